@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.result import age_text
+from firmware_bridge.zeroing.baseline import Origin
 
-Doubt = Literal["unseen", "outage", "below", "slow", "alike", "left"]
-"""Why readings are no contact: the pad was not seen at rest near its baseline in this run, or since an outage; it reads
-far below its baseline; the readings rose no faster than drift; all taxels changed alike, as in a field; or it is what a
-release has left, which warming and recovery explain."""
+Doubt = Literal["unseen", "outage", "held", "below", "slow", "alike", "left"]
+"""Why readings are no contact: the pad was not seen at rest near its baseline in this run, or since an outage; the
+recording that is played may hold something all the time; it reads far below its baseline; the readings rose no faster
+than drift; all taxels changed alike, as in a field; or it is what a release has left, which warming and recovery
+explain."""
 
 NEAR_COUNTS: Final = 50.0
 """Largest reading of a taxel at rest, on any axis: more than a pad turned over in the earth's field (36) and the first
@@ -45,6 +47,7 @@ OUTAGE_SHARE: Final = 0.1
 _TEXTS: Final[dict[Doubt, str]] = {
     "unseen": "most taxels are off it together, by {counts}, and the pad was not seen at rest near it in this run",
     "outage": "after an outage most taxels are off it together, by {counts}: is this another pad?",
+    "held": "taken from this recording, whose readings hardly change: the pad is free, or holds something all the time",
     "below": "far below the baseline on all taxels, by {counts}: it was taken while something pressed, or is old",
     "slow": "all taxels rose slowly together, by {counts}, as drift does",
     "alike": "all taxels changed alike by {counts}, as in a field or by warming, and as no touch does",
@@ -76,11 +79,13 @@ class BaselineDoubt:
         self._drift_per_ns = DRIFT_PER_S * taxels / 1e9
         self._left = LEFT_COUNTS * taxels
         self.counts = (0.0, 0.0, 0.0)
-        self.begin(seen=False)
+        self.begin("file")
 
-    def begin(self, *, seen: bool) -> None:
-        """Begin with a baseline; `seen`: it was taken from these very scans."""
+    def begin(self, origin: Origin) -> None:
+        """Begin with a baseline of an origin: of a file, or taken from these very scans."""
+        seen = origin != "file"
         self.doubt: Doubt | None = None
+        self._held = origin == "unsure"
         self._seen = seen
         self._unseen: Doubt = "unseen"
         self._touched = seen  # until it was low once, nothing is known of how a contact began
@@ -89,11 +94,12 @@ class BaselineDoubt:
         self._level = self._peak = self._still_counts = 0.0
         self._newest_ns = self._still_ns = 0
 
-    def lose_touch(self) -> None:
-        """Confirm the baseline again after an outage, since the pad may be another one."""
-        if self._seen:
+    def lose_touch(self, *, same_pad: bool = False) -> None:
+        """Forget how a contact began, and after an outage that the pad was seen: it may not be the `same_pad`."""
+        if self._seen and not same_pad:
             self._before, self._newest = self._newest, None
             self._seen, self._unseen = False, "outage"
+        self._touched = self._seen
 
     def weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
         """Return why a scan's readings are in doubt, or None.
@@ -104,6 +110,8 @@ class BaselineDoubt:
             time_ns: of the scan, in [ns].
         """
         self._newest = zeroed
+        if self._held:
+            return "held"
         if self._seen and -self._off < z_counts < self._off:
             self._newest_ns, self._level, self._peak = time_ns, 0.0, 0.0
             self._touched, self.doubt = False, None

@@ -215,7 +215,9 @@ FIELDS: Final = (
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
           decimals=1, out=_RECORD_ROS, byte=176),
     Field("baseline", _ID, "baseline", "id of the baseline", make=attrgetter("id"), out=_RECORD_NPZ),
-    Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`", make=attrgetter("origin"),
+    Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`; or from the "
+          "recording that is played: `recording`, where its pad is free, and `unsure`, where it may hold something all "
+          "the time", make=attrgetter("origin"),
           out=Out.RECORD),
     Field("baseline_age_s", _REAL, "baseline_age_s", "how old the baseline is; unknown where the clock was wrong when "
           "it was stored", decimals=1, byte=160),

@@ -172,15 +172,16 @@ class Runtime:
         seen_counts = self._options.contact_on_counts - self._hidden_counts
         return result.state == "idle" and counts is not None and counts < seen_counts
 
-    def lose_touch(self, sensors: str = "") -> None:
+    def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
         """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.
 
         Args:
             sensors: prefix of the names of the sensors concerned; all by default.
+            same_pad: it cannot be another one since, as in a recording that goes on from another place.
         """
         for name, sensor in self._sensors.items():
             if name.startswith(sensors):
-                sensor.lose_touch()
+                sensor.lose_touch(same_pad=same_pad)
 
     def _report(self, kind: EventKind, detail: str = "") -> None:
         self._events.append(Untimed(kind, None, detail))

@@ -156,7 +156,7 @@ class Sensor:
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
         self._tracker = DriftTracker(baseline)
         self.drift, self.drift_notes = self._tracker.summary, ()
-        self.rest.begin(seen=baseline.origin != "file")
+        self.rest.begin(baseline.origin)
 
     def weigh(self, readings: NDArray[np.float32], z_counts: float, time_ns: int) -> bool:
         """Return whether the baseline is in doubt, and report when that begins, changes and ends.
@@ -181,15 +181,16 @@ class Sensor:
         """Return the age of the baseline, in [s]; None if unknown."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
-    def lose_touch(self) -> None:
+    def lose_touch(self, *, same_pad: bool = False) -> None:
         """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
 
-        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one.
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
+        a contact is believed again once the pad was seen at rest, unless it is the `same_pad` for sure.
         """
         self.taps.reset()
         self.last = None
         self.watch.forget()
-        self.rest.lose_touch()
+        self.rest.lose_touch(same_pad=same_pad)
         self._zeroing = BaselineEstimator(clock=self._unix_time_s)
         if self._tracker is not None:
             self._tracker.forget()
