@@ -142,6 +142,8 @@ def run(
                 **asdict(asked),
             )
             give_back()
+            if not model.contract.trust:
+                _tell(f"model {model.name} has no checks: no pattern is checked, so none is to be acted on")
             sinks: list[Sink] = []
             if played is not None:
                 sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)

@@ -20,7 +20,7 @@ TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
 ZeroingNoteKind = Literal[
     "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt"
 ]
-NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "late"]
+NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "late", "not_checked"]
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 _HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
@@ -133,7 +133,8 @@ class Note:
             is zeroed; "not_in_sensor_file"; "baseline_in_doubt", with what was seen and what to do.
 
             Of the rest level: "rest_level", it has stepped. Of time: "late",
-            the reading was old when it arrived, or the pattern was ready long after that.
+            the reading was old when it arrived, or the pattern was ready long after that. Of the pattern:
+            "not_checked", since the model has no checks.
         text: in a user's words.
 
     Raises:

@@ -19,7 +19,7 @@ from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_input import Due, DueQueue
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
 from edge.perception.result import Result, overtaken, replace
-from edge.perception.scan_notes import OLD_NS, age_notes, notes_on_missing
+from edge.perception.scan_notes import OLD_NS, UNCHECKED, age_notes, notes_on_missing
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_poses import TapPoses
 from edge.perception.tap_tracker import TapTracker
@@ -117,7 +117,6 @@ class Runtime:
         self._sensors: dict[str, Sensor] = {}
         self._queue = DueQueue()
         self._tracks: dict[str | None, PoseTrack] = {}
-        self._new_tracker()
 
     def __repr__(self) -> str:
         sensors = ", ".join(self._sensors) or "none so far"
@@ -281,6 +280,7 @@ class Runtime:
                 window = tap.window[list(slots)]
             made_by = (self._model.name, tap.tap, tuple(slots), taps_used, filled, watch.most_repeats >= REPEATS)
             due = Due(sensor, window, slots, poses, tap.tap, made_by)
+            known["notes"] = notes if sensor.check is not None else (*notes, UNCHECKED)
         elif doubted:
             known |= {"notes": (*notes, *sensor.doubt_notes), "trusted": False, "untrusted_reason": "baseline"}
             if force_counts >= self._options.contact_on_counts:  # to be looked at, and made from this scan alone

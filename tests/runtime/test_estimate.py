@@ -137,7 +137,7 @@ def test_a_record_says_what_the_pattern_was_made_without():
     record = json.loads(record_line(last, {}))
     assert record["state"] == "contact" and record["pattern"] is not None
     assert record["dead"] == {"3": "stuck"} and record["filled"] == "neighbours"
-    assert record["note"] == "taxel 3 stuck: estimated from its neighbours"
+    assert record["note"] == "taxel 3 stuck: estimated from its neighbours; not checked: the model has no checks"
     assert record["force_counts"] == pytest.approx(16_000, rel=0.02)
     assert last.pattern is not None and last.pattern[5, 35] == pytest.approx(1, rel=0.15)
 
