@@ -6,8 +6,8 @@
 Replace `PrintedGripper` by your own. It is also stopped for everything that may be wrong: too much force, a dead
 taxel, a baseline in doubt, a pattern that is not to be believed, readings that are old or missing, a lost link, an
 error, Ctrl-C. A model without checks is refused. Of several sensors every one must be well and free before it begins,
-and any one stops it; --name restricts this to one. It never moves by an emulated sensor or a recording, unless --pretend
-is set. Exit code 0 only if the area was reached, by a pattern that is to be believed.
+and any one stops it; --name restricts this to one. It never moves by an emulated sensor or a recording, unless
+--pretend is set. Exit code 0 only if the area was reached, by a pattern that is to be believed.
 
 No program can monitor itself: let the gripper's own controller stop when it receives no further commands.
 """

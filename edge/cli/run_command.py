@@ -143,7 +143,7 @@ def run(
             )
             give_back()
             if not model.contract.trust:
-                _tell(f"model {model.name} has no checks: no pattern is checked, so none is to be acted on")
+                _tell(f"model {model.name} has no checks: no pattern is checked, so act on no pattern")
             sinks: list[Sink] = []
             if played is not None:
                 sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)

@@ -1,4 +1,4 @@
-"""What drift, warming or an old baseline explains as well as a touch is no contact; what begins as a touch is one."""
+"""Drift, warming and old baselines, which look like a touch, are no contact; what begins as a touch is one."""
 
 import itertools
 from dataclasses import replace
