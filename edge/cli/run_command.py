@@ -110,7 +110,8 @@ def run(
             contextlib.ExitStack() as closing,
         ):
             hint = partial(silence_hint, options.source, source.counters)
-            messages = MessageSink(hint=None if source.patient else hint)
+            unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
+            messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
             opener = partial(
                 open_sink,
                 contract=model.contract,
@@ -142,8 +143,6 @@ def run(
                 **asdict(asked),
             )
             give_back()
-            if not model.contract.trust:
-                _tell(f"model {model.name} has no checks: no pattern is checked, so act on no pattern")
             sinks: list[Sink] = []
             if played is not None:
                 sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)

@@ -243,12 +243,11 @@ class Runtime:
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
         if sensor.baseline is None or zeroed is None:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
-        age_s = sensor.age_s(scan.time_ns)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = self._track_of(scan.sensor) if self._tracks else None
         pose = None if track is None else track.at(scan.on_bus_ns)
-        known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
-        known |= {"zeroed": zeroed, "pose": pose}
+        known |= {"baseline": sensor.baseline, "baseline_age_s": sensor.age_s(scan.time_ns), "drift": sensor.drift}
+        known |= {"zeroed": zeroed, "filled": filled, "pose": pose}
         if not watch.sound and (watch.waiting or (dead and readings is None)):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 

@@ -113,7 +113,7 @@ class TestRefusals:
     def test_a_full_disk_is_5_after_the_summary(self, files):
         done = run(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:/dev/full")
         lines = done.stderr.splitlines()
-        assert done.returncode == 5 and lines[0].startswith("REPLAY")
+        assert done.returncode == 5 and lines[1].startswith("REPLAY")
         assert lines[-1] == "edge-sr: cannot write records to /dev/full: No space left on device"
 
 
