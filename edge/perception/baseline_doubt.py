@@ -118,8 +118,10 @@ class BaselineDoubt:
             return None
         near = np.maximum.reduce(np.abs(zeroed)) <= NEAR_COUNTS
         at_rest = np.count_nonzero(near) / near.size
-        if not self._seen:
-            self._seen = at_rest >= SEEN_SHARE or self._goes_on(zeroed)
+        if at_rest >= SEEN_SHARE:
+            self._seen, self._peak, self._level = True, 0.0, 0.0
+        elif not self._seen:
+            self._seen = self._goes_on(zeroed)
         before, self.doubt = self.doubt, None
         if z_counts <= -self._off and float(np.median(zeroed[2])) < -NEAR_COUNTS:
             self.doubt, self._seen, self._touched = "below", False, False

@@ -140,6 +140,8 @@ class TestStatus:
         ):
             sink.write(replace(result, trusted=trusted, untrusted_reason=reason), RUN)
             assert sink.line().startswith(words)
+        sink.write(replace(result, state="baseline_in_doubt", contact=None, trusted=False), RUN)
+        assert sink.line().startswith("4 BASELINE IN DOUBT: zero the free pad")
 
     def test_where_to_touch_next_is_shown_from_the_end_of_a_tap(self):
         sink = self.make()
