@@ -78,7 +78,7 @@ def dialect_words(
     text: str, dialect: frozenset[str] = DIALECT, phrases: tuple[str, ...] = DIALECT_PHRASES
 ) -> Counter[str]:
     """Count the words of the dialect in a text."""
-    lowered = text.lower()
+    lowered = re.sub(r"in[ _]doubt", "", text.lower())  # the name of a state, and English
     words = Counter(word for word in _WORD.findall(lowered) if word in dialect)
     return words + Counter({phrase: len(re.findall(rf"\b{phrase}\b", lowered)) for phrase in phrases})
 

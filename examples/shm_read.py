@@ -14,7 +14,8 @@ import numpy as np
 
 USAGE = "usage: python shm_read.py NAME SENSOR [--pretend]; --pretend acts also on a sensor that is none"
 SOURCES = ("unknown", "device", "replay", "emulated")
-UNTRUSTED = 0
+IN_DOUBT = 6
+VERDICTS = {0: "pattern not to be believed", -1: "pattern not checked"}
 
 
 def attach(name: str) -> memoryview:
@@ -37,7 +38,9 @@ def refusal(half: bytes, oldest_s: float = 0.05, pretend: bool = False) -> str |
     age_s = (time.monotonic_ns() - unpack_from("<q", half, 16)[0]) / 1e9
     if not 0 <= age_s < oldest_s:
         return f"the newest reading is {age_s:.2f} s old, expected under {oldest_s:g}"
-    (source,) = unpack_from("<i", half, 48)
+    source, state = unpack_from("<2i", half, 48)
+    if state == IN_DOUBT:
+        return "its baseline is in doubt: free the pad and zero again"
     if SOURCES[source] == "device" or pretend:
         return None
     return f"its source is {SOURCES[source]}, not a device: --pretend acts on it all the same"
@@ -63,11 +66,11 @@ def newest(memory: memoryview) -> dict[str, bytes]:
 
 
 def described(memory: memoryview, half: bytes) -> str:
-    """Return the force of a result in words, and the depth unless its pattern is not to be believed."""
+    """Return the force of a result in words, and the depth if its pattern is to be believed."""
     height, width, _, _, pattern_at = unpack_from("<5I", memory, 40)
     pattern = np.frombuffer(half, "<f4", height * width, pattern_at).reshape(height, width)  # NaN without one
-    believed = unpack_from("<i", half, 592) != (UNTRUSTED,)
-    depth = f"{pattern.max():.3f} mm at most" if believed else "pattern not to be believed"
+    (trusted,) = unpack_from("<i", half, 592)
+    depth = VERDICTS.get(trusted, f"{pattern.max():.3f} mm at most")
     return f"{unpack_from('<d', half, 104)[0]:.0f} counts, {depth}"
 
 

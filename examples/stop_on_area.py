@@ -4,9 +4,10 @@
     python stop_on_area.py --area-mm2 60 --source demo --pretend        # without a sensor
 
 Replace `PrintedGripper` by your own. It is also stopped for everything that may be wrong: too much force, a dead
-taxel, a pattern that is not to be believed, readings that are old or missing, a lost link, an error, Ctrl-C. Of several
-sensors every one must be well and free before it begins, and any one stops it; --name restricts this to one. It never
-moves by an emulated sensor or a recording, unless --pretend is set. Exit code 0 only if the area was reached.
+taxel, a baseline in doubt, a pattern that is not to be believed, readings that are old or missing, a lost link, an
+error, Ctrl-C. A model without checks is refused. Of several sensors every one must be well and free before it begins,
+and any one stops it; --name restricts this to one. It never moves by an emulated sensor or a recording, unless
+--pretend is set. Exit code 0 only if the area was reached, by a pattern that is to be believed.
 
 No program can monitor itself: let the gripper's own controller stop when it receives no further commands.
 """
@@ -19,7 +20,7 @@ import sys
 import time
 from typing import Protocol
 
-from edge.api import BridgeError, EdgeError, Event, Result, Source, Stream, open_runtime, open_source
+from edge.api import BridgeError, EdgeError, Event, Model, Result, Source, Stream, load_model, open_runtime, open_source
 
 SETTLING_NS = 500_000_000
 """Time after the first reading by which every present sensor must have sent one, in [ns]."""
@@ -91,7 +92,7 @@ class Grip:
         self._closing = False
         self._ended = False
 
-    def run(self, source: Source, model: str, duration_s: float) -> None:
+    def run(self, source: Source, model: Model, duration_s: float) -> None:
         """Grip; the gripper is stopped whenever this returns or raises."""
         runtime = open_runtime(model, source)
         if self._name is None:
@@ -120,8 +121,9 @@ class Grip:
         if wrong is not None:
             self._end(wrong)
         elif result.area_mm2 is not None and result.area_mm2 >= self._area_mm2:
-            self.reached = self._closing
-            self._end(f"{result.area_mm2:.0f} mm2 touch, as felt {self._age_ms(scan.sensor):.1f} ms ago")
+            self.reached = self._closing and result.trusted is True
+            checked = "" if result.trusted is True else ", in a pattern that was not checked"
+            self._end(f"{result.area_mm2:.0f} mm2 touch, as felt {self._age_ms(scan.sensor):.1f} ms ago{checked}")
         elif result.state == "idle":  # zeroed, every taxel has sent readings, no contact
             self._free.add(scan.sensor)
             self._begin(scan.time_ns - self._first_ns)
@@ -147,7 +149,7 @@ class Grip:
             return silent
         if result.dead:
             return f"taxels {sorted(result.dead)} are dead"
-        if result.state in ("zeroing", "incomplete") or result.force_counts is None:
+        if result.state not in ("idle", "contact", "dropped") or result.force_counts is None:
             return f"the sensor is not ready: {result.note or result.state}"
         if result.trusted is False:  # its area is no ground to go on, nor to have reached anything
             return f"the pattern is not to be believed: {result.untrusted_text}"
@@ -213,7 +215,10 @@ def main() -> None:
         with open_source(*options.source, sensor=options.sensor) as source:
             if source.kind != "device" and not options.pretend:
                 sys.exit(f"stop_on_area: {source.name} is {source.kind}, not a sensor: pass --pretend to accept it")
-            grip.run(source, options.model, options.duration_s)
+            model = load_model(options.model)
+            if not model.contract.trust:
+                sys.exit(f"stop_on_area: model {model.name} has no checks: no pattern of it is to be acted on")
+            grip.run(source, model, options.duration_s)
         print(f"why: {grip.why}", flush=True)
     except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -136,7 +136,7 @@ def _measured(
 ) -> Saving:
     """Measure a row; `idle`: the network runs where nothing touches, too."""
     counted = _Counted(model)
-    baseline = Baseline.of(SENSOR, REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="file")
+    baseline = Baseline.of(SENSOR, REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="start-up")
     runtime = Runtime(
         counted,
         source="replay",

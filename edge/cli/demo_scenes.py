@@ -45,7 +45,7 @@ class DemoScenes(Sink):
         self._tell = tell
         self._reset = reset
         self._scene = _FREE
-        self._patterns = self._untrusted = self._dropped = 0
+        self._patterns = self._checked = self._untrusted = self._dropped = 0
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the scenes."""
@@ -60,6 +60,7 @@ class DemoScenes(Sink):
         self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
         if result.pattern is not None:
             self._patterns += 1
+            self._checked += result.trusted is not None
             self._untrusted += result.trusted is False
 
     def close(self) -> None:
@@ -71,8 +72,10 @@ class DemoScenes(Sink):
             none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
             self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
         elif self._scene == _MAGNET:
-            self._say(f"demo: {self._untrusted} of {self._patterns} patterns with the magnet were not to be believed")
-        self._patterns = self._untrusted = self._dropped = 0
+            told = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
+            none = f"none of {self._patterns} patterns with the magnet was checked"
+            self._say(f"demo: {told if self._checked else none}")
+        self._patterns = self._checked = self._untrusted = self._dropped = 0
 
     def _say(self, text: str) -> None:
         self._tell(Event(time.monotonic_ns(), "note", None, text))

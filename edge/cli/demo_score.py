@@ -209,7 +209,7 @@ def score_picture(score: TapScore, columns: int, palette: Palette) -> str:
         raise ValueError("score has no pattern, expected one made by DemoScore")
     taxels_z = deformation(result.scan.counts, result.baseline)[2]
     highest = float(max(result.pattern.max(), score.truth.max()))
-    believed = "super-resolved" if result.trusted is not False else "NOT BELIEVED"
+    believed = {True: "super-resolved", None: "not checked", False: "NOT BELIEVED"}[result.trusted]
     height, width = result.pattern.shape
     return draw(
         [

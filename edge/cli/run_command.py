@@ -110,7 +110,8 @@ def run(
             contextlib.ExitStack() as closing,
         ):
             hint = partial(silence_hint, options.source, source.counters)
-            messages = MessageSink(hint=None if source.patient else hint)
+            unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
+            messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
             opener = partial(
                 open_sink,
                 contract=model.contract,

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable
 from typing import Final, TextIO
@@ -76,7 +77,7 @@ def run(
             except LinkLostError as error:
                 lost = error
             watched = watch.watched()
-            examined = examine(watched, time.time())
+            examined = examine(watched, math.nan if watch.link.kind == "replay" else time.time())
             mountings: dict[str, Mounting] = {}
             if lost is None and not stop.is_set():
                 try:

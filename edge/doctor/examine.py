@@ -82,7 +82,7 @@ class Examined:
 
 
 def examine(watched: Watched, unix_time_s: float) -> Examined:
-    """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970."""
+    """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970, NaN if unknown."""
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
     enough = {name: one for name, one in samples.items() if one.enough}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}

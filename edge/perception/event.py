@@ -10,14 +10,18 @@ from typing import Final, Literal, NamedTuple, get_args
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
 
-ZeroingKind = Literal["zeroing", "zeroed", "in_contact", "given_up", "rest_level"]
+ZeroingKind = Literal[
+    "zeroing", "zeroed", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"
+]
 TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
 TapPoseKind = Literal["tap_without_pose", "tap_out_of_reach"]
 PoseSourceKind = Literal["poses_silent", "poses_back", "poses_trouble"]
 EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, TapPoseKind, PoseSourceKind, "sink", "reset", "refused"]
 TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
-ZeroingNoteKind = Literal["zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file"]
-NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "all_alike", "late"]
+ZeroingNoteKind = Literal[
+    "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt"
+]
+NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "late", "not_checked"]
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 _HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
@@ -39,9 +43,10 @@ class Event:
             Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
             "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
             has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
-            its end; "tap_dropped", earlier taps do not belong to the contact; "suspected", contact after contact reads
-            like none, and "cleared", no longer; "gains_learned", gains learned from contacts are in use;
-            "tap_without_pose" and "tap_out_of_reach", a tap is left out.
+            its end; "baseline_doubted", drift or an old baseline explains the readings as well as a touch, and
+            "baseline_cleared", no longer; "tap_dropped", earlier taps do not belong to the contact; "suspected",
+            contact after contact reads like none, and "cleared", no longer; "gains_learned", gains learned from
+            contacts are in use; "tap_without_pose" and "tap_out_of_reach", a tap is left out.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
         sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
@@ -83,7 +88,16 @@ class Event:
                 return f"sensor {self.sensor} is suspected: {self.detail or causes}"
             case "cleared":
                 return f"sensor {self.sensor}: contacts read as they should again"
-            case "rest_level" | "gains_learned" | "tap_dropped" | "tap_without_pose" | "tap_out_of_reach":
+            case "baseline_cleared":
+                return f"sensor {self.sensor}: the baseline is no longer in doubt"
+            case (
+                "rest_level"
+                | "baseline_doubted"
+                | "gains_learned"
+                | "tap_dropped"
+                | "tap_without_pose"
+                | "tap_out_of_reach"
+            ):
                 return f"sensor {self.sensor}: {self.detail}"
             case _:
                 return self.detail
@@ -118,10 +132,11 @@ class Note:
             is frozen.
 
             Of zeroing: "zeroing", it goes on; "zeroing_restarted", with the reason; "no_stored_baseline", so the sensor
-            is zeroed; "not_in_sensor_file".
+            is zeroed; "not_in_sensor_file"; "baseline_in_doubt", with what was seen and what to do.
 
-            Of the rest level: "rest_level", it has stepped; "all_alike", a contact looks like drift. Of time: "late",
-            the reading was old when it arrived, or the pattern was ready long after that.
+            Of the rest level: "rest_level", it has stepped. Of time: "late",
+            the reading was old when it arrived, or the pattern was ready long after that. Of the pattern:
+            "not_checked", since the model has no checks.
         text: in a user's words.
 
     Raises:

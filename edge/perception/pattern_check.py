@@ -18,15 +18,16 @@ from edge.inference.familiarity import contact_features, pose_tap_features, tap_
 from edge.inference.trust import Trust
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
-Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "baseline"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; contacts together are unfamiliar, or contradict the gains of the sensor file."""
-REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor")
+its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the baseline is in doubt."""
+REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor", "baseline")
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
     "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
     "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
+    "baseline": "the baseline is in doubt (free the pad and zero again)",
 }
 """Reasons in a user's words, each with what to look for."""
 

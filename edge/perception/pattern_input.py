@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Hashable, Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.result import MADE, Result, replace
+from edge.inference.pose_input import scheduled_rows
+from edge.perception.result import MADE, Result, overtaken, replace
 from edge.perception.sensor_state import Sensor
 
 SMOOTHING: Final = 0.1
@@ -32,6 +33,13 @@ class Due(NamedTuple):
     poses: NDArray[np.float32] | None
     tap: int
     made_by: Hashable
+
+    @classmethod
+    def alone(cls, sensor: Sensor, readings: NDArray[np.float32], taps: int, made_by: Hashable) -> Self:
+        """Return the input of readings (3, rows, cols) that are no tap, in a window of so many."""
+        window = np.zeros((taps, *readings.shape), dtype=np.float32)
+        window[0] = readings
+        return cls(sensor, window, (0,), None if sensor.poses is None else scheduled_rows(1, 0.0), -1, made_by)
 
     def unchanged(self, result: Result) -> Result | None:
         """Return the result with the sensor's last pattern, or None if a new pattern is needed."""
@@ -60,14 +68,14 @@ class DueQueue:
 
     def join(self, sensor: str, result: Result, due: Due) -> list[Result]:
         """Let a scan's pattern wait in the sensor's place; return the result that it overtakes, if any."""
-        overtaken = self._waiting.get(sensor)
+        before = self._waiting.get(sensor)
         self._waiting[sensor] = result, due
-        return [] if overtaken is None else [replace(overtaken[0], state="dropped")]
+        return [] if before is None else [overtaken(before[0])]
 
     def leave(self, sensor: str) -> list[Result]:
         """Give up the sensor's place, since its newest scan needs none; return the result that waited, if any."""
-        overtaken = self._waiting.pop(sensor, None) if self._waiting else None
-        return [] if overtaken is None else [replace(overtaken[0], state="dropped")]
+        before = self._waiting.pop(sensor, None) if self._waiting else None
+        return [] if before is None else [overtaken(before[0])]
 
     def take(self, longest_us: float | None) -> list[tuple[Result, Due]]:
         """Return those that have waited longest, one at least, as many as are inferred in so long, in [us].

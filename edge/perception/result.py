@@ -25,7 +25,7 @@ MADE: Final = (
 )
 """Fields of a result that are made from a pattern."""
 
-State = Literal["zeroing", "incomplete", "idle", "contact", "dropped"]
+State = Literal["zeroing", "incomplete", "baseline_in_doubt", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
 Estimate = Literal["network", "smooth"]
@@ -153,6 +153,11 @@ def replace(result: Result, **changes: object) -> Result:
     values: dict[str, Any] = dict(zip(_NAMES, _values(result), strict=True))
     values.update(changes)
     return Result(**values)
+
+
+def overtaken(result: Result) -> Result:
+    """Return a result whose pattern was due as it is without one, since a newer scan has come."""
+    return result if result.state == "baseline_in_doubt" else replace(result, state="dropped")
 
 
 _NAMES: Final = tuple(one.name for one in fields(Result))

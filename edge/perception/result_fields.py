@@ -143,8 +143,9 @@ FIELDS: Final = (
           out=_RECORD_NPZ, byte=32),
     Field("source", _one_of("device", "replay", "emulated"), "source",
           "kind of source: a robot acts on `device` alone", byte=48),
-    Field("state", _one_of("zeroing", "incomplete", "idle", "contact", "dropped"), "state",
+    Field("state", _one_of("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"), "state",
           "`incomplete`: a taxel has not arrived yet, or more are dead than can be estimated; "
+          "`baseline_in_doubt`: an old baseline or drift explains the readings as well as a touch; "
           "`dropped`: a newer scan was already waiting", byte=52),
     Field("model", _text(32, 64, cut=True), "model", "name of the model; npz and shared memory cut a long one",
           byte=440),
@@ -152,7 +153,8 @@ FIELDS: Final = (
           make=mask_bits, out=Out.RECORD, byte=88),
     Field("renewed", _BITS, "scan.renewed", "bit i: and differs from its reading before",
           make=mask_bits, out=Out.RECORD, byte=96),
-    Field("contact", _YES_OR_NO, "contact", "whether something touches", byte=56),
+    Field("contact", _YES_OR_NO, "contact", "whether something touches; unknown while the baseline is in doubt",
+          byte=56),
     Field("taps_used", _SMALL, "taps_used", "taps that the pattern was made from", byte=60),
     Field("has_pattern", _IS_THERE, "pattern", "whether there is a pattern", make=_there, out=Out.NPZ, byte=64),
     Field("has_deviation", _IS_THERE, "deviation", "whether there is a deviation", make=_there, out=_NONE, byte=68),
@@ -190,7 +192,7 @@ FIELDS: Final = (
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
           "a contact that is too light to check, and for models without checks", byte=592),
     Field("untrusted_reason", _one_of(*REASONS, unknown=""), "untrusted_reason",
-          "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
+          "why not: `stuck`, `unfamiliar`, `unexplained`, `sensor` or `baseline`", byte=596),
     Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
           "linear estimate that replaces one that is not to be believed", byte=600),
     Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
@@ -213,7 +215,9 @@ FIELDS: Final = (
     Field("latency_us", _REAL, "latency_us", "from the read that gave the scan's last byte to the pattern",
           decimals=1, out=_RECORD_ROS, byte=176),
     Field("baseline", _ID, "baseline", "id of the baseline", make=attrgetter("id"), out=_RECORD_NPZ),
-    Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`", make=attrgetter("origin"),
+    Field("baseline_origin", _TEXT, "baseline", "`start-up`, `file` or `demand`; or from the "
+          "recording that is played: `recording`, where its pad is free, and `unsure`, where it may hold something all "
+          "the time", make=attrgetter("origin"),
           out=Out.RECORD),
     Field("baseline_age_s", _REAL, "baseline_age_s", "how old the baseline is; unknown where the clock was wrong when "
           "it was stored", decimals=1, byte=160),

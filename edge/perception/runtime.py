@@ -18,8 +18,8 @@ from edge.perception.next_tap import TapAdvice
 from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_input import Due, DueQueue
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
-from edge.perception.result import Result, replace
-from edge.perception.scan_notes import OLD_NS, age_notes, notes_on_missing
+from edge.perception.result import Result, overtaken, replace
+from edge.perception.scan_notes import OLD_NS, UNCHECKED, age_notes, notes_on_missing
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_poses import TapPoses
 from edge.perception.tap_tracker import TapTracker
@@ -114,7 +114,6 @@ class Runtime:
         self._sensors: dict[str, Sensor] = {}
         self._queue = DueQueue()
         self._tracks: dict[str | None, PoseTrack] = {}
-        self._new_tracker()
 
     def __repr__(self) -> str:
         sensors = ", ".join(self._sensors) or "none so far"
@@ -169,15 +168,16 @@ class Runtime:
         seen_counts = self._options.contact_on_counts - self._hidden_counts
         return result.state == "idle" and counts is not None and counts < seen_counts
 
-    def lose_touch(self, sensors: str = "") -> None:
+    def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
         """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.
 
         Args:
             sensors: prefix of the names of the sensors concerned; all by default.
+            same_pad: it cannot be another one since, as in a recording that goes on from another place.
         """
         for name, sensor in self._sensors.items():
             if name.startswith(sensors):
-                sensor.lose_touch()
+                sensor.lose_touch(same_pad=same_pad)
 
     def _report(self, kind: EventKind, detail: str = "") -> None:
         self._events.append(Untimed(kind, None, detail))
@@ -186,7 +186,7 @@ class Runtime:
         """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""
         result, due = self._follow(scan)
         if due is None or not infer:
-            return result if due is None else replace(result, state="dropped")
+            return result if due is None else overtaken(result)
         same = None if self._every_scan else due.unchanged(result)
         return same or self._infer([(result, due)])[0]
 
@@ -240,22 +240,22 @@ class Runtime:
         known: dict[str, Any] = {"pattern_unit": unit, "dead": dead, "notes": notes, "events": events}
         if sensor.baseline is None or zeroed is None:
             return Result(scan, self._source, self._model.name, "zeroing", **known), None
-        age_s = sensor.age_s(scan.time_ns)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = self._track_of(scan.sensor) if self._tracks else None
         pose = None if track is None else track.at(scan.on_bus_ns)
-        known |= {"baseline": sensor.baseline, "baseline_age_s": age_s, "drift": sensor.drift, "filled": filled}
-        known |= {"zeroed": zeroed, "pose": pose}
+        known |= {"baseline": sensor.baseline, "baseline_age_s": sensor.age_s(scan.time_ns), "drift": sensor.drift}
+        known |= {"zeroed": zeroed, "filled": filled, "pose": pose}
         if not watch.sound and (watch.waiting or (dead and readings is None)):
             return Result(scan, self._source, self._model.name, "incomplete", **known), None
 
         force_counts = float(np.add.reduce(zeroed[2], axis=None)) if readings is None else readings.z_counts
         readings_counts = zeroed if readings is None else readings.counts
-        tap = sensor.taps.push(readings_counts, scan.time_ns, force_counts, scan.on_bus_ns)
+        doubted = sensor.weigh(readings_counts, force_counts, scan.time_ns)
+        tap = sensor.taps.push(readings_counts, scan.time_ns, force_counts, scan.on_bus_ns, doubted=doubted)
         if sensor.poses is not None and track is not None:
             sensor.poses.follow(tap, track)
         if self._follow_drift:
-            sensor.follow_drift(scan, tap.contact)
+            sensor.follow_drift(scan, tap.contact or doubted)
         if not tap.contact and sensor.follower is not None and sensor.follower.waiting:
             sensor.learn(self._model.contract)
         taps_used = min(tap.taps_used, self._taps)
@@ -275,17 +275,21 @@ class Runtime:
                 window = tap.window[list(slots)]
             made_by = (self._model.name, tap.tap, tuple(slots), taps_used, filled, watch.most_repeats >= REPEATS)
             due = Due(sensor, window, slots, poses, tap.tap, made_by)
-        advice = sensor.advice
+            known["notes"] = notes if sensor.check is not None else (*notes, UNCHECKED)
+        elif doubted:
+            known |= {"notes": (*notes, *sensor.doubt_notes), "trusted": False, "untrusted_reason": "baseline"}
+            if force_counts >= self._options.contact_on_counts:  # to be looked at, and made from this scan alone
+                taps_used, due = 1, Due.alone(sensor, readings_counts, len(tap.window), (self._model.name, filled))
         result = Result(
             scan,
             self._source,
             self._model.name,
-            "idle",
-            contact=tap.contact,
+            "baseline_in_doubt" if doubted else "idle",
+            contact=None if doubted else tap.contact,
             taps_used=taps_used,
             window=None if due is None else due.window[:taps_used],
             poses=None if due is None else due.poses,
-            next_tap=None if advice is None else advice.proposal(tap),
+            next_tap=None if doubted or sensor.advice is None else sensor.advice.proposal(tap),
             force_counts=force_counts,
             force_n=force_n,
             gains_certainty=sensor.gains_certainty,
@@ -327,22 +331,24 @@ class Runtime:
         self._queue.took(run_time_us / len(waiting))
         deviations, tractions = self._model.deviation, self._model.traction
         for row, (_, touch) in enumerate(waiting):
-            deviation = None if deviations is None else deviations[row].copy()
-            traction = None if tractions is None else tractions[row].copy()
+            doubted = results[row].state == "baseline_in_doubt"
             made = replace(
                 results[row],
-                state="contact",
+                state="baseline_in_doubt" if doubted else "contact",
                 pattern=patterns[row].copy(),
-                deviation=deviation,
-                traction=traction,
+                deviation=None if deviations is None else deviations[row].copy(),
+                traction=None if doubted or tractions is None else tractions[row].copy(),
                 estimate="network",
                 run_time_us=run_time_us,
             )
             sensor = touch.sensor
-            made = self._describe(checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback), sensor)
-            sensor.last = made
+            if not doubted:
+                judged = checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback)
+                made = self._describe(judged, sensor)
+            sensor.last = results[row] = made
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
-            results[row] = made
+            if doubted:
+                continue  # nothing follows from it, and nothing is learned
             if sensor.advice is not None:
                 sensor.advice.see(made, touch.tap)
             if sensor.follower is not None and sensor.follower.see(made, touch.window[0]):
@@ -362,6 +368,7 @@ class Runtime:
             notes,
             mounting,
             self._unix_time_s,
+            self._options,
         )
         per_newton = self._counts_per_newton
         sensor.counts_per_newton = per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton

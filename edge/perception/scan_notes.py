@@ -25,6 +25,10 @@ def age_notes(scan: Scan) -> tuple[Note, ...]:
     return (Note("late", f"this reading was {(scan.time_ns - scan.device_ns) / 1e9:.2f} s old when it arrived"),)
 
 
+UNCHECKED: Final = Note("not_checked", "not checked: the model has no checks")
+"""Note on each pattern of a model that nothing is known of by which to believe it."""
+
+
 def waited_note(waited_ns: int) -> Note:
     """Return the note on a pattern that was ready more than OLD_NS after its newest reading arrived, in [ns]."""
     return Note("late", f"this pattern was ready {waited_ns / 1e9:.2f} s after its newest reading arrived")

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
+from edge.perception.baseline_doubt import BaselineDoubt, Doubt, doubt_text
 from edge.perception.change_gate import LastReading
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import Filler, Readings, TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower
@@ -37,6 +39,9 @@ class Sensor:
         drift: what has become of the rest level since it was zeroed; None without a baseline.
         zeroing_notes: why there is no baseline yet, or how a zeroing on demand stands.
         drift_notes: what the user should know of the rest level.
+        rest: tells whether its readings may be a touch, or an old baseline explains them as well.
+        doubt: what it said last.
+        doubt_notes: the same for the user.
         counts_per_newton: summed z per [N], if that is known.
         pad: what is known of it.
         pad_row: the same as the model takes it.
@@ -60,8 +65,12 @@ class Sensor:
         notes: tuple[Note, ...] = (),
         mounting: Mounting | None = None,
         unix_time_s: Callable[[], float] = time.time,
+        options: RuntimeOptions = DEFAULTS,
     ) -> None:
         self.taps = taps
+        self.rest = BaselineDoubt(options, geometry.taxel_count)
+        self.doubt: Doubt | None = None
+        self.doubt_notes: tuple[Note, ...] = ()
         self.poses: TapPoses | None = None
         self.advice: TapAdvice | None = None
         self.last_reading = LastReading(geometry.scan_shape)
@@ -146,19 +155,41 @@ class Sensor:
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
         self._tracker = DriftTracker(baseline)
         self.drift, self.drift_notes = self._tracker.summary, ()
+        self.rest.begin(baseline.origin)
+
+    def weigh(self, readings: NDArray[np.float32], z_counts: float, time_ns: int) -> bool:
+        """Return whether the baseline is in doubt, and report when that begins, changes and ends.
+
+        Args:
+            readings: (3, rows, cols) in counts over the baseline, without gaps.
+            z_counts: their summed z.
+            time_ns: of the scan, in [ns].
+        """
+        doubt = self.rest.weigh(readings, z_counts, time_ns)
+        if doubt is not self.doubt:
+            self.doubt = doubt
+            if doubt is None:
+                self.report("baseline_cleared")
+            else:
+                text = doubt_text(doubt, self.rest.counts, self.age_s(time_ns))
+                self.doubt_notes = (Note("baseline_in_doubt", text),)
+                self.report("baseline_doubted", text)
+        return doubt is not None
 
     def age_s(self, time_ns: int) -> float | None:
         """Return the age of the baseline, in [s]; None if unknown."""
         return None if self._taken_ns is None else max(time_ns - self._taken_ns, 0) / 1e9
 
-    def lose_touch(self) -> None:
+    def lose_touch(self, *, same_pad: bool = False) -> None:
         """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
 
-        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one.
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
+        a contact is believed again once the pad was seen at rest, unless it is the `same_pad` for sure.
         """
         self.taps.reset()
         self.last = None
         self.watch.forget()
+        self.rest.lose_touch(same_pad=same_pad)
         self._zeroing = BaselineEstimator(clock=self._unix_time_s)
         if self._tracker is not None:
             self._tracker.forget()
@@ -192,8 +223,7 @@ class Sensor:
             return
         self.baseline = taken.moved(tracker.counts)
         self.drift, note = tracker.summary, tracker.note
-        kind = "all_alike" if tracker.doubted else "rest_level"
-        self.drift_notes = () if note is None else (Note(kind, note),)
+        self.drift_notes = () if note is None else (Note("rest_level", note),)
         event = tracker.take_event()
         if event is not None:
             self.report("rest_level", event)
@@ -206,15 +236,12 @@ class Sensor:
         """
         if self.baseline is None:
             self.report("zeroing")
-        elif self._touched and not force:
+        elif self.taps.contact and not force:
             self.report("in_contact")
         else:
-            self._rezeroing = Rezeroing(self.baseline, force=force, unix_time_s=self._unix_time_s)
+            old = None if force or self.doubt is not None else self.baseline
+            self._rezeroing = Rezeroing(old, force=force, unix_time_s=self._unix_time_s)
             self.zeroing_notes = (self._rezeroing.note,)
-
-    @property
-    def _touched(self) -> bool:
-        return self.taps.contact and not (self._tracker is not None and self._tracker.doubted)
 
     def _bury(self) -> None:
         """Prepare the estimate of the dead taxels after their set has changed."""
@@ -240,7 +267,7 @@ class Sensor:
     def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> bool:
         """Push a scan to a zeroing on demand and return whether it gave a new baseline."""
         try:
-            baseline = rezeroing.push(scan, self._touched, self._silent())
+            baseline = rezeroing.push(scan, self.taps.contact, self._silent())
         except BaselineRefusedError as refusal:
             self._end_rezeroing()
             self.report("given_up", str(refusal))

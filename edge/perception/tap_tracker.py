@@ -114,6 +114,8 @@ class TapTracker:
         time_ns: int,
         z_counts: float | None = None,
         taken_ns: int | None = None,
+        *,
+        doubted: bool = False,
     ) -> TapState:
         """Take one scan and return the new state.
 
@@ -125,13 +127,14 @@ class TapTracker:
             time_ns: of the scan, in [ns].
             z_counts: its summed z, if available more exactly than from `deformation`.
             taken_ns: when its readings were taken, in [ns]; by default `time_ns`.
+            doubted: it is no contact, whatever its z.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self._contact:
-            self._contact = z_counts >= self._off_counts
+            self._contact = z_counts >= self._off_counts and not doubted
             if not self._contact:
                 self._release()
-        elif z_counts >= self._on_counts:
+        elif z_counts >= self._on_counts and not doubted:
             self._forget_if_idle(time_ns)
             self._contact = True
             self._tap += 1

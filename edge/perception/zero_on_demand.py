@@ -24,12 +24,12 @@ class Rezeroing:
         note: its progress.
     """
 
-    def __init__(self, old: Baseline, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
+    def __init__(self, old: Baseline | None, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
         """Start with the next scan.
 
         Args:
-            old: the baseline so far; a load shows as a difference from it.
-            force: zero away a contact or a load.
+            old: the baseline so far; a load shows as a difference from it. None zeroes away a load.
+            force: zero away a contact.
             unix_time_s: dates the new one, in [s] since 1970.
         """
         self.note = Note("zeroing", "zeroing: keep the pad still and free")
@@ -69,4 +69,4 @@ class Rezeroing:
         return None if taken is None else replace(taken, origin="demand")
 
     def _new_estimator(self) -> BaselineEstimator:
-        return BaselineEstimator(reference=None if self._force else self._old, clock=self._unix_time_s)
+        return BaselineEstimator(reference=self._old, clock=self._unix_time_s)

@@ -1,5 +1,6 @@
 """Zeroing once, to keep the baseline for later runs."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +15,10 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+
+
+def _unknown_s() -> float:
+    return math.nan
 
 
 def take_baselines(
@@ -42,6 +47,7 @@ def take_baselines(
     check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)
     source.lend()
+    clock = _unknown_s if source.kind == "replay" else time.time  # never today's, of an old file
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}
@@ -71,7 +77,7 @@ def take_baselines(
                     whole_s[name] = now_s
                 if skipped[name] < skip or name in baselines:
                     continue
-                estimator = estimators.setdefault(name, BaselineEstimator(scans))
+                estimator = estimators.setdefault(name, BaselineEstimator(scans, clock=clock))
                 try:
                     baseline = estimator.push(one)
                 except BaselineRefusedError as refusal:

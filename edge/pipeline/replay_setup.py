@@ -1,11 +1,12 @@
 """Recording as a source, with what it stores of its sensors."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from types import MappingProxyType
-from typing import Final
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import settled, with_recorded
@@ -23,11 +24,6 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
-
-_HELD: Final = (
-    ". Its readings hardly change: either nothing touches the pad, or it holds something all the time. If it does, "
-    "pass --baseline of the free pad, such as edge-sr baseline makes of another recording"
-)
 
 
 def open_recording(
@@ -69,7 +65,7 @@ def open_recording(
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
     mountings = known.mountings
     if not zero:
-        baselines = free_baselines(replay, mountings, baselines) | dict(baselines)
+        baselines = free_baselines(replay, mountings, baselines, rate_hz=rate_hz) | dict(baselines)
     sensors = {*mountings, *baselines}
     if sensor is None:  # else a note reports the sensors that the file lacks
         sensors |= {track.sensor for track in tracks}
@@ -103,7 +99,7 @@ def recorded_baselines(text: str, known: SensorFile, rate_hz: float | None) -> t
         SourceError: its rate is unknown or out of range.
     """
     replay = ReplayLink(recording_paths(text), rate_hz)
-    baselines = free_baselines(replay, with_recorded(known, [replay]).mountings, opening=True)
+    baselines = free_baselines(replay, with_recorded(known, [replay]).mountings, opening=True, rate_hz=rate_hz)
     sensors = {track.sensor for recording in replay.recordings for track in recording.tracks}
     notes = [notice.text for notice in replay.notices()]
     if sensors - baselines.keys():
@@ -118,6 +114,7 @@ def free_baselines(
     known: Mapping[str, Baseline] = MappingProxyType({}),
     *,
     opening: bool = False,
+    rate_hz: float | None = None,
 ) -> dict[str, Baseline]:
     """Return the baselines of the sensors without one that the recordings are free and still for, and note where.
 
@@ -125,11 +122,14 @@ def free_baselines(
         replay: of the recordings; gets a note for each sensor.
         mountings: those of taxels that still have to be put in place.
         known: baselines that there are.
-        opening: also of a stretch from which a live run would zero by itself: the first scans.
+        opening: also of a stretch from which a live run would zero by itself: the first scans; to be kept, so that a
+            date is one that the recording states.
+        rate_hz: of the recordings, as the user gave it.
     """
     baselines: dict[str, Baseline] = {}
     for recording in replay.recordings:
         raw = recording.path.suffix.lower() == ".csv"
+        held = _remedy(recording.path, rate_hz)
         for track in recording.tracks:
             name = track.sensor
             if name in known or len(track.counts) < FEWEST_RECORDED:
@@ -137,23 +137,38 @@ def free_baselines(
             try:
                 stretch = free_stretch(track.counts)
             except BaselineRefusedError as refusal:
-                replay.notes.append(f"sensor {name}: {refusal}")
+                replay.notes.append(f"sensor {name}: {refusal}. {held}")
                 continue
+            doubt = "" if stretch.touched else f". Its readings hardly change: is the pad free, or held? {held}"
             if stretch.opens and not opening:
-                if not stretch.touched:
-                    replay.notes.append(f"sensor {name}: zeroed from its first {FEWEST_SCANS} scans{_HELD}")
+                if doubt:
+                    replay.notes.append(f"sensor {name}: zeroed from its first {FEWEST_SCANS} scans{doubt}")
                 continue
             first, last = int(stretch.rows[0]), int(stretch.rows[-1])
             at_ns = replay.times_ns(name)[[first, last]]
+            how = "still and pressed least"
+            if stretch.within_counts is not None:
+                how = f"pressed least; it recovers there: a taxel may be off by {stretch.within_counts:.0f} counts"
             replay.notes.append(
                 f"sensor {name}: zeroed from its scans {first + 1} to {last + 1}, {at_ns[0] / 1e9:.1f} to "
-                f"{at_ns[1] / 1e9:.1f} s, where the pad is still and pressed least{'' if stretch.touched else _HELD}"
+                f"{at_ns[1] / 1e9:.1f} s, where the pad is {how}{doubt}"
             )
             if raw and name in mountings:
                 stretch = stretch._replace(counts=mountings[name].place_counts(stretch.counts))
             created_s = (replay.first_ns + int(at_ns[1]) + (recording.unix_offset_ns or 0)) / 1e9
-            baselines[name] = stretch.baseline(name, created_s)
+            undated = opening and not recording.unix_offset_ns
+            baselines[name] = stretch.baseline(name, math.nan if undated else created_s)
     return baselines
+
+
+def _remedy(path: Path, rate_hz: float | None) -> str:
+    """Return what to do about a recording whose pad may never be free."""
+    rate = "" if rate_hz is None else f" --rate-hz {rate_hz:g}"
+    return (
+        "If it holds something all the time, take the baseline of a recording of this sensor in which it lets go: "
+        f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {quote(str(path))}{rate} "
+        "--baseline zero.json shows patterns, marked as not to be believed"
+    )
 
 
 def _named(pad: SensorGeometry) -> str | ModelMap:

@@ -320,7 +320,7 @@ class Rounds:
     def _heed(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
         if notice.kind in ("lost", "silent", "back"):
-            self._runtime.lose_touch(notice.sensors)
+            self._runtime.lose_touch(notice.sensors, same_pad=not notice.text)  # no text: a recording jumped
             self._silence.begin_anew(notice.time_ns, notice.sensors)
         if notice.text:
             self._tell(Event.of(notice))

@@ -14,7 +14,7 @@ BUCKETS_PER_OCTAVE: Final = 32
 SHORTEST_NS: Final = 1_000_000_000
 """Shortest run whose rate is reported: the first scans have waited for the model and come at once, and over less time
 100 Hz looks like 135."""
-STAGES: Final = ("zeroing", "incomplete", "idle", "dropped", "contact")
+STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 LONGEST_US: Final = 2.0**26
 """Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
@@ -196,11 +196,13 @@ class Statistics:
             why = {
                 "zeroing": f"not zeroed, {result.note or 'too few scans'}; or pass --baseline, of the free pad",
                 "incomplete": result.note or "a taxel was not received",
+                "baseline_in_doubt": result.note,
                 "idle": None if self.patterns else NO_CONTACT,
                 "dropped": "newer scans overtook all that were in contact",
             }.get(result.state)
+            believed = " to be believed" if result.state == "baseline_in_doubt" else ""
             if why is not None:
-                lines.append(f"sensor {name} has no pattern: {why}")
+                lines.append(f"sensor {name} has no pattern{believed}: {why}")
         return lines
 
 

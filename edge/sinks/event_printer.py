@@ -27,6 +27,7 @@ class MessageSink(Sink):
         stream: TextIO | None = None,
         *,
         hint: Callable[[], str] | None = None,
+        first: str | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin without an event.
@@ -34,8 +35,10 @@ class MessageSink(Sink):
         Args:
             stream: output; stderr by default.
             hint: returns advice while no scan has come at all; it is printed at growing intervals.
+            first: printed with the first result.
             clock_s: monotonic, in [s].
         """
+        self._first = first
         self._stream = sys.stderr if stream is None else stream
         self._hint = hint
         self._clock_s = clock_s
@@ -46,12 +49,15 @@ class MessageSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Print the events before this scan, and once in a contact that its pattern is not to be believed."""
         self._hint = None
+        if self._first is not None:
+            self._say(self._first)
+            self._first = None
         for event in result.events:
             self.say(event)
         sensor = result.scan.sensor
         if result.contact is False:
             self._doubted.discard(sensor)
-        elif result.trusted is False and sensor not in self._doubted:
+        elif result.state == "contact" and result.trusted is False and sensor not in self._doubted:
             self._doubted.add(sensor)
             self._say(f"sensor {sensor}: pattern not to be believed: {result.untrusted_text}")
 

@@ -135,10 +135,14 @@ class StatusSink(Sink):
         words = [(0, f"{name} {result.state}")]
         if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
+        if result.state == "baseline_in_doubt":
+            return f"{name} BASELINE IN DOUBT: zero the free pad"
         if result.dead:
             words.append((0, f"without taxel {','.join(map(str, result.dead))}"))
         if result.drift is not None and result.drift.step_counts:
             words.append((1, f"rest off by {result.drift.step_counts:.0f}"))
+        if result.trusted is None and result.pattern is not None:
+            words.append((1, "not checked"))
         if result.trusted is False:
             words.append((0, f"NOT BELIEVED ({result.untrusted_reason})"))
         if result.contact:

@@ -109,7 +109,7 @@ def _window(session: ModelSession, severity: str, window: NDArray[np.float32]) -
 
 def _scan(session: ModelSession, severity: str, raw: NDArray[np.int32]) -> Case:
     """Return the case of a scan after a free pad, in a runtime that fills in dead taxels."""
-    baseline = Baseline.of("4", _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="file")
+    baseline = Baseline.of("4", _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="start-up")
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
     runtime = Runtime(session, source="replay", baselines={"4": baseline}, estimator=estimator)
     series, largest, states = ScanSeries("4", USPA44), 0.0, []

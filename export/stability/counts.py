@@ -45,7 +45,7 @@ def cases(quick: bool = False) -> Iterator[Case]:
 
 def _around(rest: int) -> Case:
     """Return the case of a press on a pad whose taxels rest at `rest`, stored in 16 bits."""
-    baseline = Baseline.of("4", _even(rest).astype(np.float32), created_unix_s=0.0, scans=_SCANS, origin="file")
+    baseline = Baseline.of("4", _even(rest).astype(np.float32), created_unix_s=0.0, scans=_SCANS, origin="start-up")
     raw = (_even(rest) + _PRESS) % 65536
     zeroed, run_ms = timed(lambda: deformation(raw, baseline))
     apart = float(np.abs(zeroed - _PRESS).max())

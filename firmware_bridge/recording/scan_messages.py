@@ -1,7 +1,7 @@
 """Messages of scans, baselines and sensors: all the data needed to play a recording again, bit for bit. No I/O."""
 
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
-from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
+from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline, Origin
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
 BASELINE_NAME: Final = "tactile_edge_sr/msg/Baseline"
@@ -158,7 +158,7 @@ def encode_baseline(baseline: Baseline, frame: str, age_s: float | None, unix_ns
 
 
 def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> Baseline:
-    """Decode the baseline in a message, with the origin "file".
+    """Decode the baseline in a message, with the origin that it had in the recorded run.
 
     Raises:
         CdrError: it is no baseline message, or a value is impossible.
@@ -178,7 +178,8 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
     inside = np.isnan(counts) | ((counts >= 0) & (counts <= HIGHEST_COUNT + 1))
     _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
     counts.setflags(write=False)
-    return Baseline(sensor, counts, created_unix_s, scans, "file", fields["id"])
+    origin: Origin = fields["origin"] if fields["origin"] in get_args(Origin) else "file"
+    return Baseline(sensor, counts, created_unix_s, scans, origin, fields["id"])
 
 
 def encode_sensor(sensor: str, frame: str, facts: str, unix_ns: int) -> bytes:

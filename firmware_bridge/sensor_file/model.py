@@ -3,6 +3,7 @@
 This module holds its content and its reading; `toml_writer` writes it.
 """
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -247,11 +248,12 @@ def _numbers(expected: str, count: int, value: Any) -> tuple[float, ...]:
 def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:
     table = Table(path, f"sensors.{name}.baseline.", values)
     expected_id = table.take("id", text_value, required=False)
-    created_unix_s = table.take("created_unix_s", between(1, LAST_UNIX_S))
+    created_unix_s = table.take("created_unix_s", between(1, LAST_UNIX_S), required=False)
     scans = table.take("scans", whole)
     axes = [table.take(axis, partial(_rest_counts, geometry)) for axis in AXES]
     table.end()
-    baseline = Baseline.of(name, np.stack(axes), created_unix_s, scans, "file")
+    dated = math.nan if created_unix_s is None else created_unix_s
+    baseline = Baseline.of(name, np.stack(axes), dated, scans, "file")
     if expected_id not in (None, baseline.id):
         table.refuse(
             "id", repr(expected_id), f"'{baseline.id}', which the counts give, or none; the baseline was changed"

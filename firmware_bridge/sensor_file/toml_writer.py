@@ -4,6 +4,7 @@ So a pad's numbers have the same arrangement in the file as on the pad, and comm
 """
 
 import json
+import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -207,7 +208,7 @@ def _baseline_lines(baseline: Baseline) -> list[str]:
     return [
         "# What the free pad reads, in counts, place by place.",
         f"id = {_quoted(baseline.id)}",
-        f"created_unix_s = {baseline.created_unix_s!r}",
+        *([] if math.isnan(baseline.created_unix_s) else [f"created_unix_s = {baseline.created_unix_s!r}"]),
         f"scans = {baseline.scans}",
         *axes,
     ]

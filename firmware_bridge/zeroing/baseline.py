@@ -1,6 +1,7 @@
 """Zeroing: the baseline of a free pad, and the difference of a scan to it. Counts wrap round at 2^16."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ CREEP_LIMIT_COUNTS: Final = 10.0
 # Between the 120 counts that warming up adds to a free pad and the 350 that 0.3 N on one taxel add.
 LOAD_LIMIT_COUNTS: Final = 200.0
 
-Origin = Literal["start-up", "demand", "file"]
+Origin = Literal["start-up", "demand", "file", "recording", "unsure"]
 
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
@@ -52,9 +53,10 @@ class Baseline:
         sensor: name of the sensor.
         counts: (3, rows, cols) float32 in 0..65536, read-only; NaN where a taxel was silent. These are subtracted:
             `id` identifies them as they were taken, `moved` adds the drift since.
-        created_unix_s: time at which it was taken, in [s] since 1970.
+        created_unix_s: time of its scans, in [s] since 1970; NaN if it is unknown.
         scans: number of scans whose median it is.
-        origin: taken at this start-up, or later on demand, or loaded from a file.
+        origin: taken at this start-up, or later on demand, or loaded from a file; or from the very recording that is
+            played: "recording" where the pad is free, "unsure" where it may hold something all the time.
         id: short text that identifies sensor, counts and time.
     """
 
@@ -226,7 +228,7 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orde
         {
             "id": baseline.id,
             "sensor": baseline.sensor,
-            "created_unix_s": baseline.created_unix_s,
+            "created_unix_s": None if math.isnan(baseline.created_unix_s) else baseline.created_unix_s,
             "scans": baseline.scans,
             "counts": baseline.counts.tolist(),
             **({"order": list(orders[baseline.sensor])} if baseline.sensor in orders else {}),
@@ -349,8 +351,10 @@ def _read_entry(path: Path, entry: Any) -> Baseline:
     sensor, created_unix_s, scans = entry.get("sensor"), entry.get("created_unix_s"), entry.get("scans")
     if not isinstance(sensor, str) or not is_sensor_name(sensor):
         _refuse_file(path, "sensor", sensor, f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
-    if not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
-        _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970")
+    if created_unix_s is None:
+        created_unix_s = math.nan
+    elif not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
+        _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970, or null")
     if type(scans) is not int or not 1 <= scans < 2**31:
         _refuse_file(path, "scans", scans, "a whole number from 1")
     baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")

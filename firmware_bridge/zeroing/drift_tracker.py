@@ -55,9 +55,6 @@ SLOW_PER_S: Final = 1.0
 """Rate of the common drift, in [counts/s], up to which a taxel's own drift is not followed while one may be touched."""
 STILL_COUNTS: Final = 7.0
 """Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
-FOREIGN_COUNTS: Final = 100.0
-"""Median change of taxels, on each axis, at which a stored baseline may be of another pad: rests of pads differ by
-hundreds of counts, those of one pad by ten in a day."""
 STEP_COUNTS: Final = 15.0
 """Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause. A
 smaller change of a single taxel stays in the readings as well, a common one is followed."""
@@ -92,8 +89,7 @@ class DriftTracker:
     Attributes:
         counts: (3, rows, cols) float32, to be added to the baseline; a new array whenever it changes.
         summary: the same in a few numbers, with the step that stays in the readings.
-        note: message to the user while a step or a doubtful contact lasts, with the figures from its beginning.
-        doubted: True where there is a contact that looks like drift.
+        note: message to the user while a step lasts, with the figures from its beginning.
     """
 
     def __init__(self, baseline: Baseline) -> None:
@@ -101,7 +97,6 @@ class DriftTracker:
         self.counts: NDArray[np.float32] = np.zeros_like(baseline.counts)
         self.summary = Drift()
         self.note: str | None = None
-        self.doubted = False
         self._baseline = baseline
         self._unzeroed = np.isnan(baseline.counts).any(axis=0)
         self._dead: NDArray[np.bool_] | None = None
@@ -119,7 +114,7 @@ class DriftTracker:
 
         Args:
             scan: next scan of the sensor.
-            contact: True during a tap.
+            contact: True during a tap, and while the baseline is in doubt.
             dead: taxels (rows, cols) that are ignored; a new array only where they have changed.
 
         Returns:
@@ -129,7 +124,7 @@ class DriftTracker:
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns
         if contact != self._contact or dead is not self._dead or not 0 <= since_ns <= GAP_NS:
             return self._interrupt(scan, contact, dead)
-        if time_ns < self._next_ns:
+        if contact or time_ns < self._next_ns:
             return False
         if scan.complete or bool((scan.fresh | dead).all()):
             self._block.append(scan.counts)
@@ -161,7 +156,6 @@ class DriftTracker:
         self._all_live = bool(self._live.all())
         self._begin_block(scan.time_ns)
         self._stop()
-        self.doubted = False
         before, self.note = self.note, self._step_note()
         return self.note != before
 
@@ -222,16 +216,7 @@ class DriftTracker:
         self._quiet_blocks = self._quiet_blocks + 1 if still else 0
         if self._quiet_blocks < REST_BLOCKS:
             return False
-        return self._doubt(level) if self._contact else self._settle(level)
-
-    def _doubt(self, level: NDArray[np.float32]) -> bool:
-        """Doubt a still contact that all taxels read alike: no surface causes it."""
-        common, own = self._parts(level - self.counts)
-        self.doubted = bool((np.abs(own) <= TOUCH_COUNTS + OWN_SHARE * np.abs(common)).all())
-        before, self.note = self.note, None
-        if self.doubted:
-            self.note = f"all taxels alike read {common[-1, 0, 0]:.0f} counts on z: if nothing touches, zero again"
-        return self.note != before
+        return self._settle(level)
 
     def _settle(self, level: NDArray[np.float32]) -> bool:
         self._resting = True
@@ -296,12 +281,7 @@ class DriftTracker:
         where = "all taxels alike, as drift or another attitude" if alike else f"taxel {row * shown.shape[2] + col}"
         above = "above" if counts > 0 else "below"
         what = f"rest level {abs(counts):.0f} counts {above} the one before on {AXES[axis]} ({where})"
-        note = f"{what} {self._cause}: free the pad and zero again"
-        # Stored baselines are of a pad: fingers may be swapped, or a pad replaced.
-        foreign = np.median(np.abs(own), axis=(1, 2)).min() > FOREIGN_COUNTS
-        if foreign and self._cause == _ZEROED and self._baseline.origin == "file":
-            note += "; most taxels differ: is this baseline of another pad (fingers swapped)?"
-        return note
+        return f"{what} {self._cause}: free the pad and zero again"
 
 
 def _alike(common: NDArray[np.float32], own: NDArray[np.float32]) -> bool:

@@ -1,5 +1,6 @@
 """Search of a recording for the scans during which its pad is free and still."""
 
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ FREEST_SHARE: Final = 0.01
 MOST_TRIES: Final = 2000
 """Places of a long recording at which a stretch may begin, so that the search ends within a second or two."""
 
+RECOVERY_COUNTS: Final = 60.0
+"""Largest spread of a taxel during the freest scans: real pads recover by some tens of counts in the second after a
+grip."""
 TOUCH_COUNTS: Final = 1500.0
 """Rise of the summed z that is a contact, some 1.3 N; a free pad warms by less within a recording."""
 FEWEST_TOUCHED: Final = 5
@@ -31,28 +35,31 @@ class Stretch(NamedTuple):
         counts: (n, 3, rows, cols) raw counts of them.
         touched: True if something touches the pad elsewhere in the recording. Without it, a pad that holds something
             all the time cannot be distinguished from a free one.
+        within_counts: how far the level of a taxel may be off, where the pad still recovers; None where it is still.
     """
 
     rows: NDArray[np.intp]
     counts: NDArray[np.int32]
     touched: bool
+    within_counts: float | None = None
 
     @property
     def opens(self) -> bool:
         """True if a live run would zero from it: it begins the recording, and is as long as a zeroing."""
-        return len(self.rows) >= FEWEST_SCANS and bool(self.rows[0] == 0)
+        return self.within_counts is None and len(self.rows) >= FEWEST_SCANS and bool(self.rows[0] == 0)
 
     def baseline(self, sensor: str, created_unix_s: float) -> Baseline:
-        """Return the baseline of these scans, taken at a time in [s] since 1970."""
+        """Return the baseline of these scans, taken at a time in [s] since 1970, NaN if that is unknown."""
         taken = Baseline.from_counts(sensor, self.counts, created_unix_s)
-        return Baseline.of(sensor, taken.counts, created_unix_s, taken.scans, "file")
+        return replace(taken, origin="recording" if self.touched else "unsure")
 
 
 def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     """Return the stretch with the lowest z in which the pad is still, of FEWEST_RECORDED to FEWEST_SCANS scans.
 
     A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
-    may lie above the freest scans of the whole recording, as with an earlier baseline.
+    may lie above the freest scans of the whole recording, as with an earlier baseline. Where the pad is still nowhere,
+    but was let go of, these are the freest FEWEST_RECORDED scans.
 
     Args:
         counts: (n, 3, rows, cols) raw counts of all scans of a sensor; ABSENT where a taxel gave no reading.
@@ -74,12 +81,17 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     level = np.convolve(z, np.ones(FEWEST_RECORDED), "valid")
     begins = np.arange(0, len(level), max(1, len(level) // MOST_TRIES))
     least: BaselineRefusedError | None = None
-    for begin in begins[np.argsort(level[begins], kind="stable")].tolist():
+    freest_first = begins[np.argsort(level[begins], kind="stable")].tolist()
+    for begin in freest_first:
         fault = _fault(taken[begin : begin + FEWEST_RECORDED], reference)
         if fault is None:
             begin, end = _widest(taken, begin, reference)
             return Stretch(rows[begin:end], taken[begin:end], _touched(z, z[begin:end]))
         least = least or fault
+    lowest = slice(freest_first[0], freest_first[0] + FEWEST_RECORDED)
+    spread = float(np.ptp(np.percentile(unwrapped(taken[lowest]), (5, 95), axis=0), axis=0).max())
+    if spread <= RECOVERY_COUNTS and _touched(z, z[lowest]):
+        return Stretch(rows[lowest], taken[lowest], touched=True, within_counts=spread / 2)
     raise BaselineRefusedError(f"nowhere free and still for {FEWEST_RECORDED} scans; where it is freest, {least}")
 
 

@@ -111,7 +111,7 @@ def with_cell(cell: object) -> list:
         ({"sensor": 4}, "'sensor'"),
         ({"created_unix_s": 0}, "'created_unix_s'"),
         ({"created_unix_s": True}, "'created_unix_s'"),
-        ({"created_unix_s": None}, "'created_unix_s'"),
+        ({"created_unix_s": "5"}, "'created_unix_s'"),
         ({"created_unix_s": float("inf")}, "'created_unix_s'"),
         ({"scans": 0}, "'scans'"),
         ({"scans": 1.0}, "'scans'"),

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from edge_samples import BASELINE, REST
-from test_drift_thresholds import Blocks
 
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
@@ -233,19 +232,6 @@ def test_a_stored_baseline_that_is_far_off_is_told_of():
     assert "since it was zeroed" in pad.events[0]
 
 
-def test_a_contact_that_all_taxels_feel_alike_is_doubted_and_a_grasp_is_not():
-    pad = Pad()
-    pad.play(5)
-    pad.play(5, 120 * AXES * TAXELS, contact=True)
-    assert pad.tracker.doubted and "all taxels alike read 1" in str(pad.tracker.note)
-    pad.play(0.1)
-    assert not pad.tracker.doubted and pad.tracker.note is None
-    grasp = np.zeros((3, 4, 4))
-    grasp[2] = np.linspace(50, 400, 16).reshape(4, 4)
-    pad.play(5, grasp, contact=True)
-    assert not pad.tracker.doubted and pad.tracker.note is None
-
-
 def test_a_dead_taxel_moves_no_other_and_keeps_its_own():
     pad = Pad()
     pad.play(5)
@@ -309,12 +295,3 @@ def test_a_rest_level_is_not_compared_before_the_pad_is_still():
     assert pad.events == []
     pad.play(5, sway * 11)
     assert len(pad.events) == 1 and pad.tracker.summary.step_counts == pytest.approx(440, abs=4)
-
-
-@pytest.mark.parametrize(("origin", "counts", "asked"), [("file", 110, 1), ("file", 90, 0), ("start-up", 110, 0)])
-def test_rests_that_differ_on_most_taxels_may_be_those_of_another_pad(origin, counts, asked):
-    stored = Baseline.of("4", REST.astype(np.float32), 1000.0, 100, origin)
-    apart = np.where(np.arange(48).reshape(3, 4, 4) % 2, counts, -counts)
-    pad = Blocks(baseline=stored)
-    pad.blocks(8, apart)
-    assert pad.event.count("is this baseline of another pad (fingers swapped)?") == asked, pad.tracker.note

@@ -84,7 +84,7 @@ def on_axes(x, y, z):
 def test_a_new_tracker_has_moved_nothing():
     tracker = DriftTracker(BASELINE)
     assert tracker.summary == Drift((0, 0, 0), 0, 0) and not tracker.counts.any()
-    assert tracker.note is None and tracker.doubted is False and tracker.take_event() is None
+    assert tracker.note is None and tracker.take_event() is None
 
 
 def test_after_five_blocks_of_half_a_second_it_is_followed_one_block_late():
@@ -233,36 +233,6 @@ def test_a_restless_block_begins_the_wait_again():
     pad = Blocks()
     pad.blocks(4)
     assert pad.blocks(5, of_z(own=40)) == [False] * 4 + [True]
-
-
-@pytest.mark.parametrize(
-    ("level", "doubted"),
-    [
-        (of_z(40, own=35), True),
-        (of_z(40, own=37), False),
-        (on_axes(0, 0, 40) + of_z(own=1)[::-1] * 10, True),
-        (on_axes(0, 0, 40) + of_z(own=1)[::-1] * 11, False),
-    ],
-)
-def test_a_still_contact_is_doubted_where_all_taxels_feel_it_alike(level, doubted):
-    pad = resting()
-    pad.contact = True
-    assert pad.push(level) is False
-    assert pad.blocks(6, level) == [False] * 4 + [doubted, False]
-    note = "all taxels alike read 40 counts on z: if nothing touches, zero again"
-    assert pad.tracker.doubted is doubted and pad.tracker.note == (note if doubted else None)
-    pad.contact = False
-    assert pad.push() is doubted and pad.tracker.doubted is False and pad.tracker.note is None
-
-
-def test_a_doubted_contact_is_over_what_has_been_followed():
-    pad = resting()
-    for _ in range(7):
-        pad.block(of_z(30))
-    pad.contact = True
-    pad.push(of_z(70))
-    pad.blocks(5, of_z(70))
-    assert pad.tracker.note == "all taxels alike read 40 counts on z: if nothing touches, zero again"
 
 
 @pytest.mark.parametrize(("own", "kept", "told"), [(8, 0, False), (9, 9, False), (15, 15, False), (-16, -16, True)])

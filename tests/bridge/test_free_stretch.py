@@ -23,10 +23,8 @@ def test_the_freest_still_scans_are_taken_wherever_they_are():
     stretch = free_stretch(counts)
     assert stretch.rows[0] >= 349 and stretch.rows[-1] < 411 and len(stretch.rows) >= 50
     baseline = stretch.baseline("4", 5.0)
-    assert np.abs(baseline.counts - 30000).max() < 3 and (baseline.scans, baseline.origin) == (
-        len(stretch.rows),
-        "file",
-    )
+    assert np.abs(baseline.counts - 30000).max() < 3
+    assert (baseline.scans, baseline.origin) == (len(stretch.rows), "recording")
     assert not stretch.opens and stretch.touched
 
 
@@ -34,6 +32,26 @@ def test_a_still_grip_is_not_free():
     """Still for longer than any other part, and loaded: the pad is free elsewhere, if never for long enough."""
     with pytest.raises(BaselineRefusedError, match=r"nowhere free and still for 30 scans.*"):
         free_stretch(scans((200, 1000), (40, None), (FEWEST_RECORDED - 5, 0), (40, None)))
+
+
+def recovering(scans, counts, seed=3):
+    """Counts of a pad that recovers by so many counts a taxel on z after a grip."""
+    rng = np.random.default_rng(seed)
+    grip = 30000 + rng.normal(0, 2, (40, 3, 4, 4))
+    grip[:, 2] += 600 + 20 * np.sin(np.arange(40))[:, None, None]
+    free = 30000 + rng.normal(0, 2, (scans, 3, 4, 4))
+    free[:, 2] += counts * np.linspace(1, 0, scans)[:, None, None]
+    return np.concatenate([grip, free]).round().astype(np.int32)
+
+
+def test_where_a_pad_only_recovers_its_freest_scans_are_taken_with_their_uncertainty():
+    stretch = free_stretch(recovering(38, 40))
+    assert stretch.touched and not stretch.opens and stretch.rows.tolist() == list(range(48, 78))
+    assert stretch.within_counts == pytest.approx(16, abs=5)
+    assert np.abs(stretch.baseline("4", 5.0).counts - 30000).max() < 16 + 8
+    assert free_stretch(recovering(200, 40)).within_counts is None, "still at its end"
+    with pytest.raises(BaselineRefusedError, match="nowhere free and still"):
+        free_stretch(recovering(38, 200))
 
 
 def test_a_free_beginning_is_where_a_live_run_zeroes():

@@ -62,7 +62,9 @@ def test_stop_at_an_area(cook):
         (latest(dead={3: "stuck"}), "the sensor is not ready: idle"),
         (latest(state="incomplete", note="taxel 3 was not received"), "not ready: taxel 3 was not received"),
         (latest(trusted=False, state="contact", area_mm2=200.0), "not to be believed"),
-        (latest(state="contact", area_mm2=61.0), "area reached"),
+        (latest(state="baseline_in_doubt", trusted=False, area_mm2=61.0, note="zero again"), "not ready: zero again"),
+        (latest(state="contact", area_mm2=61.0), "a large area, but not checked"),
+        (latest(state="contact", area_mm2=61.0, trusted=True), "area reached"),
     ):
         readings, done = iter([latest(), latest(state="contact", area_mm2=5.0), wrong]), []
         stream = SimpleNamespace(latest=readings.__next__)
@@ -83,6 +85,7 @@ def test_a_force_is_held(cook):
         latest(age_s=31),
         latest(force_counts=None),
         latest(dead={1: "stuck"}),
+        latest(state="baseline_in_doubt"),
         api.Latest(None, float("inf"), "up", new=False, skipped=0),
     ):
         assert recipe.speed_mm_s(wrong) == 0.0

@@ -356,7 +356,9 @@ def test_a_recording_is_examined_but_not_pressed(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)
-    assert cli.main(["doctor", "--source", f"replay:{tmp_path}/r.npz", "--json"]) == 0
+    kept = tmp_path / "sensor.toml"
+    assert cli.main(["doctor", "--source", f"replay:{tmp_path}/r.npz", "--json", "--out", str(kept)]) == 0
+    assert np.isnan(load_sensor_file(kept).baselines["4"].created_unix_s), "nobody knows of when it is"
     document = json.loads(out.getvalue())
     assert document["kind"] == "replay" and not any(one["sensor"] is None for one in document["findings"])
     assert "cannot be pressed" in document["findings"][-1]["remedy"]

@@ -85,7 +85,8 @@ class TestReplay:
         assert {record["baseline"] for record in got} == {BASELINE.id}
         assert all(record["force_n"] is None for record in got)
         lines = done.stderr.splitlines()
-        assert re.match(r"REPLAY replay:.*taps.npz: 40 scans, \d+ patterns \(\d+ reused\), \d+ dropped", lines[0])
+        assert lines[0] == "edge-sr: model tiny has no checks: act on no pattern of it"
+        assert re.match(r"REPLAY replay:.*taps.npz: 40 scans, \d+ patterns \(\d+ reused\), \d+ dropped", lines[1])
         assert re.search(r"rate held: (29|30)\.\d Hz \(sensor 4\), 30 Hz asked for", done.stderr)
         assert "p50" in done.stderr and "\x1b" not in done.stderr
 
@@ -233,5 +234,5 @@ class TestDemo:
         assert [(int(row[0]), int(row[2])) for row in rows] == [(n, n) for n in (1, 2, 3, 4)]
         angles_deg = [int(row[1]) for row in rows]
         assert np.diff(angles_deg).tolist() == [-5, -5, -5]
-        assert re.search(r"^taxels, 4 x 4 +super-resolved, 40 x 40 +truth$", done.stdout, re.MULTILINE)
+        assert re.search(r"^taxels, 4 x 4 +not checked, 40 x 40 +truth$", done.stdout, re.MULTILINE)
         assert "\x1b" not in done.stdout and "@" in done.stdout

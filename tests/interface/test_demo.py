@@ -157,7 +157,7 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
         ["now", "a", "magnet", "comes"],
     ]
     assert second[::2] == first[::2]
-    assert first[1].startswith("no tap was dropped") and first[3].startswith("0 of 2 patterns with the magnet")
+    assert first[1].startswith("no tap was dropped") and first[3] == "none of 2 patterns with the magnet was checked"
     assert second[1] == "earlier taps were dropped 1 times" and second[3].startswith("1 of 2 patterns with the magnet")
     assert len(told_of_scenes(results[:7], tmp_path / "scenes.npz")) == 3, "a scene that is cut off has no outcome"
 
@@ -222,7 +222,7 @@ def test_the_picture_shows_taxels_result_and_truth_on_their_scales(recording):
     score = play(recording).scores()[0]
     text = score_picture(score, 80, "plain")
     title, *_, scale = text.splitlines()
-    assert title.split("  ")[0] == "taxels, 4 x 4" and "super-resolved, 40 x 40" in title and title.endswith("truth")
+    assert title.split("  ")[0] == "taxels, 4 x 4" and "not checked, 40 x 40" in title and title.endswith("truth")
     assert scale.count(f" {score.result.pattern.max():.3g} mm") == 2 and "counts" in scale
     louder = score_picture(dataclasses.replace(score, truth=score.truth * 100), 80, "plain")
     assert louder.splitlines()[-1].count(f" {score.truth.max() * 100:.3g} mm") == 2

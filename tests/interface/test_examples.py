@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
+from trust_samples import make_trusted_contract
 
 from edge.api import Result
 from edge.perception.event import Note
@@ -85,7 +86,7 @@ def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
     process.stdout.close()
     assert (process.stderr.read(), process.wait(TIMEOUT_S)) == ("", 0)
     write_recording(tmp_path / "rest.npz", [0] * 100)
-    write_model(tmp_path / "tiny.onnx")
+    write_model(tmp_path / "tiny.onnx", make_trusted_contract())
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
     known = ("--model", tmp_path / "tiny.onnx", "--sensor", tmp_path / "s.toml", *PATIENT, "--pretend")
     process = start(empty, "stop_on_area.py", "--source", f"replay:{tmp_path}/rest.npz", "--area-mm2", "20", *known)
@@ -97,7 +98,7 @@ def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
 def closing(empty, tmp_path):
     """A gripper that closes on nothing, and the emulator whose cable can be pulled."""
     write_recording(tmp_path / "rest.npz", [0] * 100)
-    write_model(tmp_path / "tiny.onnx")
+    write_model(tmp_path / "tiny.onnx", make_trusted_contract())
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
     command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop"]
     with subprocess.Popen(
@@ -173,6 +174,13 @@ WRONG = {
     "not ready: taxel 3 was not received": {"state": "incomplete", "notes": (SILENT,), "force_counts": None},
     "not ready: zeroing": {"state": "zeroing", "force_counts": None},
     "not to be believed: readings like no contact": {"state": "contact", "area_mm2": 50.0} | UNTRUSTED,
+    "50 mm2 touch": {"state": "contact", "area_mm2": 50.0},
+    "not ready: zero again": {
+        "state": "baseline_in_doubt",
+        "notes": (Note("baseline_in_doubt", "zero again"),),
+        "trusted": False,
+        "area_mm2": 50.0,
+    },
     "the force is 21000 counts": {"state": "dropped", "force_counts": 21_000.0},
 }
 
@@ -207,7 +215,7 @@ def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     assert gripper.done == []
     grip.follow(reading(sensor="right"))
     assert gripper.done == ["close"]
-    grip.follow(reading("contact", "right", area_mm2=20.0))
+    grip.follow(reading("contact", "right", area_mm2=20.0, trusted=True))
     assert gripper.done == ["close", "stop"] and grip.reached
 
 

@@ -133,14 +133,15 @@ def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plu
     contract = make_contract(traction_scale=2)
     pattern = np.zeros((40, 40), dtype=np.float32)
     pattern[3, 7], pattern[0, 0], pattern[1, 1] = 0.15, -0.1, 9.0
-    one = replace(pressed, pattern=pattern, deviation=pattern / 10)
+    one = replace(pressed, pattern=pattern, deviation=pattern / 10, trusted=True)
     image = observation.image_of(one, contract, 0.3)
     assert image[3, 7].tolist() == [128, 13, 255] and image[0, 0, 0] == 0 and image[1, 1, 0] == 255
-    assert observation.image_of(replace(one, trusted=False), contract, 0.3)[..., 2].max() == 0
+    for doubt in ({"trusted": False}, {"trusted": None}, {"state": "baseline_in_doubt", "contact": None}):
+        assert observation.image_of(replace(one, **doubt), contract, 0.3)[..., 2].max() == 0
     assert observation.image_of(replace(free, pattern=None), contract, 0.3)[..., 2].min() == 255, "nothing touches"
     unknown = replace(one, pattern=None, deviation=None, contact=None, zeroed=None, wrench=None, state="zeroing")
     assert not observation.image_of(unknown, contract, 0.3).any()
-    state = observation.state_of(pressed, contract)
+    state = observation.state_of(replace(pressed, trusted=True), contract)
     assert [state[name] for name in observation.WRENCH] == [*pressed.wrench.force_n, *pressed.wrench.torque_n_mm]
     assert state["taxel_z_5"] == pressed.zeroed[2, 1, 1] and state["believed"] == 1
     assert observation.state_of(unknown, contract)["believed"] == 0

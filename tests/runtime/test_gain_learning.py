@@ -240,6 +240,7 @@ class Run:
         self.results = []
         self._series = ScanSeries("4", USPA44)
         self._rng = np.random.default_rng(3)
+        self.tap(np.zeros((3, 4, 4)))  # a contact begins from rest
 
     def tap(self, contact, scans=1):
         for felt in [contact] * scans + [np.zeros((3, 4, 4))]:

@@ -274,7 +274,7 @@ def test_what_a_link_tells_reaches_runtime_and_sinks_in_its_place(kind):
     batches = [[scan] for scan in scans(range(10))]
     order = []
     runtime = Runtime(FakeModel(), source="device", baselines=BASELINES)
-    runtime.lose_touch = lambda sensors: order.append("lost touch")
+    runtime.lose_touch = lambda sensors, **_: order.append("lost touch")
     sink = ListSink(on_write=lambda result: order.append(result.scan.number))
     sink.tell = lambda event, counters: order.append((event.kind, event.text))
     statistics = run(Telling(batches, 5, kind), sink, runtime=runtime)

@@ -79,15 +79,6 @@ def test_in_contact_it_is_refused_unless_forced():
     assert results[-1].contact is False and abs(results[-1].force_counts) < 100
 
 
-def test_a_contact_that_all_taxels_feel_alike_may_be_zeroed_without_force():
-    bench = Bench()
-    results = bench.play(400, 120)
-    assert results[-1].contact and "all taxels alike read 12" in results[-1].note
-    bench.runtime.zero()
-    results = bench.play(120, 120)
-    assert "zeroed on demand" in events(results)[0] and results[-1].contact is False
-
-
 def test_motion_puts_it_off_and_a_touch_meanwhile_starts_it_over():
     bench = Bench()
     bench.play(5)

@@ -44,7 +44,7 @@ def test_a_contact_gives_a_pattern_and_all_that_is_known():
     assert result.area_mm2 == pytest.approx(4.7**2)
     assert result.centroid_mm == pytest.approx((-2.35, -2.35))
     assert result.baseline is BASELINE and result.baseline_age_s == 60.0
-    assert result.note is None
+    assert result.note == "not checked: the model has no checks"
     assert result.deviation is result.interval_mm is None, "the model gives none"
 
 
@@ -345,7 +345,8 @@ def test_a_reading_that_lay_about_is_told():
     notes = []
     for number, delay_ns in enumerate([0, 50_000_000, 50_000_001, 0]):
         scan = make_scan(number, press_counts=3000)
-        notes.append(runtime.push(dataclasses.replace(scan, device_ns=scan.time_ns - delay_ns)).note)
+        told = runtime.push(dataclasses.replace(scan, device_ns=scan.time_ns - delay_ns)).notes
+        notes.append(next((note.text for note in told if note.kind == "late"), None))
     assert notes == [None, None, "this reading was 0.05 s old when it arrived", None]
 
 

@@ -104,7 +104,7 @@ def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
         held = runtime.push(saturated(number, counts))
         np.testing.assert_array_equal(held.pattern, pattern)
         assert (
-            held.note
+            held.notes[0].text
             == "its last reading is held, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
         )
     gone = runtime.push(saturated(HOLD_SCANS + 1, counts))
@@ -112,7 +112,7 @@ def test_a_chip_at_the_end_of_its_range_has_no_reading(counts):
     assert gone.note == "no pattern, taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
     for number in range(BACK_SCANS):
         back = runtime.push(make_scan(HOLD_SCANS + 2 + number, press_counts=PRESS))
-    assert back.state == "contact" and back.note is None and back.dead == {}
+    assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
 
 
 def test_a_count_from_the_end_is_a_reading():

@@ -111,7 +111,7 @@ class TestJsonLines:
             "dead": {},
             "filled": None,
             "gains_certainty": None,
-            "note": None,
+            "note": "not checked: the model has no checks",
             "event": None,
             "counters": RUN,
             "pattern_unit": "mm",

@@ -10,7 +10,7 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import BASELINE, make_contract, make_scan
 
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2.diagnostics import Level
@@ -60,6 +60,15 @@ def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
     (status,) = statuses()
     assert status[0] == Level.WARN
     assert status[1].startswith("pattern not to be believed: the pattern does not explain its readings")
+    clock.now_ns += 1_000_000_000
+    doubt = {
+        "state": "baseline_in_doubt",
+        "contact": None,
+        "trusted": False,
+        "notes": (Note("baseline_in_doubt", "why"),),
+    }
+    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubt), {"dropped": 2})
+    assert statuses() == [(Level.ERROR, "why")]
     published.clear()
     sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
     sink.close()

@@ -164,10 +164,10 @@ class TestLayout:
         choices = {field.name: field.kind.words for field in IN_MEMORY if field.kind.words}
         assert choices == {
             "source": ("device", "replay", "emulated"),
-            "state": ("zeroing", "incomplete", "idle", "contact", "dropped"),
+            "state": ("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"),
             "filled": ("rest", "neighbours"),
             "wrench_origin": ("nominal", "calibrated"),
-            "untrusted_reason": ("stuck", "unfamiliar", "unexplained", "sensor"),
+            "untrusted_reason": ("stuck", "unfamiliar", "unexplained", "sensor", "baseline"),
             "estimate": ("network", "smooth"),
         }
 

@@ -122,11 +122,18 @@ class TestReading:
             assert refused.startswith(f"its source is {source}, not a device: --pretend")
             assert shm_read.latest(memory, "4", **young, pretend=True) is not None
 
+    def test_a_baseline_in_doubt_is_nothing_to_act_on(self, sink, name):
+        memory, result = attach(name), make_result(7, press_counts=3000)
+        scan = replace(result.scan, time_ns=time.monotonic_ns())
+        sink.write(replace(result, scan=scan, source="device", state="baseline_in_doubt", trusted=False), {})
+        assert "baseline is in doubt" in str(shm_read.refusal(shm_read.newest(memory)["4"], oldest_s=60))
+
     def test_a_depth_that_is_not_to_be_believed_is_not_shown(self, sink, name):
         memory, result = attach(name), make_result(7, press_counts=3000)
         untrusted = replace(result, trusted=False, untrusted_reason="unfamiliar")
         for shown, line in (
-            (result, r"\d+ counts, [\d.]+ mm at most"),
+            (replace(result, trusted=True), r"\d+ counts, [\d.]+ mm at most"),
+            (result, r"\d+ counts, pattern not checked"),
             (untrusted, r"\d+ counts, pattern not to be .*"),
         ):
             sink.write(shown, {})
@@ -135,7 +142,7 @@ class TestReading:
     @pytest.mark.parametrize(
         ("words", "line"),
         [
-            (["left/4", "--pretend"], r"\d+ counts, [\d.]+ mm at most"),
+            (["left/4", "--pretend"], r"\d+ counts, pattern not checked"),
             (["left/4"], "nothing to act on: its source is emulated, not a device: .*"),
             (["5"], "nothing to act on: no sensor 5, but left/4.*"),
         ],

@@ -84,7 +84,7 @@ class TestStatus:
         for result in make_results(4, clock_ns=lambda: next(ticks)):
             sink.write(result, RUN)
         assert sink.line() == (
-            "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz"
+            "EMULATED | 4 contact not checked tap 1 3002 counts 22 mm2 250 us 100 Hz"
             " | 6 no stored baseline for sensor 6, only for 4: zeroing | 2 dropped | 1 overrun | 3 torn"
             f" | baseline {BASELINE.id} 12 s old"
         )
@@ -92,8 +92,8 @@ class TestStatus:
     @pytest.mark.parametrize(
         ("columns", "line"),
         [
-            (150, "EMULATED | 4 contact tap 1 3002 counts 22 mm2 250 us 100 Hz | 6 no stored baseline for sensor 6"),
-            (132, "EMULATED | 4 contact 3002 counts 22 mm2 | 6 no stored baseline for sensor 6"),
+            (170, "EMULATED | 4 contact not checked tap 1 3002 counts 22 mm2 250 us 100 Hz | 6 no stored baseline"),
+            (144, "EMULATED | 4 contact not checked 3002 counts 22 mm2 | 6 no stored baseline for sensor 6"),
             (100, "EMULATED | 4 contact 3002 counts | 6 no stored baseline for sensor 6, only for 4: zeroing ..."),
             (60, "EMULATED | 4 contact 3002 counts ..."),
             (20, "EMULATED ..."),
@@ -115,7 +115,7 @@ class TestStatus:
         sink = self.make()
         runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, counts_per_newton=1000)
         sink.write(runtime.push(make_scan(0, press_counts=3000)), {})
-        assert sink.line().startswith("4 contact tap 1 3.00 N 22 mm2 ")
+        assert sink.line().startswith("4 contact not checked tap 1 3.00 N 22 mm2 ")
 
     def test_a_model_that_gives_deviations_says_how_far_off_it_may_be(self):
         sink = self.make()
@@ -134,12 +134,14 @@ class TestStatus:
         sink = self.make()
         result = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}).push(make_scan(press_counts=3000))
         for trusted, reason, words in (
-            (None, None, "4 contact tap 1 "),
+            (None, None, "4 contact not checked tap 1 "),
             (False, "stuck", "4 contact NOT BELIEVED (stuck) tap 1 "),
             (True, None, "4 contact tap 1 "),
         ):
             sink.write(replace(result, trusted=trusted, untrusted_reason=reason), RUN)
             assert sink.line().startswith(words)
+        sink.write(replace(result, state="baseline_in_doubt", contact=None, trusted=False), RUN)
+        assert sink.line().startswith("4 BASELINE IN DOUBT: zero the free pad")
 
     def test_where_to_touch_next_is_shown_from_the_end_of_a_tap(self):
         sink = self.make()

@@ -70,9 +70,7 @@ class TestEndOfTheProgram:
             program.send_signal(signal.SIGTERM)
             words = program.communicate()[1].decode()
         assert program.returncode == EXIT_FORCED
-        assert re.fullmatch(
-            r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words
-        )
+        assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words)
 
 
 def test_the_bench_counts_what_comes():

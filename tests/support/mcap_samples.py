@@ -92,7 +92,7 @@ def messages_alone(
                 for schema, channel, message in make_reader(source).iter_messages(
                     topics, starting_at=start_ns, ending_before=end_ns
                 ):
-                    if channel.id not in channels:
+                    if schema is not None and channel.id not in channels:
                         kind = writer.register_schema(schema.name, schema.encoding, schema.data)
                         channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
                     writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)

@@ -11,7 +11,7 @@ from browser_samples import PERIOD_NS, browser, live, logged, number, open_page,
 from matplotlib.image import imread
 from view_samples import CONTRACT, Press, live_page
 
-from edge.perception.event import Event
+from edge.perception.event import Event, Note
 
 __all__ = ["browser", "open_page"]
 
@@ -73,8 +73,31 @@ def test_a_pattern_that_is_not_believed_cannot_be_taken_for_one_that_is(open_pag
     with live_page(tmp_path) as shown, shown.playing():
         page = open_page(shown.view.url)
         live(page)
-        playwright.expect(part(page, "verdict")).to_be_hidden()
+        playwright.expect(part(page, "verdict")).to_have_text("not checked: the model has no checks")
         playwright.expect(number(page, "trusted")).to_have_text(re.compile("not checked|\u2013"))
+
+
+def test_while_the_baseline_is_in_doubt_the_pattern_is_grey_with_the_reason_and_the_key_on_it(open_page, tmp_path):
+    doubt = {"state": "baseline_in_doubt", "contact": None, "trusted": False, "untrusted_reason": "baseline"}
+    text = "baseline in doubt: most taxels are off it; free the pad and zero again"
+    with live_page(tmp_path) as shown:
+        made, numbers = Press().next(), count(1)
+
+        def again():
+            number = next(numbers)
+            scan = replace(made.scan, number=number, time_ns=number * PERIOD_NS)
+            return replace(made, scan=scan, notes=(Note("baseline_in_doubt", text),), area_mm2=None, **doubt)
+
+        shown.press.next = again
+        with shown.playing():
+            page = open_page(shown.view.url)
+            word(page, "baseline in doubt")
+            playwright.expect(part(page, "stamp")).to_have_text(f"{text} (key z)")
+            playwright.expect(part(page, "stamp")).to_be_visible()
+            playwright.expect(part(page, "verdict")).to_be_hidden()
+            playwright.expect(number(page, "trusted")).to_have_text("no: baseline")
+            picture = imread(BytesIO(part(page, "field").screenshot()))[..., :3]
+            assert np.ptp(picture, axis=2).max() < 0.1, "a colour"
 
 
 def test_a_dropped_tap_is_told_as_an_event_and_a_suspected_sensor_in_red(open_page, tmp_path):

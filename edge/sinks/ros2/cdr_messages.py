@@ -50,7 +50,9 @@ Vector = tuple[float, float, float]
 _WARN, _ERROR, _INFO = 30, 40, 20
 _LEVELS: Final[Mapping[EventKind, int]] = {
     **dict.fromkeys(("lost", "sink"), _ERROR),
-    **dict.fromkeys(("silent", "trouble", "refused", "in_contact", "given_up", "rest_level"), _WARN),
+    **dict.fromkeys(
+        ("silent", "trouble", "refused", "in_contact", "given_up", "rest_level", "baseline_doubted"), _WARN
+    ),
     **dict.fromkeys(("poses_silent", "poses_trouble"), _WARN),
 }
 

@@ -66,10 +66,12 @@ def _findings(result: Result, silence_s: float | None, trouble: str | None) -> l
         found.append((Level.ERROR, result.note or "incomplete"))
     if result.state == "zeroing":
         found.append((Level.WARN, result.note or "zeroing"))
+    if result.state == "baseline_in_doubt":
+        found.append((Level.ERROR, result.note or "baseline in doubt"))
     if result.dead:
         dead = ", ".join(f"{taxel} ({reason})" for taxel, reason in result.dead.items())
         found.append((Level.WARN, f"without taxel {dead}"))
-    if result.trusted is False:
+    if result.state == "contact" and result.trusted is False:
         found.append((Level.WARN, f"pattern not to be believed: {result.untrusted_text}"))
     if result.drift is not None and result.drift.step_counts:
         found.append((Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"))

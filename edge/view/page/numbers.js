@@ -19,7 +19,7 @@ const NUMBERS = {
 };
 const LOSS_SHARE = 0.01; // of the scans: fewer losses, as in the first second of a run, are no reason to worry
 const LOSSES = new Set(["dropped", "missed", "late", "torn_wire", "unwritten"]);
-const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand" };
+const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand", recording: "this recording", unsure: "this recording, maybe held" };
 const TOO_LIGHT = "too light to check";
 
 /** Return the texts of the numbers by which a pattern is believed or not; `checks`: whether the model has any. */

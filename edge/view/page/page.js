@@ -28,7 +28,7 @@ const painter = {
 // ---- The page ----
 
 const MOST_LINES = 100;
-const COUNTED = ["reset", "zeroing", "in_contact", "given_up", "rest_level"]; // events that differ by numbers alone
+const COUNTED = ["reset", "zeroing", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"]; // events that differ by numbers alone
 const REFUSAL_S = 10; // time for which a refusal is shown, and may be forced
 
 const page = {
@@ -161,7 +161,7 @@ const frameHandlers = {
     page.eventNumber = number ?? page.eventNumber; // the answer to this page alone has no number
     const refused = ["refused", "in_contact", "given_up"].includes(event);
     const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
-    log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink", "suspected"].includes(event), ageS: age_s });
+    log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink", "suspected", "baseline_doubted"].includes(event), ageS: age_s });
     if (refused && age_s < REFUSAL_S) refuse(note, event === "in_contact" ? sensor : null);
   },
   state(header) {

@@ -115,7 +115,7 @@ class Sensor {
 
   /** Log notes once if only their numbers change; a step in rest level is an event of its own. */
   logNotes({ note, note_kinds = [], dead }, first) {
-    const shown = note_kinds.filter((kind) => kind !== "rest_level");
+    const shown = note_kinds.filter((kind) => kind !== "rest_level" && kind !== "baseline_in_doubt");
     const kinds = shown.length === 0 ? "" : JSON.stringify([shown, dead]);
     if (kinds !== "" && kinds !== this.noteKinds && !(first && this.result.state === "zeroing")) {
       log(`sensor ${this.name}: ${note}`, { key: `${this.name} ${kinds}`, again: true });
@@ -125,10 +125,7 @@ class Sensor {
 
   // -- reading a pixel --
 
-  size() {
-    const [rows, cols] = this.pattern?.shape ?? [this.hello.height, this.hello.width];
-    return [rows, cols];
-  }
+  size() { return this.pattern?.shape ?? [this.hello.height, this.hello.width]; }
 
   point(x, y) {
     const [rows, cols] = this.size();
@@ -171,6 +168,7 @@ class Sensor {
   unit() { return this.result?.pattern_unit || this.hello.pattern_unit || "mm"; }
 
   ageS() { return nowS() - this.receivedS; }
+  unsure() { return this.result?.state === "baseline_in_doubt"; }
 
   /** True if the sensor is silent: the program reports it, or the newest result is old. */
   away() { return page.atS === null && !replay.rests && this.quiet(); }
@@ -186,22 +184,22 @@ class Sensor {
     return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < FRESH_S);
   }
 
-  live() { return page.atS === null && this.newest() && page.link.up && !this.away() && !page.paused; }
+  live() { return page.atS === null && !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
 
-  /** True if the pattern is shown in grey; while paused it keeps its colours, and the state shows "paused". */
-  old() { return page.atS === null && this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest()); }
+  /** True if the pattern is shown in grey, as where the baseline is in doubt; while paused it keeps its colours. */
+  old() { return this.unsure() || (page.atS === null && this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest())); }
 
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.result; }
 
   /** True if the pattern shown is not to be believed, also when it is old. */
-  doubted() { return this.pattern !== null && this.touched.trusted === false; }
+  doubted() { return this.pattern !== null && this.touched.trusted === false && !this.unsure(); }
 
-  /** Return why the pattern shown is not to be believed, or that it is too light to check; null if all is well. */
+  /** Return why the pattern shown is not to be believed, or that it is not checked; null if all is well. */
   verdict() {
     if (this.doubted()) return `not to be believed: ${this.touched.untrusted_text}`;
-    const unknown = this.pattern !== null && this.touched.trusted === null && this.hello.checks;
-    return unknown ? `${TOO_LIGHT} whether the pattern is to be believed` : null;
+    if (this.pattern === null || this.touched.trusted !== null) return null;
+    return this.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
   }
 
   ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, this.hello.pixel_pitch_mm, this.hello.contact_level); }
@@ -212,6 +210,7 @@ class Sensor {
     if (page.paused) return ["paused", "paused"];
     if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
+    if (this.unsure()) return ["doubted", "baseline in doubt"];
     if (replay.rests) return ["paused", `${this.result.state}, held`];
     if (this.newest() && this.doubted()) return ["doubted", "contact, not believed"];
     const state = this.result.state === "dropped" ? "contact" : this.result.state; // a newer scan was already waiting
@@ -278,7 +277,7 @@ class Sensor {
     stamp.classList.toggle("aside", page.paused);
     field.dataset.live = live ? "yes" : "no";
     say(stamp, this.stampText());
-    show(stamp, !live && !(page.atS !== null && this.newest()));
+    show(stamp, this.unsure() || (!live && !(page.atS !== null && this.newest())));
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
     if (this.pattern !== null) {
       const [rows, cols] = this.pattern.shape;
@@ -296,15 +295,16 @@ class Sensor {
     show(this.part.verdict, verdict !== null);
     say(this.part.verdict, verdict ?? "");
     this.root.classList.toggle("doubted", this.doubted());
-    paintOver(this, over, live || (page.atS !== null && this.newest()));
+    paintOver(this, over, live || (page.atS !== null && this.newest() && !this.unsure()));
     readout.classList.toggle("read", this.cursor !== null);
     say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover, or use the arrow keys, to read a pixel") : this.reading());
   }
 
   stampText() {
+    if (this.unsure()) return `${this.result.note} (key z)`;
     if (page.atS !== null) return this.result === null ? "no scan then" : "no contact then";
     if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
-    if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? "no baseline yet" : "no contact yet";
+    if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? this.result.note ?? "no baseline yet" : "no contact yet";
     return `last contact ${ago(nowS() - this.touchedS)}`;
   }
 

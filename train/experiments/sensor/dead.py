@@ -42,10 +42,10 @@ MODELS: Final = ("stsr", "mtsr4")
 MOST_DEAD: Final = 8
 FAULTS: Final = ("silent", "saturated", "stuck at rest", "stuck at random")
 _REST: Final = np.broadcast_to(np.array([16_000, 16_400, 38_600])[:, None, None], USPA44.scan_shape).astype(np.int32)
-_BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="file")
+_BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="start-up")
 _SCAN_NS: Final = 10_000_000
 _TAXELS: Final = USPA44.taxel_count
-_FREE_COUNTS: Final = np.array([0, 0, -100])[:, None, None]
+_FREE_COUNTS: Final = np.array([0, 0, -40])[:, None, None]
 """Free pad between taps, drifted below its zero, so that the lightest frames are contacts and the free pad is not."""
 _FRAMES_APART: Final = 4
 _SCANS_APART: Final = 12

@@ -44,7 +44,7 @@ EARTH_COUNTS: Final = 36.0
 _NOISE_COUNTS: Final = (2.0, 2.0, 3.0)
 _AXES: Final = np.array([1 / 8, 1 / 8, 1.0])[:, None, None]
 _REST: Final = np.broadcast_to(np.array([16_000, 16_400, 38_600])[:, None, None], USPA44.scan_shape)
-_BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), 0.0, 100, "file")
+_BASELINE: Final = Baseline.of("4", _REST.astype(np.float32), 0.0, 100, "start-up")
 _LEAD_S: Final = 10.0
 """Rest before each scene, in [s]."""
 _CHUNK: Final = 5000

@@ -12,7 +12,7 @@ BELIEVED = "believed"
 
 def believed(result: Result) -> bool:
     """Return whether the image of a result shows what touches the pad, or that nothing does."""
-    return result.contact is False or (result.pattern is not None and result.trusted is not False)
+    return result.state == "idle" or (result.state == "contact" and result.trusted is True)
 
 
 def image_of(result: Result, contract: Contract, full_scale_mm: float, zoom: int = 1) -> NDArray[np.uint8]:
