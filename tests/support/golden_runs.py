@@ -180,7 +180,7 @@ class Adapter:
                     refused = command == b"Z1" and not self._stamped
                     os.write(self._host, b"\a" if refused else b"F00\r" if command == b"F" else b"\r")
             elif due_s is not None:
-                due_s = time.monotonic() + 0.01  # a late one makes none come early
+                due_s += 0.01  # the controller goes on at its pace, whatever the machine does
                 os.write(
                     self._host,
                     b"".join(self._mangle(number, slcan_cycle(self._counts[number], number, stamped=stamped))),
