@@ -4,7 +4,7 @@ The pattern is a Gaussian field on cells, with the covariance of training patter
 model's forward operator, with errors that all taps of a sensor share, and errors of its own. What the taps so far leave
 uncertain follows from their poses, and is weighted by the model's own deviations; each pose that may be proposed is
 scored by how much of it a tap there would take away over the newest tap's pattern. Only z is counted: shear is mostly
-drag. Turns and larger shifts are not tried, because they gained less than shifts by half a pitch, see docs/log.md.
+drag. Turns and larger shifts are not tried, as they gained less than shifts by half a pitch (docs/decisions.md).
 """
 
 import math

@@ -41,7 +41,7 @@ class FineTuning:
         validation: frozen set, apart from test and training, that decides about fine-tuning and calibrates deviations.
         always: True to fine-tune whatever int8 costs, since it also continues the training.
         learning_rate: highest of the one cycle. In 3000 steps the bundled four-tap network gains .2 dB in int8 and
-            .14 in float, which leaves no loss by quantisation (docs/log.md).
+            .14 in float, which leaves no loss by quantisation (docs/decisions.md).
         batch: windows in a batch.
         seed: of the draws.
     """

@@ -2,7 +2,7 @@
 
 Ranges are percentiles over training taps. For a network that takes poses they are widened to what windows beyond any
 touch give: its layers exchange values between taps, which such windows take far out of every range. Those of the newest
-tap's own layers are widened a little only, since coarser steps there cost most (docs/log.md).
+tap's own layers are widened a little only, since coarser steps there cost most (docs/decisions.md).
 """
 
 import contextlib

@@ -56,7 +56,7 @@ def pages(site) -> dict[Path, Page]:
 
 
 def test_the_first_page_and_the_reports_are_there(site, pages):
-    assert {"index.html", "trouble.html", "reports/bench.html", "reports/load/bench.html", "log.html"} <= {
+    assert {"index.html", "trouble.html", "reports/bench.html", "reports/load/bench.html", "decisions.html"} <= {
         path.relative_to(site).as_posix() for path in pages
     }
     assert (site / "reports" / "bench.png").read_bytes() == (ROOT / "reports" / "bench.png").read_bytes()

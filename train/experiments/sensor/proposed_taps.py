@@ -1,7 +1,7 @@
 """Taps that the runtime proposes, next to taps of a fixed schedule on the same figures.
 
 The patterns are those of the first tap, which all schedules share; the other taps are given in its axes. The poses that
-may be proposed were chosen on other figures, by a fusion without a network (docs/log.md).
+may be proposed were chosen on other figures, by a fusion without a network (docs/decisions.md).
 """
 
 from collections.abc import Mapping
