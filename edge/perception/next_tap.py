@@ -28,8 +28,8 @@ _READINGS: Final = USPA44.rows * USPA44.cols
 _CELL_MM: Final = USPA44.rows * USPA44.pitch_mm / GRID
 _LENGTHS_MM: Final = np.array([1.0, 2.0, 3.0, 7.0, 40.0])
 _WEIGHTS: Final = np.array([0.0044, 0.0164, 0.0066, 0.0215, 0.0071])
-"""Gaussians whose sum is the covariance of patterns by distance, over the square of the readings' amplitude, fitted by
-train.experiments.support.kalman_fusion."""
+"""Gaussians whose sum is the covariance of patterns by distance, over the square of the readings' amplitude, fitted
+on training patterns (docs/decisions.md)."""
 SHARED: Final = 0.45
 """Share of the operator's error that all taps have in common: one pad, one shape."""
 _FINE: Final = 0.56

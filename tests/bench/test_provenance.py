@@ -121,4 +121,4 @@ def test_a_report_without_a_head_is_named(tmp_path, capsys):
 def test_every_report_has_a_head():
     pages = sorted((ROOT / "reports").rglob("*.md"))
     assert [page.name for page in pages if read_provenance(page.read_text()) is None] == []
-    assert len(pages) > 30
+    assert len(pages) > 20
