@@ -18,11 +18,11 @@ from edge.bench.contenders import WEIGHTS_KEY
 from edge.inference.onnx_session import load_session
 from export.errors import ExportError
 from export.graphs.graph import to_model
-from export.quantisation.rounding import folded
 from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from train.networks.cost import macs, parameters_count
 from train.networks.registry import NETWORKS, build
+from train.networks.symmetric import write_out
 
 SCALE: Final = 10
 
@@ -42,7 +42,8 @@ def export_peer(name: str, path: Path, seed: int = 0, scale: int = SCALE) -> str
         OSError: the file cannot be written.
     """
     torch.manual_seed(seed)
-    net = folded(build(name, scale).eval())
+    net = build(name, scale).eval()
+    write_out(net)
     check_writable(path)  # before the work, not after it
     model = to_model(net, USPA44)
     model.metadata_props.add(key=WEIGHTS_KEY, value=f"random, of {name}, seed {seed}")
