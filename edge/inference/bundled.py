@@ -48,18 +48,6 @@ def find_model(name: str | Path) -> Path:
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
 
 
-def alternatives(model: Path) -> list[Path]:
-    """Return files of models that may replace a model: for a bundled one the others, else its own int8 file.
-
-    A network that is not bundled was trained on other surfaces, and the bundled ones cannot stand in for it.
-    """
-    bundled = bundled_models()
-    if model.resolve() in bundled:
-        return [path for path in bundled if path != model.resolve()]
-    int8 = model.with_name(f"{model.stem}{INT8_SUFFIX}{model.suffix}")
-    return [int8] if int8.is_file() else []
-
-
 def demo_recording() -> Path:
     """Return the file of the recording that the demo plays.
 

@@ -47,7 +47,7 @@ ENOUGH = 60
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
-    r"edge-sr .*--budget-us .*": "measures run times for seconds; test_run_times runs it",
+    r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr map .*": "is of poses that a robot sends, and without them writes nothing; test_map_command runs it",
     r"edge-sr .*--realtime.*": "takes a processor from the other tests; test_realtime runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",

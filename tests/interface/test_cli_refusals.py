@@ -23,8 +23,6 @@ class TestRefusals:
             (["--rate-hz", "0"], ["--rate-hz: '0' is not a positive number"]),
             (["--duration-s", "nan"], ["--duration-s: 'nan' is not a positive number"]),
             (["--counts-per-newton", "x"], ["--counts-per-newton: 'x' is not"]),
-            (["--budget-us", "0"], ["--budget-us: '0' is not a positive number"]),
-            (["--recalibrate"], ["--recalibrate requires --budget-us"]),
             (["--mode", "x"], ["unrecognized arguments: --mode"]),
             (["model"], ["no command 'model': did you mean models?"]),
             (["doctro"], ["no command 'doctro': did you mean doctor?"]),

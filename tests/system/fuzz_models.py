@@ -12,7 +12,6 @@ from fuzz_samples import FOLDER, as_file, refused
 from edge.bench.compare import compared
 from edge.bench.errors import BenchError
 from edge.bench.record import read_record
-from edge.budgeting.run_time_cache import CalibrationCache
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
@@ -21,25 +20,6 @@ from edge.inference.onnx_session import ModelSession
 from train.data.dataset import Sequences, load_sequences
 from train.errors import DatasetError
 from train.physics.simulated_sensor import FRAMES
-
-
-def calibration(data: bytes) -> None:
-    """Read the cache of run times; its keys are of this machine, so one entry stands for every key."""
-    cache = CalibrationCache(as_file("calibration.json", data), 100.0, unix_time_s=lambda: 2e9)
-    entry = next(iter(cache._entries.values()), None)
-    cache._entries[cache._key(MODEL_LIKE)] = entry
-    found = cache.find(MODEL_LIKE)
-    assert found is None or (0 < found[0].p50_us <= found[0].p99_us < 1e12 and 0 <= found[1] < 1e12)
-    assert all("\n" not in note for note in cache.notes)
-
-
-MODEL_LIKE = as_file("like.onnx", b"model")
-
-
-def calibration_seeds() -> list[bytes]:
-    entry = {"model": "m", "p50_us": 900.5, "p99_us": 1200, "unix_s": 1.7e9}
-    return [json.dumps({"ab" * 32: entry}).encode(), b"{}"]
-
 
 CONTRACT = {
     "version": 4,
