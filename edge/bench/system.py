@@ -3,14 +3,13 @@
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from edge.bench.processes import STARTS, busy_core, usable_cores
+from edge.bench.processes import STARTS, usable_cores
 from edge.bench.program import Line, Play, Program, edge_sr, parsed, plain_loop
 from edge.bench.timing import Times, summary
 
@@ -21,7 +20,6 @@ FAST_HZ: Final = 5000.0
 FAST: Final = f"at rest, {FAST_HZ:g} Hz"
 HELD, MOVING, FEW = "held still", "every scan new", "every scan new, pattern alone"
 TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
-TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
 HAND: Final = 16
 """Sensors of a hand."""
 
@@ -85,7 +83,7 @@ class StartUp:
     resident_mb: float
 
 
-ROWS: Final = 10
+ROWS: Final = 9
 """Number of rows that `rows` yields."""
 HAND_ROWS: Final = 4
 """Number of rows that `hand_rows` yields."""
@@ -102,7 +100,6 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
 
     Raises:
         BenchError: a process ended.
-        UsageError: there is no second core to keep busy.
     """
     seconds = scans / 100
     moving, two = Play(pressed=ALL, moving=True), Play(sensors=2, pressed=ALL, moving=True)
@@ -111,18 +108,16 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
         yield from _at_rest(folder, (PLAIN, IDLE), Play(), scans, tell)
         tell(TWO)
         yield _unrecorded(folder, TWO, two, scans)
-        for name, play, options, busy in (
-            (IDLE_RECORDED, Play(), (), False),
-            (HELD, Play(pressed=ALL), (), False),
-            (MOVING, moving, ("--every-scan",), False),
-            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern"), False),
-            (TWO_RECORDED, two, ("--every-scan",), False),
-            (TWO_BUSY, two, ("--every-scan",), True),
-            (FAST, Play(rate_hz=FAST_HZ, waits=True), (), False),
+        for name, play, options in (
+            (IDLE_RECORDED, Play(), ()),
+            (HELD, Play(pressed=ALL), ()),
+            (MOVING, moving, ("--every-scan",)),
+            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern")),
+            (TWO_RECORDED, two, ("--every-scan",)),
+            (FAST, Play(rate_hz=FAST_HZ, waits=True), ()),
         ):
             tell(name)
-            with busy_core() if busy else nullcontext():
-                yield _measured(folder, name, play, seconds, *options)
+            yield _measured(folder, name, play, seconds, *options)
 
 
 def hand_rows(sensors: int, scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:

@@ -193,28 +193,10 @@ def _bench(arguments: Sequence[str]) -> int:
         ) from error
 
     options = bench_parser().parse_args(arguments)
-    if options.soak is not None and not (options.system or options.sensors):
-        raise UsageError("--soak is a part of --system: add it")
-    from edge.bench.command import Settings, run
+    from edge.bench.command import run
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
-    settings = Settings(
-        out=options.out,
-        rate_hz=options.rate_hz,
-        ticks=options.ticks,
-        threads=tuple(sorted(set(options.threads))),
-        load=options.load,
-        models=options.models,
-        peers=tuple(options.against),
-        earlier=options.compare,
-        by_surface=options.by_surface,
-        only=options.only,
-        system=options.system or options.sensors is not None,
-        sensors=options.sensors,
-        soak_minutes=options.soak,
-        command=shlex.join(["edge-sr", "bench", *arguments]),
-    )
-    return run(settings, sys.stdout, sys.stderr)
+    return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
 def _devices(arguments: Sequence[str]) -> int:
