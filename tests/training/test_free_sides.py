@@ -12,7 +12,7 @@ SIZE, CELL_MM = 42, 0.47
 CELLS_MM = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM
 FLAT = np.zeros((1, SIZE, SIZE), dtype=np.float32)
 # By finite elements of the whole pad (docs/decisions.md): stiffness in N/mm, pressure over its mean at .235, 7.05 and
-# 9.635 mm from the centre along x, and per mm of indentation the inner, edge and corner magnets' way down, then outwards.
+# 9.635 mm from the centre along x, and per mm of indentation the inner, edge and corner magnets' way down and outwards.
 ELEMENTS = {
     0.45: (46.97, (1.33, 1.09, 0.60), (0.450, 0.438, 0.438), (0.189, 0.674, 0.535)),
     0.48: (53.0, (1.42, 1.10, 0.52), (0.412, 0.404, 0.408), (0.249, 0.853, 0.656)),
