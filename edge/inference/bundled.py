@@ -8,8 +8,6 @@ from edge.errors import ModelError, UsageError
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
 TAXELS: Final = BUNDLE_DIR / "taxels.npz"
 """File of the estimator of dead taxels."""
-FLAT_GRIPS: Final = BUNDLE_DIR / "grips.npz"
-"""File of the table by which flat grips give the gains of a sensor."""
 CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
 """File of the distribution of contacts by which a running sensor learns its gains."""
 DEFAULT_MODEL: Final = "stsr-int8"

@@ -100,7 +100,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     }, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "mtsr7-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
-        *("contacts.npz", "demo.npz", "grips.npz", "taxels.npz"),
+        *("contacts.npz", "demo.npz", "taxels.npz"),
     }
 
 
@@ -170,7 +170,7 @@ def test_licence_and_version_are_in_the_wheel(fresh):
     ("typed", "offered"),
     [
         ("edge-sr re", {"record", "replay"}),
-        ("edge-sr doctor --no", {"--no-press", "--no-grip"}),
+        ("edge-sr doctor --no", {"--no-press"}),
         ("edge-sr --model stsr-s", {"stsr-small", "stsr-small-int8"}),
         ("edge-sr replay pre", {"press.mcap"}),
     ],
