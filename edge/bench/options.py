@@ -12,7 +12,8 @@ program should run meanwhile.
 
 examples:
   edge-sr bench --out today
-  edge-sr bench --threads 1 --only stsr mtsr4
+  edge-sr bench --threads 1 \\
+          --only stsr mtsr4
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """

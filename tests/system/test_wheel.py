@@ -226,7 +226,7 @@ def test_the_demo_runs_from_the_wheel(demo):
 def test_the_second_wheel_adds_models_bench_and_emulation(both, tmp_path):
     listed = run([str(both / "edge-sr"), "models"]).splitlines()
     assert any(line.startswith("stsr ") for line in listed)
-    assert "--by-surface" in run([str(both / "edge-sr"), "bench", "--help"])
+    assert "--sensors" in run([str(both / "edge-sr"), "bench", "--help"])
     assert "usage" in run([str(both / "python"), "-I", "-m", "firmware_bridge.emulation.xela_server_main", "--help"])
     done = subprocess.run(
         [str(both / "python"), "-m", "train.generate", "x.npz"],
