@@ -92,7 +92,7 @@ def provenance(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         commit=_git("rev-parse", "--short=10", "HEAD") or UNKNOWN,
         tree=UNKNOWN if changes is None else "changed" if changes else "clean",
-        machine=str(this_machine()),
+        machine=this_machine(),
         seed=seed,
         sources=tuple(_below_root(Path(source)) for source in sources),
         models={_below_root(path): file_hash(path) for path in sorted({path.resolve() for path in models})},

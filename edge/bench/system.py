@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -42,37 +42,51 @@ class Losses:
 
 
 @dataclass(frozen=True, slots=True)
-class SystemRow:
-    """Measurement of one run of the whole program.
+class Used:
+    """Usage of the machine by a program during a row.
 
     Attributes:
-        name: of the row.
-        scans: number of scans in the run.
-        rate_hz: scans a second, of all sensors together, in [Hz].
+        seconds: length of the row, in [s].
         cpu_percent: processor time of all its threads, in [% of one core].
         thread_percent: the same of each thread that takes any, the most first.
         resident_mb: memory at the end, in [MB].
-        run_time: of the inference; None where there was none.
-        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
-            were lost, so that records cannot be matched.
-        losses: None where no records are read.
         preempted: number of times a thread lost its processor against its will.
         others_percent: processor time of everything else on the machine, in [% of one core].
         stolen_percent: processor time that the host took away from all cores, in [% of one core].
     """
 
-    name: str
-    scans: int
-    rate_hz: float
+    seconds: float
     cpu_percent: float
     thread_percent: tuple[float, ...]
     resident_mb: float
-    run_time: Times | None
-    latency: Times | None
-    losses: Losses | None
     preempted: int
     others_percent: float
     stolen_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class SystemRow(Used):
+    """Measurement of one run of the whole program.
+
+    Attributes:
+        name: of the row.
+        scans: number of scans in the run.
+        run_time: of the inference; None where there was none.
+        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
+            were lost, so that records cannot be matched.
+        losses: None where no records are read.
+    """
+
+    name: str
+    scans: int
+    run_time: Times | None = None
+    latency: Times | None = None
+    losses: Losses | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """Scans a second, of all sensors together, in [Hz]."""
+        return self.scans / self.seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +167,7 @@ def _at_rest(
         time.sleep(scans / play.rate_hz)
         used = [usage.since() for usage in usages]
     for name, one in zip(names, used, strict=True):
-        yield _row(name, scans * play.sensors, one)
+        yield SystemRow(**asdict(one), name=name, scans=scans * play.sensors)
 
 
 def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence[int] = ()) -> SystemRow:
@@ -161,7 +175,7 @@ def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence
         time.sleep(SETTLE_S)
         usage = _Usage(program)
         time.sleep(scans / play.rate_hz)
-        return _row(name, scans * play.sensors, usage.since())
+        return SystemRow(**asdict(usage.since()), name=name, scans=scans * play.sensors)
 
 
 def _measured(
@@ -187,17 +201,6 @@ def start_up() -> StartUp:
     return StartUp(tuple(took_s), float(np.median(resident_mb)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Used:
-    seconds: float
-    cpu_percent: float
-    thread_percent: tuple[float, ...]
-    resident_mb: float
-    preempted: int
-    others_percent: float
-    stolen_percent: float
-
-
 class _Usage:
     """Usage of a process from now on."""
 
@@ -206,7 +209,7 @@ class _Usage:
         self._threads, self._preempted, self._machine = program.thread_cpu_s(), program.preemptions(), _machine_s()
         self._start_s = time.monotonic()
 
-    def since(self) -> _Used:
+    def since(self) -> Used:
         """Return the usage until now."""
         took_s = time.monotonic() - self._start_s
         now = self._program.thread_cpu_s()
@@ -214,7 +217,7 @@ class _Usage:
         busy, stolen = (
             100 * (after - before) / took_s for after, before in zip(_machine_s(), self._machine, strict=True)
         )
-        return _Used(
+        return Used(
             took_s,
             sum(percent),
             tuple(share for share in percent if share >= 0.01),
@@ -232,15 +235,15 @@ def _machine_s() -> tuple[float, float]:
     return user + nice + system + interrupts + soft_interrupts, stolen
 
 
-def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
+def _recorded(name: str, lines: list[Line], used: Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
     first, last = lines[0].record["counters"], lines[-1].record["counters"]
     lost = {key: last[key] - first[key] for key in ("late", "dropped", "overruns", "torn_wire")}
     run_times_us = [line.record["run_time_us"] for line in lines if line.record["run_time_us"] is not None]
     distinguishable = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
-    return _row(
-        name,
-        len(lines),
-        used,
+    return SystemRow(
+        **asdict(used),
+        name=name,
+        scans=len(lines),
         run_time=summary([round(1e3 * run_time_us) for run_time_us in run_times_us]) if run_times_us else None,
         latency=summary(latencies_ns(lines, stamps_ns)) if distinguishable else None,
         losses=Losses(lost["late"], lost["dropped"], lost["overruns"], lost["torn_wire"]),
@@ -250,28 +253,3 @@ def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, li
 def latencies_ns(lines: list[Line], stamps_ns: dict[str, list[int]]) -> list[int]:
     """Return the time from each scan's last byte to its record, in [ns]; matched by number, so no scan may be lost."""
     return [line.time_ns - stamps_ns[line.record["sensor"]][line.record["scan"]] for line in lines]
-
-
-def _row(
-    name: str,
-    scans: int,
-    used: _Used,
-    *,
-    run_time: Times | None = None,
-    latency: Times | None = None,
-    losses: Losses | None = None,
-) -> SystemRow:
-    return SystemRow(
-        name=name,
-        scans=scans,
-        rate_hz=scans / used.seconds,
-        cpu_percent=used.cpu_percent,
-        thread_percent=used.thread_percent,
-        resident_mb=used.resident_mb,
-        run_time=run_time,
-        latency=latency,
-        losses=losses,
-        preempted=used.preempted,
-        others_percent=used.others_percent,
-        stolen_percent=used.stolen_percent,
-    )

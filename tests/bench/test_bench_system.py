@@ -16,7 +16,7 @@ from edge.cli.main import main
 
 HAND = system.hand_names(system.HAND)
 QUICK = summary([700_000] * 1000)
-ROW = SystemRow(system.IDLE, 1000, 5000.0, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)
+ROW = SystemRow(0.2, 1.0, (0.6, 0.4), 70.0, 3, 20.0, 0.5, system.IDLE, 1000)
 ROWS = {
     row.name: row
     for row in (
@@ -69,7 +69,7 @@ def test_who_lost_scans_has_no_latency():
     lines = [
         Line(9, {"sensor": "4", "scan": 0, "run_time_us": 5.0, "counters": counters | {"overruns": n}}) for n in (0, 1)
     ]
-    used = system._Used(1.0, 1.0, (1.0,), 70.0, 0, 0.0, 0.0)
+    used = system.Used(1.0, 1.0, (1.0,), 70.0, 0, 0.0, 0.0)
     row = system._recorded("x", lines, used, {"4": [1]})
     assert row.latency is None and row.losses == Losses(0, 0, 1, 0)
     assert system._recorded("x", lines[:1], used, {"4": [1]}).latency == summary([8])
