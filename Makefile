@@ -47,8 +47,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.stability
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
-	$(BIN)/edge-sr bench --threads 1 --by-surface --out reports
-	$(BIN)/edge-sr bench --only stsr-int8 --threads 1 2 --load --out reports/load
+	$(BIN)/edge-sr bench --threads 1 --out reports
 	$(BIN)/edge-sr bench --system --out reports/system
 	$(REPORT) tests/system/cycles.py --out reports/cycles.md
 	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
@@ -58,7 +57,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 
 reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why
-	@$(BIN)/python -m edge.bench.stale_reports
+	@$(BIN)/python -m edge.bench.provenance
 
 data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
 	$(BIN)/python -m train.data.make_presses $@ --count 100000 --seed 1

@@ -119,7 +119,7 @@ def shown_texts() -> Iterator[tuple[str, str]]:
                 yield f"{path}:{line}", text
         elif path.parts[0] == "edge" and path.suffix in (".html", ".js"):
             yield str(path), page_text(path.read_text(encoding="utf-8"), path.suffix)
-        elif path.suffix == ".md" and path.parts[0] in ("docs", "README.md") and path.name != "log.md":
+        elif path.suffix == ".md" and path.parts[0] in ("docs", "README.md"):
             yield str(path), prose(path.read_text(encoding="utf-8"))
 
 

@@ -13,7 +13,6 @@ request that cannot be met raises a BridgeError or an EdgeError with one clear l
 
 import math
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,7 +75,6 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
-    from edge.inference.onnx_session import ModelSession
     from firmware_bridge.links.discovery import Found
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
@@ -133,7 +131,6 @@ __all__ = [
     "WindowError",
     "Wrench",
     "bundled_models",
-    "choose_model",
     "demo_recording",
     "devices",
     "examine",
@@ -193,49 +190,6 @@ def open_source(
     known = settled(sensor, id_map)
     links = links_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
     return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
-
-
-def choose_model(
-    model: str | Path,
-    budget_us: float,
-    *,
-    rate_hz: float | None = None,
-    recalibrate: bool = False,
-    stop: threading.Event | None = None,
-    tell: Callable[[str], object] = lambda line: None,
-) -> "ModelSession | None":
-    """Load the most accurate model whose run time on this machine is within a budget, as `edge-sr --budget-us` does.
-
-    Args:
-        model: the best model that may be used: a file, or the name of a bundled one.
-        budget_us: longest run time of a pattern, in [us].
-        rate_hz: rate of the sensor, in [Hz]; 100 by default.
-        recalibrate: measure again although stored run times exist.
-        stop: event that ends the measurement early.
-        tell: called with one line each about what is measured, what is wrong and which model was chosen.
-
-    Returns:
-        The model, or None if it was stopped.
-
-    Raises:
-        ModelError: the model cannot be used, or its contract does not state its error.
-        UsageError: the budget or the rate is out of range.
-    """
-    check_positive("budget_us", budget_us)
-    if rate_hz is not None:
-        check_positive("rate_hz", rate_hz)
-    from edge.budgeting import budget
-    from edge.budgeting.run_time_cache import cache_path
-
-    return budget.choose_model(
-        find_model(model),
-        budget_us,
-        rate_hz=budget.USUAL_RATE_HZ if rate_hz is None else rate_hz,
-        cache=cache_path(),
-        recalibrate=recalibrate,
-        stop=threading.Event() if stop is None else stop,
-        tell=tell,
-    )
 
 
 def open_recording(

@@ -5,7 +5,6 @@ python -m export.to_onnx checkpoints/stsr.pt --int8 data/seen.npz data/figures.n
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 
 With validation presses, deviations are corrected by region, so that their intervals hold; with --intervals, by window.
-If int8 costs more than the limit on the validation set, the network is fine-tuned for it, on the same taps.
 """
 
 import argparse
@@ -28,9 +27,7 @@ from export.graphs.graph import known_width, outputs, to_model
 from export.graphs.intervals import IntervalData
 from export.graphs.parity import check_parity, extreme_windows
 from export.graphs.writing import Writer
-from export.quantisation.fine_tune import FineTuning, quantised_well
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
-from export.quantisation.rounding import folded
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.dataset import Sequences
@@ -45,6 +42,7 @@ from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_calibration import half_width_mm
 from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
+from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG
 from train.surfaces.tap_schedules import REACH_MM
@@ -52,7 +50,6 @@ from train.surfaces.tap_schedules import REACH_MM
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1
 """Largest accepted loss by int8 on the frozen test set, in [dB]."""
-FINE_TUNE_STEPS: Final = 500
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02
 """Largest accepted change of the 90 % interval's coverage by int8."""
@@ -112,7 +109,6 @@ def export(
     calibration: Sequences | PressSet | None = None,
     *,
     every: bool = False,
-    tuning: FineTuning | None = None,
     validation: Sequence[FrozenSet] = (),
     trust: TrustFit | None = None,
     intervals: IntervalData | None = None,
@@ -120,8 +116,7 @@ def export(
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
-    Parity is checked in float32, also for graphs that are then quantised. If a network is fine-tuned for int8, its
-    NAME.onnx is written as well, with a line of its own.
+    Parity is checked in float32, also for graphs that are then quantised.
 
     Args:
         checkpoint: NAME.pt of train.fit.
@@ -131,7 +126,6 @@ def export(
         batch: windows in one run, or ANY_BATCH.
         calibration: training taps from which int8 ranges are measured; None for float32.
         every: quantise all convolutions, not only the expensive ones.
-        tuning: settings of the fine-tuning for int8; None for no fine-tuning.
         validation: sets apart from test and training, on which confidence is fitted; without them, the contract's
             confidence stays empty.
         trust: forward model and checks for the contract; None for none.
@@ -145,7 +139,7 @@ def export(
         ExportError: no node of the graph can be quantised, or the batch is not positive.
     """
     net, report = load_network(checkpoint)
-    net = folded(net)
+    write_out(net)
     contract = contract_of(net, report, frozen, geometry, batch)
     level = contract.contact_level
     if intervals is not None and contract.interval_factor is not None:
@@ -167,8 +161,7 @@ def export(
     check_parity(net, single, frozen, contract)
     seen = calibration_batch(calibration, contract)
     beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
-    well = quantised_well(net, single, geometry, seen, calibration, tuning, MOST_LOSS_DB, every=every, beyond=beyond)
-    net, in_float, integers = well.net, well.model, well.integers
+    in_float, integers = single, quantised(single, seen, every=every, beyond=beyond)
     integer_net, levels = net, {}
     if intervals is not None:
         found = intervals.corrected(net, level)
@@ -177,14 +170,6 @@ def export(
         found = intervals.conformed(net, quantised(in_float, seen, every=every, beyond=beyond))
         integer_net, levels = found.net, found.interval_levels
         integers = quantised(to_model(integer_net, geometry, traced), seen, every=every, beyond=beyond)
-    lines: list[str] = []
-    if tuning is not None and well.trained_on:
-        mixed_sha256 = tuning.sha256(contract.training_sha256, calibration.sha256(), every=every)
-        contract = replace(contract, training_sha256=mixed_sha256)
-        model = in_float if batch == traced else to_model(net, geometry, batch)
-        parity = check_parity(net, model, frozen, contract)
-        facts = [f"parity {parity:.1e}", "float32 after fine-tuning for int8"]
-        lines.append(writer.write(checkpoint.stem, model, in_float, contract, facts))
     float_error = writer.error(in_float, contract)
     model = (
         integers
@@ -193,13 +178,9 @@ def export(
     )
     integer, convs = convolutions(model)
     contract = replace(contract, arithmetic="int8", test_error={}, confidence={}, interval_levels=levels)
-    facts = [
-        f"{integer} of {convs} convolutions in int8",
-        *_cost(float_error, writer.error(integers, contract)),
-        *[well.said] * bool(well.said),
-    ]
-    lines.append(writer.write(checkpoint.stem + INT8_SUFFIX, model, integers, contract, facts))
-    return "\n".join(lines)
+    cost = _cost(float_error, writer.error(integers, contract))
+    facts = [f"{integer} of {convs} convolutions in int8", *cost]
+    return writer.write(checkpoint.stem + INT8_SUFFIX, model, integers, contract, facts)
 
 
 def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
@@ -247,23 +228,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--all-integers", action="store_true", help="with --int8: quantise all convolutions, not only the large ones"
     )
-    parser.add_argument(
-        "--fine-tune-steps",
-        type=int,
-        metavar="N",
-        help=f"with --int8: fine-tune for so many steps (default: {FINE_TUNE_STEPS}, if quantisation costs over "
-        f"{MOST_LOSS_DB} dB; 0: never)",
-    )
     options = parser.parse_args(arguments)
-    steps: int | None = options.fine_tune_steps
-    if steps is not None and steps < 0:
-        parser.error(f"--fine-tune-steps is {steps}, expected 0 or more")
     if options.trust is not None and options.validation is None:
         parser.error("--trust needs --validation, on which limits are set")
     if options.int8 is None and options.all_integers:
         parser.error("--all-integers needs --int8")
-    if options.int8 is None and steps is not None:
-        parser.error("--fine-tune-steps needs --int8")
     if options.intervals is not None and options.validation is None:
         parser.error("--intervals needs --validation")
     lines: list[str] = []
@@ -281,7 +250,6 @@ def main(arguments: list[str] | None = None) -> None:
             intervals = IntervalData(presses, training)
             if options.trust is not None:
                 trust = load_trust(options.trust, presses)
-        tuning = FineTuning(FINE_TUNE_STEPS if steps is None else steps, validation[0], always=steps is not None)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
                 checkpoint,
@@ -290,14 +258,13 @@ def main(arguments: list[str] | None = None) -> None:
                 batch=options.batch,
                 calibration=taps,
                 every=options.all_integers,
-                tuning=tuning if steps != 0 else None,
                 validation=validation,
                 trust=trust,
                 intervals=intervals,
                 one_tap=options.one_tap,
             )
             sys.stdout.write(line + "\n")
-            lines += line.splitlines()
+            lines.append(line)
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"export: {error}")
     except OSError as error:
@@ -305,9 +272,7 @@ def main(arguments: list[str] | None = None) -> None:
     costly = {line.partition(":")[0]: [cost for cost in (_COSTLY, _UNSURE) if cost in line] for line in lines}
     lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
     if lossy:
-        sys.exit(
-            f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model or fine-tune longer"
-        )
+        sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")
 
 
 if __name__ == "__main__":

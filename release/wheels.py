@@ -21,7 +21,7 @@ from edge import __version__
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ["firmware_bridge", "edge", "train", "export"]
 SECOND: Final = "tactile-edge-sr-train"
-ITS_EXTRAS: Final = ("train", "export", "bench")
+ITS_EXTRAS: Final = ("train", "export")
 
 
 def runtime_settings(project: dict[str, Any], shared: dict[Path, str]) -> dict[str, Any]:

@@ -120,5 +120,6 @@ def _shown(cell: Cell) -> str:
 
 def _command() -> str:
     """Return the command line of this process."""
-    module = getattr(sys.modules["__main__"].__spec__, "parent", None)
-    return shlex.join(["python", *(["-m", module] if module else []), *sys.argv[1:]])
+    spec = sys.modules["__main__"].__spec__
+    module = ["-m", spec.name.removesuffix(".__main__")] if spec else []
+    return shlex.join(["python", *module, *sys.argv[1:]])

@@ -1,6 +1,5 @@
-"""Error against run time: every model and every method without a network, evaluated and timed on this machine.
+"""Error against run time of every model and of methods without a network, and the cost of the whole program.
 
-`command` orders the sections, each of one file: `accuracy` (frozen test set), `timing` and `processes` (run time, in
-processes of their own), `macs` and `peak` (distance from the machine's limit), `peer_ratios` (a peer's network),
-`compare` (an earlier bench). `record` holds the results, `report` and `plot` show them.
+`command` orders the tables, `accuracy` has the error on the frozen test set, `timing` and `processes` the run time, in
+processes of their own (`worker`); `system`, `program` and `targets` measure the whole program from outside.
 """

@@ -8,13 +8,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.bench.contenders import Subject
+from edge.bench.contenders import CLASSICAL_FILE, Subject
 from edge.errors import ModelError
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
-from edge.evaluation.evaluate import by_surface, infer_with_intervals, judge, mean_error
+from edge.evaluation.evaluate import infer_with_intervals, judge, mean_error
 from edge.evaluation.metrics import volume_mm3
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 
@@ -30,29 +29,25 @@ class ErrorRow:
         name: of the subject.
         given: number of newest taps in its input.
         error: metric to its mean over all frames; "force_percent" is that of `force_error_percent`.
-        psnr_db_by_surface: surface to PSNR in [dB].
     """
 
     name: str
     given: int
     error: dict[str, float]
-    psnr_db_by_surface: dict[str, float]
 
 
 def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
     """Yield the error of a classical method with the newest tap, of a model with one tap and with all it takes.
 
-    A peer has no error.
-
     Raises:
         ModelError: the model cannot be used, or was made for another scale than the test set.
         FrozenSetError: the model takes more taps than the test set has.
     """
-    if subject.kind == "classical":
+    if subject.path is None:
         newest = frozen.newest.astype(np.float32)
-        patterns = fitted_methods(BUNDLE_DIR / "classical.npz", frozen.scale)[subject.name](newest)
+        patterns = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name](newest)
         yield _row(subject, 1, patterns, judge(patterns, frozen, CONTACT_LEVEL), frozen)
-    elif subject.path is not None and subject.kind == "model":
+    else:
         session = ModelSession(Path(subject.path))
         contract = session.contract
         if contract.scale != frozen.scale:
@@ -72,7 +67,7 @@ def _row(
     frozen: FrozenSet,
 ) -> ErrorRow:
     error = mean_error(errors) | {"force_percent": round(force_error_percent(patterns, frozen), 4)}
-    return ErrorRow(subject.name, given, error, by_surface(errors["psnr_db"], frozen))
+    return ErrorRow(subject.name, given, error)
 
 
 def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:

@@ -1,135 +1,87 @@
-"""Command `edge-sr bench`: its sections, one after the other, and its files."""
+"""Command `edge-sr bench`: its tables, one after the other, and its files."""
 
-import contextlib
+import argparse
+import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from edge.bench import contenders as subjects
-from edge.bench import peak
-from edge.bench import peer_ratios as against
-from edge.bench import ratios as intervals
-from edge.bench import report as tables
-from edge.bench.accuracy import error_rows, force_floor_percent
-from edge.bench.compare import compared
+from edge.bench import contenders
+from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
 from edge.bench.contenders import Subject
 from edge.bench.errors import BenchError
-from edge.bench.gate_section import show_savings
-from edge.bench.live_report import Page
+from edge.bench.live_report import Page, head, line
 from edge.bench.machine import this_machine
-from edge.bench.macs import macs_of
-from edge.bench.plot import draw
-from edge.bench.processes import busy_core, measured, start_up
+from edge.bench.processes import measured, start_up
 from edge.bench.program import PROGRAM_SOURCES
 from edge.bench.provenance import provenance, with_head
-from edge.bench.record import Facts, Record, RunTimeRow, read_record
+from edge.bench.system import SystemRow
 from edge.bench.system_section import show_system
-from edge.bench.timing import Pace, Times
 from edge.errors import EdgeError, UsageError
-from edge.evaluation.classical_methods import method_macs
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
 INTERRUPTED: Final = 130
 """Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
+FULL_TICKS: Final = 3000
+"""Fewest ticks for which p99.9 rests on more than the longest few."""
+ERROR_COLUMNS: Final = (
+    *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),
+    "force error %",
+)
+FIGURES: Final = ("p50_us", "p99_us", "p999_us", "max_us")
+_PERCENTILES: Final = ("p50 us", "p99 us", "p99.9 us", "max us")
+FRONT_COLUMNS: Final = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
+_RUN_TIME: Final = (
+    "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is faster "
+    "with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. Start-up is "
+    "from the spawn to the first pattern, MB the most memory resident till then."
+)
+_FRONT: Final = "On {} thread{}. * is on the Pareto front: no other is at least as good in both RMSE and paced p50."
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a bench.
-
-    Attributes:
-        out: folder for bench.json, .csv, .md and .png, or None for no files.
-        rate_hz: of the paced runs, in [Hz].
-        ticks: of the paced runs.
-        threads: numbers of threads to measure on.
-        load: True to measure with the other core busy, too.
-        models: folder of the user's own models, or None.
-        peers: ONNX files of peers.
-        earlier: bench.json of an earlier bench, or None.
-        by_surface: True to show PSNR by surface.
-        only: names of the subjects to measure, or None for all.
-        system: True to measure the whole program, and nothing else.
-        sensors: number of sensors with which alone it is measured, or None.
-        soak_minutes: of the whole program afterwards, in [min], or None.
-        command: command line of the bench.
-    """
-
-    out: Path | None
-    rate_hz: float
-    ticks: int
-    threads: tuple[int, ...]
-    load: bool
-    models: Path | None
-    peers: tuple[Path, ...]
-    earlier: Path | None
-    by_surface: bool
-    only: list[str] | None
-    system: bool
-    sensors: int | None
-    soak_minutes: float | None
-    command: str
-
-
-def run(settings: Settings, out: TextIO, err: TextIO) -> int:
+def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
     """Measure, show and write; returns the exit code.
+
+    Args:
+        options: of edge.bench.options.bench_parser.
+        command: command line of the bench.
+        out: for the page.
+        err: for progress and warnings.
 
     Raises:
         EdgeError: an input cannot be used, or a measurement failed; the measurements so far are written first.
     """
     page = Page(out, err)
-    earlier = None if settings.earlier is None else read_record(settings.earlier)
-    _make_folder(settings.out)
-    frozen = load_frozen_set(subjects.FROZEN_FILE)
-    everyone = [*subjects.classical_subjects(frozen.scale), *subjects.bundled_subjects()]
-    if settings.models is not None:
-        everyone += subjects.models_in(settings.models, page.warn)
-    everyone = subjects.chosen(everyone, settings.only)
-    peers = [subjects.peer_subject(path) for path in settings.peers]
-    measured_ones = [*everyone, *peers]
-    record = Record(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        command=settings.command,
-        machine=this_machine(),
-        settings={
-            "rate_hz": settings.rate_hz,
-            "ticks": settings.ticks,
-            "threads": list(settings.threads),
-            "load": _tried_load() if settings.load else "",
-            "seeds": {"peer": subjects.PEER_SEED, "peak": peak.SEED, "intervals": intervals.SEED},
-            "test_set_sha256": frozen.sha256(),
-        },
+    _make_folder(options.out)
+    frozen = load_frozen_set(contenders.FROZEN_FILE)
+    everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
+    system = options.system or options.sensors is not None
+    threads = sorted(set(options.threads))
+    few = "" if options.ticks >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses mean little)"
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    page.say(
+        f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
+        f"{options.rate_hz:g} Hz{few}; threads {' and '.join(map(str, threads))}."
     )
-    page.say(f"# Error against run time\n\n{tables.about(record)}")
+    lines: list[dict[str, Any]] = []
     try:
-        if settings.system:
-            show_system(settings.ticks, settings.sensors, settings.soak_minutes, record, page)
+        if system:
+            lines += map(_flat, show_system(options.ticks, options.sensors, page))
         else:
-            record.facts += [_facts(subject) for subject in measured_ones]
-            _errors(everyone, frozen, record, page, by_surface=settings.by_surface)
-            _run_times(measured_ones, frozen, settings, record, page)
-            _front(record, page)
-            show_savings(everyone, frozen, record, page)
-            for peer in peers:
-                _against(everyone, peer, record, page)
-            if earlier is not None and settings.earlier is not None:
-                _compare(record, earlier, settings.earlier, page)
-        record.complete = True
+            errors = _errors(everyone, frozen, lines, page)
+            _run_times(everyone, threads, options, frozen, lines, page)
+            _front(errors, lines, threads[0], page)
     except KeyboardInterrupt:
-        kept = f": what was measured is in {settings.out}" if settings.out else ""
+        kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
         return INTERRUPTED
     finally:
-        if record.errors or record.run_times or record.system:  # an earlier bench is not replaced by an empty one
-            _write(record, page, settings.out, [Path(subject.path) for subject in measured_ones if subject.path])
+        if lines and options.out is not None:  # an earlier bench is not replaced by an empty one
+            models = [Path(subject.path) for subject in everyone if subject.path]
+            _write(options.out, command, page, lines, models, system=system)
     return 0
-
-
-def _tried_load() -> str:
-    """Return the description of the load, tried before minutes are spent; later it runs only next to its own rows."""
-    with busy_core() as answer:
-        return answer
 
 
 def _make_folder(folder: Path | None) -> None:
@@ -140,122 +92,115 @@ def _make_folder(folder: Path | None) -> None:
         raise UsageError(f"--out {folder}: cannot be made: {error.strerror}: name a folder to write in") from error
 
 
-def _facts(subject: Subject) -> Facts:
-    if subject.path is None:
-        return Facts(subject.name, subject.kind, method_macs(subject.name, subject.scale))
-    macs = macs_of(Path(subject.path), subjects.taps_of(subject))
-    weights = subjects.peer_weights(Path(subject.path)) if subject.kind == "peer" else None
-    return Facts(subject.name, subject.kind, macs.count, macs.uncounted, weights)
-
-
-def _errors(everyone: Sequence[Subject], frozen: FrozenSet, record: Record, page: Page, *, by_surface: bool) -> None:
-    record.force_floor_percent = round(force_floor_percent(frozen), 4)
-    page.section("Error", tables.error_text(record.force_floor_percent), tables.head(tables.ERROR_COLUMNS))
+def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: Page) -> list[ErrorRow]:
+    text = (
+        f"Frozen test set, means over all frames. Force error is RMS in % of {FORCE_RANGE_N:g} N, of what patterns sum "
+        f"up to, by the one factor that suits true patterns best: those themselves are "
+        f"{force_floor_percent(frozen):.2f} % off."
+    )
+    page.section("Error", text, head(ERROR_COLUMNS))
+    rows: list[ErrorRow] = []
     for subject in page.tracked(everyone, "error"):
         page.progress(f"error of {subject.name}")
         try:
             for row in error_rows(subject, frozen):
-                record.errors.append(row)
-                page.say(tables.error_line(row))
+                rows.append(row)
+                lines.append({"method": row.name, "taps_given": row.given} | row.error)
+                page.say(_error_line(row))
         except EdgeError as error:
             page.warn(f"run time only of {subject.name}: {error}")
-    if by_surface and record.errors:
-        page.say(f"\n{tables.surface_table(record.errors)}")
+    return rows
 
 
-def _run_times(everyone: Sequence[Subject], frozen: FrozenSet, settings: Settings, record: Record, page: Page) -> None:
-    for threads in settings.threads:
-        page.progress(f"the machine's peak on {threads}")
-        record.peak_gmac_s[threads] = measured({"do": "peak", "threads": threads}, threads)["gmac_s"]
-    columns = tables.run_time_columns(settings.rate_hz)
-    page.section("Run time", tables.run_time_text(record.peak_gmac_s), tables.head(columns))
-    window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
-    rows = [
-        (subject, threads, load)
-        for load in ((False, True) if settings.load else (False,))
-        for threads in settings.threads
-        for subject in everyone
-    ]
-    for subject, threads, load in page.tracked(rows, "run times"):
-        page.progress(tables.progress_text(subject.name, threads, load))
-        fact = record.fact(subject.name)
-        with busy_core() if load else contextlib.nullcontext():
-            row = _run_time(subject, fact, threads, load, window, settings, record.peak_gmac_s[threads])
-        record.run_times.append(row)
-        page.say(tables.run_time_line(row, fact))
-
-
-def _run_time(
-    subject: Subject,
-    fact: Facts,
-    threads: int,
-    load: bool,
-    window: list[Any],
-    settings: Settings,
-    peak_gmac_s: float,
-) -> RunTimeRow:
-    job = {"subject": asdict(subject), "threads": threads}
-    start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, threads)
-    answer = measured(job | {"do": "time", "rate_hz": settings.rate_hz, "ticks": settings.ticks}, threads)
-    back_to_back = _times(answer["back_to_back"])
-    gmac_s = fact.macs / (back_to_back.p50_us * 1e3)
-    return RunTimeRow(
-        name=subject.name,
-        threads=threads,
-        load=load,
-        back_to_back=back_to_back,
-        paced=Pace(**(answer["paced"] | {"times": _times(answer["paced"]["times"])})),
-        gmac_s=gmac_s,
-        peak_percent=100 * gmac_s / peak_gmac_s,
-        start_up_ms=start_up_ms,
-        resident_mb=resident_mb,
+def _error_line(row: ErrorRow) -> str:
+    error = row.error
+    cells = (
+        f"{error['psnr_db']:.2f}",
+        f"{error['rmse_percent']:.2f}",
+        *(f"{error[name]:.3f}" for name in ("ssim", "ssim_global", "contact_iou")),
+        f"{error['boundary_mm']:.2f}",
+        f"{100 * error['coverage_90']:.1f}" if "coverage_90" in error else "-",
+        f"{error['force_percent']:.2f}",
     )
+    return line((row.name, str(row.given), *cells))
 
 
-def _times(answer: dict[str, Any]) -> Times:
-    figures: dict[str, Any] = answer | {"block_p50_us": tuple(answer["block_p50_us"])}
-    return Times(**figures)
+def _run_times(
+    everyone: Sequence[Subject],
+    threads: Sequence[int],
+    options: argparse.Namespace,
+    frozen: FrozenSet,
+    lines: list[dict[str, Any]],
+    page: Page,
+) -> None:
+    columns = ("method", "threads", *(f"back to back {figure}" for figure in _PERCENTILES))
+    columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _PERCENTILES), "missed", "CPU %")
+    page.section("Run time", _RUN_TIME, head((*columns, "start-up ms", "MB")))
+    window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
+    rows = [(subject, count) for count in threads for subject in everyone]
+    for subject, count in page.tracked(rows, "run times"):
+        page.progress(f"run time of {subject.name}, {count} thread{'s' * (count > 1)}")
+        job = {"subject": asdict(subject), "threads": count}
+        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count)
+        answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
+        back_to_back, paced = answer["back_to_back"], answer["paced"]
+        cells = (
+            *_percentiles(back_to_back),
+            *_percentiles(paced["times"]),
+            f"{paced['missed']} of {paced['ticks']}",
+            f"{paced['cpu_percent']:.1f}",
+            f"{start_up_ms:.0f}",
+            "-" if resident_mb is None else f"{resident_mb:.0f}",
+        )
+        page.say(line((subject.name, str(count), *cells)))
+        figures = {f"back_to_back_{figure}": back_to_back[figure] for figure in FIGURES}
+        figures |= {f"paced_{figure}": paced["times"][figure] for figure in FIGURES}
+        figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
+        about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
+        lines.append(about | figures)
 
 
-def _front(record: Record, page: Page) -> None:
-    rows = record.front_rows()
-    if rows:
-        page.section("Pareto front", tables.front_text(record.run_times), tables.head(tables.FRONT_COLUMNS))
-        for row in rows:
-            page.say(tables.front_line(row))
+def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:
+    p999 = "-" if times["runs"] < 1000 else f"{times['p999_us']:.0f}"
+    return f"{times['p50_us']:.0f}", f"{times['p99_us']:.0f}", p999, f"{times['max_us']:.0f}"
 
 
-def _against(everyone: Sequence[Subject], peer: Subject, record: Record, page: Page) -> None:
-    text = tables.against_text(peer.name, record.fact(peer.name).weights)
-    page.section("Against a peer", text, tables.head(tables.AGAINST_COLUMNS))
-    for subject in page.tracked(everyone, "against"):
-        page.progress(f"{subject.name} against {peer.name}")
-        answer = measured(against.job(asdict(subject), asdict(peer)))
-        ratio = intervals.ratio_of(answer["subject_us"], answer["peer_us"], paired=True)
-        record.against.setdefault(peer.name, {})[subject.name] = ratio
-        page.say(tables.against_line(subject.name, ratio))
-
-
-def _compare(record: Record, earlier: dict[str, Any], path: Path, page: Page) -> None:
-    comparison = compared(record, earlier, path)
-    page.section("Compared", tables.compare_text(str(path), comparison), tables.head(tables.COMPARE_COLUMNS))
-    for row in comparison.rows:
-        page.say(tables.compare_line(row))
-
-
-def _write(record: Record, page: Page, folder: Path | None, models: Sequence[Path]) -> None:
-    if folder is None:
+def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads: int, page: Page) -> None:
+    paced_us = {row["method"]: row["paced_p50_us"] for row in lines if row.get("threads") == threads}
+    rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
+    if not rows:
         return
-    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(PROGRAM_SOURCES if record.system else [])]
-    made = provenance(record.command, sources, [*models, subjects.FROZEN_FILE])
+    page.section("Pareto front", _FRONT.format(threads, "s" * (threads > 1)), head(FRONT_COLUMNS))
+    best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
+    for row, is_best in zip(rows, best, strict=True):
+        figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")
+        page.say(line(("*" if is_best else "", row.name, str(row.given), *figures)))
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return, for each point, True if no other point is at least as small in both numbers and smaller in one."""
+    return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
+
+
+def _flat(row: SystemRow) -> dict[str, Any]:
+    """Return a row of the whole program as cells of a flat table."""
+    cells = {"method": row.name, "scans": row.scans, "cpu_percent": row.cpu_percent, "resident_mb": row.resident_mb}
+    for name, times in (("run_time", row.run_time), ("latency", row.latency)):
+        cells |= {} if times is None else {f"{name}_{figure}": getattr(times, figure) for figure in FIGURES}
+    return cells | ({} if row.losses is None else asdict(row.losses))
+
+
+def _write(
+    folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
+) -> None:
+    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(PROGRAM_SOURCES if system else [])]
+    made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
+    columns = dict.fromkeys(column for row in lines for column in row)
     try:
-        (folder / "bench.json").write_text(record.to_json())
-        (folder / "bench.csv").write_text(record.to_csv())
+        with (folder / "bench.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines)
         (folder / "bench.md").write_text(with_head("\n".join(page.lines) + "\n", made))
-        rows = record.front_rows()
-        if rows:
-            draw(rows, folder / "bench.png", f"{record.date}, {record.machine}")
     except OSError as error:
         raise BenchError(f"--out {folder}: cannot be written: {error.strerror}") from error
-    except BenchError as error:
-        page.warn(str(error))

@@ -1,6 +1,6 @@
 """Live report of a bench: the page on stdout, kept for the file, and one line of progress."""
 
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from typing import Final, TextIO, TypeVar
 
 from edge.terminal.progress_bar import Progress
@@ -9,6 +9,16 @@ from firmware_bridge.errors import harmless
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _Thing = TypeVar("_Thing")
+
+
+def line(cells: Sequence[str]) -> str:
+    """Return a row of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
+
+
+def head(columns: Sequence[str]) -> str:
+    """Return the head of a Markdown table."""
+    return f"{line(columns)}\n{'|---' * len(columns)}|"
 
 
 class Page:

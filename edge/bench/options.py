@@ -12,9 +12,8 @@ program should run meanwhile.
 
 examples:
   edge-sr bench --out today
-  edge-sr bench --load --only stsr mtsr4
   edge-sr bench --threads 1 \\
-          --compare before/bench.json
+          --only stsr mtsr4
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """
@@ -29,23 +28,12 @@ def bench_parser() -> argparse.ArgumentParser:
         epilog=BENCH_HELP,
     )
     add = parser.add_argument
-    add("--out", metavar="DIR", type=Path, help="folder for bench.json, .csv, .md and .png")
+    add("--out", metavar="DIR", type=Path, help="folder for bench.csv and bench.md")
     add("--rate-hz", metavar="R", type=positive, default=100.0, help="paced ticks a second (default 100)")
     add("--ticks", metavar="N", type=whole(10), default=3000, help="paced ticks a row (default 3000)")
-    add(
-        "--threads",
-        metavar="N",
-        type=whole(1),
-        nargs="+",
-        default=[1, 2],
-        help="numbers of threads to measure (default 1 2)",
-    )
-    add("--load", action="store_true", help="measure each row again with the last core busy")
+    add("--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="numbers of threads (default 1 2)")
     add("--models", metavar="DIR", type=Path, help="folder of your own models, measured as well")
-    against_help = "ratios to the run times of these ONNX files, with float inputs"
-    add("--against", metavar="FILE", type=Path, nargs="+", default=[], help=against_help)
-    add("--compare", metavar="OLD.json", type=Path, help="ratios to an earlier bench")
-    add("--by-surface", action="store_true", help="report the PSNR of each surface")
+    add("--only", metavar="NAME", nargs="+", help="measure only these methods")
     add("--system", action="store_true", help="measure the whole program only: 6 minutes with 3000 ticks")
     add(
         "--sensors",
@@ -53,11 +41,4 @@ def bench_parser() -> argparse.ArgumentParser:
         type=whole(3),
         help="measure the whole program with so many sensors only: 2 minutes with 3000 ticks",
     )
-    add(
-        "--soak",
-        metavar="MINUTES",
-        type=positive,
-        help="with --system or --sensors: also run it this long, for growth of memory and drift of latency",
-    )
-    add("--only", metavar="NAME", nargs="+", help="measure only these methods")
     return parser

@@ -7,12 +7,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from typing import Any, Final, TextIO, cast
+from typing import Any, Final
 
 import numpy as np
 
 from edge.bench.errors import BenchError
-from edge.errors import UsageError
 
 _THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
@@ -54,28 +53,6 @@ def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None
         if answer["resident_mb"] is not None:
             resident_mb.append(answer["resident_mb"])
     return float(np.median(took_ms)), float(np.median(resident_mb)) if resident_mb else None
-
-
-@contextlib.contextmanager
-def busy_core() -> Iterator[str]:
-    """Keep the last core busy that this process may use; yields a line that describes the load.
-
-    Only the load is held to its core: the measured process runs where the scheduler puts it, as on a robot.
-
-    Raises:
-        UsageError: this process may use only one core.
-    """
-    cores = usable_cores()
-    if len(cores) < 2:
-        raise UsageError("--load keeps another core busy, but this process may use one: bench without it")
-    pinned = hasattr(os, "sched_setaffinity")
-    with _child(1) as child:
-        asked, output = cast(TextIO, child.stdin), cast(TextIO, child.stdout)
-        asked.write(json.dumps({"do": "spin", "core": cores[-1] if pinned else None}))
-        asked.close()
-        if not output.readline():
-            raise BenchError("the load could not be started: its process ended at once")
-        yield f"core {cores[-1]} kept busy" if pinned else "a process that keeps a core busy, not held to one"
 
 
 def usable_cores() -> list[int]:

@@ -1,15 +1,21 @@
-"""Head of a report: the command, commit, models and sources that it was made from, as a block of TOML."""
+"""Head of a report: the command, commit and models that it was made from, as a block of TOML, and the report's age.
 
-import ast
+    python -m edge.bench.provenance
+
+prints a line for each report: fresh, or stale and why. A report is stale where a model or set that it names has
+changed, or a source that it names is gone or has changed since its commit. It is a list and not a gate: exit code 0.
+"""
+
+import argparse
 import hashlib
 import json
 import re
 import subprocess
+import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,10 +23,6 @@ from edge.bench.machine import this_machine
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 """Folder of the packages: the checkout's, where there is one."""
-SEARCHED: Final = ("", "tests/support/", "tests/system/")
-"""Folders that modules are imported from, below ROOT."""
-FOR_SHOW: Final = ("edge/terminal/", "edge/bench/live_report.py", "edge/bench/provenance.py")
-"""Files and folders that show progress or write the page: no figure depends on them."""
 DIGITS: Final = 12
 """Number of digits kept of a SHA-256."""
 UNKNOWN: Final = "unknown"
@@ -39,8 +41,7 @@ class Provenance:
         tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
         machine: processor, cores and versions.
         seed: of all chance, or None where each source has its own.
-        sources: files that make it, below ROOT; the files that they import count, too.
-        code: hash of these sources and the files that they import, see `code_hash`.
+        sources: files that make it, below ROOT.
         models: file below ROOT -> hash, of each model or frozen set it used.
     """
 
@@ -51,7 +52,6 @@ class Provenance:
     machine: str
     seed: int | None
     sources: tuple[str, ...]
-    code: str
     models: dict[str, str]
 
     def __str__(self) -> str:
@@ -60,6 +60,19 @@ class Provenance:
         lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items()]
         lines += ["", "[models]", *(f"{json.dumps(path)} = {json.dumps(value)}" for path, value in self.models.items())]
         return "\n".join(["```toml", *(lines if self.models else lines[:-2]), "```"])
+
+    def stale(self) -> Iterator[str]:
+        """Yield why the report is stale; nothing where it is fresh."""
+        for name, before in self.models.items():
+            if not (ROOT / name).exists():
+                yield f"{name} is not here, so whether it has changed is unknown"
+            elif file_hash(ROOT / name) != before:
+                yield f"{name} has changed"
+        yield from (f"{name} is gone" for name in self.sources if not (ROOT / name).exists())
+        names = _git("diff", "--name-only", self.commit, "--", *self.sources)
+        if names is None:
+            yield f"commit {self.commit} is not here, so whether its sources have changed is unknown"
+        yield from (f"{name} has changed" for name in (names or "").splitlines() if (ROOT / name).exists())
 
 
 def provenance(
@@ -73,17 +86,15 @@ def provenance(
         models: files of models and frozen sets that it uses.
         seed: of all chance.
     """
-    names = tuple(_below_root(Path(source)) for source in sources)
     changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!reports")
     return Provenance(
         command=command,
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         commit=_git("rev-parse", "--short=10", "HEAD") or UNKNOWN,
         tree=UNKNOWN if changes is None else "changed" if changes else "clean",
-        machine=str(this_machine()),
+        machine=this_machine(),
         seed=seed,
-        sources=names,
-        code=code_hash(imported_sources(names)),
+        sources=tuple(_below_root(Path(source)) for source in sources),
         models={_below_root(path): file_hash(path) for path in sorted({path.resolve() for path in models})},
     )
 
@@ -94,10 +105,9 @@ def read_provenance(page: str) -> Provenance | None:
     if block is None:
         return None
     try:
-        values: dict[str, Any] = {"seed": None, "models": {}}
-        values |= tomllib.loads(block[1])
+        values: dict[str, Any] = {"seed": None, "models": {}} | tomllib.loads(block[1])
         values["sources"] = tuple(values["sources"])
-        return Provenance(**values)
+        return Provenance(**{field.name: values[field.name] for field in fields(Provenance)})
     except (tomllib.TOMLDecodeError, KeyError, TypeError):
         return None
 
@@ -108,78 +118,9 @@ def with_head(page: str, made: Provenance) -> str:
     return f"{title}\n\n{made}\n{rest}"
 
 
-def read_source(path: str) -> str | None:
-    """Return the text of a file below ROOT, or None where there is none."""
-    try:
-        return (ROOT / path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return None
-
-
-def imported_sources(entries: Sequence[str], read: Callable[[str], str | None] = read_source) -> dict[str, str]:
-    """Return the entries and the files of this repository that they import themselves, not FOR_SHOW: path -> text.
-
-    Not what those import in turn: nearly every report reaches nearly every module that way, and all would be out of
-    date at any change. A report that depends on more names it among its sources.
-
-    Args:
-        entries: files below ROOT.
-        read: text of a file below ROOT, None where there is none.
-    """
-    sources = {path: text for path in entries if (text := read(path)) is not None}
-    imported = {module for text in sources.values() for module in _imports(text)}
-    paths = sorted(f"{folder}{module}" for module in imported for folder in SEARCHED)
-    return sources | {
-        path: text for path in paths if not path.startswith(FOR_SHOW) and (text := read(path)) is not None
-    }
-
-
-def code_hash(sources: Mapping[str, str]) -> str:
-    """Return a hash of path -> source that comments, docstrings and layout do not change."""
-    codes = {path: _code(text) for path, text in sources.items()}
-    return _hash(json.dumps(sorted(codes.items())).encode())
-
-
 def file_hash(path: Path) -> str:
     """Return a hash of a file's bytes."""
-    return _hash(path.read_bytes())
-
-
-def changed_files(commit: str, paths: Iterable[str]) -> list[str]:
-    """Return those of the files that differ from a commit's; an empty list where git or the commit lacks."""
-    names = _git("diff", "--name-only", commit, "--")
-    return sorted(set(paths) & set((names or "").splitlines()))
-
-
-@cache  # reports share most of their sources
-def _imports(text: str) -> frozenset[str]:
-    """Return the files that the imports of a source may stand for; a name from a package may be a module, too."""
-    names: set[str] = set()
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    paths = {name.replace(".", "/") for name in names}
-    return frozenset({f"{path}.py" for path in paths} | {f"{path}/__init__.py" for path in paths})
-
-
-@cache
-def _code(text: str) -> str:
-    """Return a source as its syntax alone, without the texts that are statements of their own."""
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(body := getattr(node, "body", None), list):
-            node.body = [one for one in body if not _is_text(one)] or [ast.Pass()]  # type: ignore[attr-defined]
-    return ast.unparse(tree)  # ast.dump differs from one Python to the next
-
-
-def _is_text(node: ast.stmt) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-
-
-def _hash(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:DIGITS]
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
 
 
 def _below_root(path: Path) -> str:
@@ -188,9 +129,37 @@ def _below_root(path: Path) -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """Return the output of git in ROOT; None outside a checkout, or without git."""
+    """Return the output of git in ROOT; None outside a checkout, without git, or where it refuses."""
     try:
         done = subprocess.run(["git", "-C", ROOT, *arguments], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
     return done.stdout.strip()
+
+
+def lines(folder: Path) -> Iterator[str]:
+    """Yield one line per report of a folder and those in it."""
+    for path in sorted(folder.rglob("*.md")):
+        made = read_provenance(path.read_text(encoding="utf-8"))
+        name = path.relative_to(folder).as_posix()
+        if made is None:
+            yield f"{name}: no head: make it again with its command"
+        elif why := "; ".join(made.stale()):
+            yield f"{name}: stale, of {made.date[:10]} ({made.commit}): {why}"
+        else:
+            yield f"{name}: fresh ({made.commit})"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    summary = "List the reports: fresh, or stale and why."
+    parser = argparse.ArgumentParser(prog="python -m edge.bench.provenance", description=summary)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", default=ROOT / "reports", help="folder of the reports (default: reports)"
+    )
+    for text in lines(parser.parse_args(arguments).folder):
+        sys.stdout.write(f"{text}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -3,14 +3,13 @@
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from edge.bench.processes import STARTS, busy_core, usable_cores
+from edge.bench.processes import STARTS, usable_cores
 from edge.bench.program import Line, Play, Program, edge_sr, parsed, plain_loop
 from edge.bench.timing import Times, summary
 
@@ -21,7 +20,6 @@ FAST_HZ: Final = 5000.0
 FAST: Final = f"at rest, {FAST_HZ:g} Hz"
 HELD, MOVING, FEW = "held still", "every scan new", "every scan new, pattern alone"
 TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
-TWO_BUSY = "two sensors, every scan new, recorded, other core busy"
 HAND: Final = 16
 """Sensors of a hand."""
 
@@ -44,37 +42,51 @@ class Losses:
 
 
 @dataclass(frozen=True, slots=True)
-class SystemRow:
-    """Measurement of one run of the whole program.
+class Used:
+    """Usage of the machine by a program during a row.
 
     Attributes:
-        name: of the row.
-        scans: number of scans in the run.
-        rate_hz: scans a second, of all sensors together, in [Hz].
+        seconds: length of the row, in [s].
         cpu_percent: processor time of all its threads, in [% of one core].
         thread_percent: the same of each thread that takes any, the most first.
         resident_mb: memory at the end, in [MB].
-        run_time: of the inference; None where there was none.
-        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
-            were lost, so that records cannot be matched.
-        losses: None where no records are read.
         preempted: number of times a thread lost its processor against its will.
         others_percent: processor time of everything else on the machine, in [% of one core].
         stolen_percent: processor time that the host took away from all cores, in [% of one core].
     """
 
-    name: str
-    scans: int
-    rate_hz: float
+    seconds: float
     cpu_percent: float
     thread_percent: tuple[float, ...]
     resident_mb: float
-    run_time: Times | None
-    latency: Times | None
-    losses: Losses | None
     preempted: int
     others_percent: float
     stolen_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class SystemRow(Used):
+    """Measurement of one run of the whole program.
+
+    Attributes:
+        name: of the row.
+        scans: number of scans in the run.
+        run_time: of the inference; None where there was none.
+        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
+            were lost, so that records cannot be matched.
+        losses: None where no records are read.
+    """
+
+    name: str
+    scans: int
+    run_time: Times | None = None
+    latency: Times | None = None
+    losses: Losses | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """Scans a second, of all sensors together, in [Hz]."""
+        return self.scans / self.seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +97,7 @@ class StartUp:
     resident_mb: float
 
 
-ROWS: Final = 10
+ROWS: Final = 9
 """Number of rows that `rows` yields."""
 HAND_ROWS: Final = 4
 """Number of rows that `hand_rows` yields."""
@@ -102,7 +114,6 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
 
     Raises:
         BenchError: a process ended.
-        UsageError: there is no second core to keep busy.
     """
     seconds = scans / 100
     moving, two = Play(pressed=ALL, moving=True), Play(sensors=2, pressed=ALL, moving=True)
@@ -111,18 +122,16 @@ def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
         yield from _at_rest(folder, (PLAIN, IDLE), Play(), scans, tell)
         tell(TWO)
         yield _unrecorded(folder, TWO, two, scans)
-        for name, play, options, busy in (
-            (IDLE_RECORDED, Play(), (), False),
-            (HELD, Play(pressed=ALL), (), False),
-            (MOVING, moving, ("--every-scan",), False),
-            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern"), False),
-            (TWO_RECORDED, two, ("--every-scan",), False),
-            (TWO_BUSY, two, ("--every-scan",), True),
-            (FAST, Play(rate_hz=FAST_HZ, waits=True), (), False),
+        for name, play, options in (
+            (IDLE_RECORDED, Play(), ()),
+            (HELD, Play(pressed=ALL), ()),
+            (MOVING, moving, ("--every-scan",)),
+            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern")),
+            (TWO_RECORDED, two, ("--every-scan",)),
+            (FAST, Play(rate_hz=FAST_HZ, waits=True), ()),
         ):
             tell(name)
-            with busy_core() if busy else nullcontext():
-                yield _measured(folder, name, play, seconds, *options)
+            yield _measured(folder, name, play, seconds, *options)
 
 
 def hand_rows(sensors: int, scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
@@ -158,7 +167,7 @@ def _at_rest(
         time.sleep(scans / play.rate_hz)
         used = [usage.since() for usage in usages]
     for name, one in zip(names, used, strict=True):
-        yield _row(name, scans * play.sensors, one)
+        yield SystemRow(**asdict(one), name=name, scans=scans * play.sensors)
 
 
 def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence[int] = ()) -> SystemRow:
@@ -166,7 +175,7 @@ def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence
         time.sleep(SETTLE_S)
         usage = _Usage(program)
         time.sleep(scans / play.rate_hz)
-        return _row(name, scans * play.sensors, usage.since())
+        return SystemRow(**asdict(usage.since()), name=name, scans=scans * play.sensors)
 
 
 def _measured(
@@ -192,17 +201,6 @@ def start_up() -> StartUp:
     return StartUp(tuple(took_s), float(np.median(resident_mb)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Used:
-    seconds: float
-    cpu_percent: float
-    thread_percent: tuple[float, ...]
-    resident_mb: float
-    preempted: int
-    others_percent: float
-    stolen_percent: float
-
-
 class _Usage:
     """Usage of a process from now on."""
 
@@ -211,7 +209,7 @@ class _Usage:
         self._threads, self._preempted, self._machine = program.thread_cpu_s(), program.preemptions(), _machine_s()
         self._start_s = time.monotonic()
 
-    def since(self) -> _Used:
+    def since(self) -> Used:
         """Return the usage until now."""
         took_s = time.monotonic() - self._start_s
         now = self._program.thread_cpu_s()
@@ -219,7 +217,7 @@ class _Usage:
         busy, stolen = (
             100 * (after - before) / took_s for after, before in zip(_machine_s(), self._machine, strict=True)
         )
-        return _Used(
+        return Used(
             took_s,
             sum(percent),
             tuple(share for share in percent if share >= 0.01),
@@ -237,15 +235,15 @@ def _machine_s() -> tuple[float, float]:
     return user + nice + system + interrupts + soft_interrupts, stolen
 
 
-def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
+def _recorded(name: str, lines: list[Line], used: Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
     first, last = lines[0].record["counters"], lines[-1].record["counters"]
     lost = {key: last[key] - first[key] for key in ("late", "dropped", "overruns", "torn_wire")}
     run_times_us = [line.record["run_time_us"] for line in lines if line.record["run_time_us"] is not None]
     distinguishable = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
-    return _row(
-        name,
-        len(lines),
-        used,
+    return SystemRow(
+        **asdict(used),
+        name=name,
+        scans=len(lines),
         run_time=summary([round(1e3 * run_time_us) for run_time_us in run_times_us]) if run_times_us else None,
         latency=summary(latencies_ns(lines, stamps_ns)) if distinguishable else None,
         losses=Losses(lost["late"], lost["dropped"], lost["overruns"], lost["torn_wire"]),
@@ -255,28 +253,3 @@ def _recorded(name: str, lines: list[Line], used: _Used, stamps_ns: dict[str, li
 def latencies_ns(lines: list[Line], stamps_ns: dict[str, list[int]]) -> list[int]:
     """Return the time from each scan's last byte to its record, in [ns]; matched by number, so no scan may be lost."""
     return [line.time_ns - stamps_ns[line.record["sensor"]][line.record["scan"]] for line in lines]
-
-
-def _row(
-    name: str,
-    scans: int,
-    used: _Used,
-    *,
-    run_time: Times | None = None,
-    latency: Times | None = None,
-    losses: Losses | None = None,
-) -> SystemRow:
-    return SystemRow(
-        name=name,
-        scans=scans,
-        rate_hz=scans / used.seconds,
-        cpu_percent=used.cpu_percent,
-        thread_percent=used.thread_percent,
-        resident_mb=used.resident_mb,
-        run_time=run_time,
-        latency=latency,
-        losses=losses,
-        preempted=used.preempted,
-        others_percent=used.others_percent,
-        stolen_percent=used.stolen_percent,
-    )

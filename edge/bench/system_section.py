@@ -3,10 +3,7 @@
 from itertools import chain
 from typing import Final
 
-from edge.bench.live_report import Page
-from edge.bench.record import Record, SystemRecord
-from edge.bench.report import head, line
-from edge.bench.soak import Soak, soak
+from edge.bench.live_report import Page, head, line
 from edge.bench.system import HAND, HAND_ROWS, ROWS, SystemRow, hand_rows, rows, start_up
 from edge.bench.targets import Verdict, verdicts
 from edge.bench.timing import Times
@@ -27,43 +24,38 @@ _TEXT: Final = (
 )
 
 
-def show_system(scans: int, sensors: int | None, soak_minutes: float | None, record: Record, page: Page) -> None:
-    """Measure the whole program, show it and keep it in the record.
+def show_system(scans: int, sensors: int | None, page: Page) -> list[SystemRow]:
+    """Measure the whole program and show it row by row.
 
     Args:
         scans: of each sensor, a row.
         sensors: number of sensors, of which alone rows are measured; None for one, two and a hand.
-        soak_minutes: length of a soak afterwards, in [min]; None for none.
-        record: keeps what was measured.
         page: shows it.
 
     Raises:
         BenchError: a process ended.
-        UsageError: there is no second core to keep busy.
     """
-    system = record.system = SystemRecord()
+    found: list[SystemRow] = []
     page.section("The whole program", _TEXT, head(COLUMNS))
     hand = hand_rows(HAND if sensors is None else sensors, scans, page.progress)
     measured, count = (
         (chain(rows(scans, page.progress), hand), ROWS + HAND_ROWS) if sensors is None else (hand, HAND_ROWS)
     )
     for row in page.tracked(measured, "the program", total=count):
-        system.rows.append(row)
+        found.append(row)
         page.say(row_line(row))
+    started = None
     if sensors is None:
         page.progress("start-up")
-        system.start_up = start_up()
-        starts = ", ".join(f"{took_s:.2f}" for took_s in system.start_up.first_pattern_s)
-        memory = f"{system.start_up.resident_mb:.0f} MB by then"
-        page.say(f"\nStart to the record of the first pattern: {starts} s; {memory}.")
-    system.verdicts += verdicts({row.name: row for row in system.rows}, system.start_up)
-    if system.verdicts:
+        started = start_up()
+        starts = ", ".join(f"{took_s:.2f}" for took_s in started.first_pattern_s)
+        page.say(f"\nStart to the record of the first pattern: {starts} s; {started.resident_mb:.0f} MB by then.")
+    held = list(verdicts({row.name: row for row in found}, started))
+    if held:
         page.section("Targets", "Measured in this run.", head(("target", "measured", "held", "limited by")))
-    for verdict in system.verdicts:
+    for verdict in held:
         page.say(verdict_line(verdict))
-    if soak_minutes is not None:
-        system.soak = soak(soak_minutes, 1 if sensors is None else sensors)
-        page.say(f"\n## Soak\n\n{soak_text(system.soak)}")
+    return found
 
 
 def row_line(row: SystemRow) -> str:
@@ -93,17 +85,6 @@ def row_line(row: SystemRow) -> str:
 def verdict_line(verdict: Verdict) -> str:
     """Return a target as a row of the table."""
     return line((verdict.target, verdict.measured, "yes" if verdict.held else "no", verdict.limited_by))
-
-
-def soak_text(found: Soak) -> str:
-    """Describe a soak in a few sentences."""
-    first, last = found.windows[0], found.windows[-1]
-    return (
-        f"{found.minutes:.1f} minutes, rest and a moving contact in turns of 2.5 s: memory {first.resident_mb:.1f} to "
-        f"{last.resident_mb:.1f} MB, {found.memory_mb_per_minute:+.3f} MB a minute (+- {found.memory_half:.3f}, 95 %); "
-        f"lower quartile of the latency, last third to first: {found.latency_ratio:.3f}; threads {first.threads} to "
-        f"{last.threads}, descriptors {first.descriptors} to {last.descriptors}, {last.overruns} overrun."
-    )
 
 
 def _times(times: Times | None) -> tuple[str, ...]:

@@ -1,8 +1,4 @@
-"""Run times, back to back and at the sensor's rate, on an injected clock.
-
-Each measurement keeps the medians of its blocks: slow variation shows between them, and two measurements can be
-compared with an interval.
-"""
+"""Run times, back to back and at the sensor's rate, on an injected clock."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -13,11 +9,9 @@ import numpy as np
 
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
-BLOCKS: Final = 30
-"""Number of blocks of consecutive runs in a measurement, if it has as many runs."""
 _BUDGET_NS: Final = 2_000_000_000
 _LEAST_RUNS: Final = 90
-"""Fewest runs of a measurement, three a block, however long one takes."""
+"""Fewest runs of a measurement, however long one takes."""
 
 Run = Callable[[int], object]
 """One inference; its argument is a number that selects the input."""
@@ -33,7 +27,6 @@ class Times:
         p99_us: 99th percentile, in [us].
         p999_us: 99.9th percentile, in [us]; of fewer than 1000 runs it is the longest.
         max_us: longest, in [us].
-        block_p50_us: median of each block of consecutive runs, in [us].
     """
 
     runs: int
@@ -41,7 +34,6 @@ class Times:
     p99_us: float
     p999_us: float
     max_us: float
-    block_p50_us: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +57,7 @@ def summary(took_ns: Sequence[int]) -> Times:
     """Return the percentiles of run times in [ns]."""
     took_us = np.asarray(took_ns, dtype=np.float64) / 1e3
     p50, p99, p999 = np.percentile(took_us, [50, 99, 99.9])
-    blocks = np.array_split(took_us, min(BLOCKS, len(took_us)))
-    medians = tuple(float(np.median(block)) for block in blocks)
-    return Times(len(took_us), float(p50), float(p99), float(p999), float(took_us.max()), medians)
+    return Times(len(took_us), float(p50), float(p99), float(p999), float(took_us.max()))
 
 
 def timed(run: Run, numbers: Sequence[int], clock: Clock = time.perf_counter_ns) -> list[int]:

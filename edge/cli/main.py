@@ -23,8 +23,6 @@ from edge.api import (
     Source,
     Statistics,
     UsageError,
-    bundled_models,
-    load_model,
     open_source,
     save_baselines,
     take_baselines,
@@ -124,8 +122,6 @@ def _map(arguments: Sequence[str]) -> int:
 def _follow(options: argparse.Namespace, statistics: Statistics | None = None, mapping: MapSink | None = None) -> None:
     if options.source == ["demo"] and options.view is not None and not set(options.sink) - {"status"}:
         options.source = [DEMO_LOOP]  # a person may look at a page for long; a sink gets one round
-    if options.recalibrate and options.budget_us is None:
-        raise UsageError("--recalibrate requires --budget-us")
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
     from edge.cli.run_command import run
 
@@ -164,22 +160,10 @@ def _replay(arguments: Sequence[str]) -> int:
 
 
 def _models(arguments: Sequence[str]) -> int:
-    models_parser().parse_args(arguments)
-    models = bundled_models()
-    if not models:
-        raise ModelError("no models are bundled with this installation")
-    widest = max(len(path.stem) for path in models)
-    print(f"{'model':{widest}s} taps scale    size arithmetic  error on the frozen test set, with all taps")
-    for path in models:
-        contract = load_model(path).contract
-        error = contract.test_error.get(str(contract.taps), {})
-        figures = ", ".join(f"{name} {value:.3g}" for name, value in error.items())
-        size_mb = path.stat().st_size / 1e6
-        print(
-            f"{path.stem:{widest}s} {contract.taps:4d} {f'x{contract.scale}':>5s} {size_mb:4.1f} MB "
-            f"{contract.arithmetic:10s}  {figures or 'not known'}"
-        )
-    return 0
+    options = models_parser().parse_args(arguments)
+    from edge.cli.models_command import run
+
+    return run(measure=options.measure, stdout=sys.stdout)
 
 
 def _baseline(arguments: Sequence[str]) -> int:
@@ -216,29 +200,11 @@ def _bench(arguments: Sequence[str]) -> int:
         ) from error
 
     options = bench_parser().parse_args(arguments)
-    if options.soak is not None and not (options.system or options.sensors):
-        raise UsageError("--soak is a part of --system: add it")
-    from edge.bench.command import Settings, run
+    from edge.bench.command import run
 
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
-    settings = Settings(
-        out=options.out,
-        rate_hz=options.rate_hz,
-        ticks=options.ticks,
-        threads=tuple(sorted(set(options.threads))),
-        load=options.load,
-        models=options.models,
-        peers=tuple(options.against),
-        earlier=options.compare,
-        by_surface=options.by_surface,
-        only=options.only,
-        system=options.system or options.sensors is not None,
-        sensors=options.sensors,
-        soak_minutes=options.soak,
-        command=shlex.join(["edge-sr", "bench", *arguments]),
-    )
-    return run(settings, sys.stdout, sys.stderr)
+    return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
 def _devices(arguments: Sequence[str]) -> int:

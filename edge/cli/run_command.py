@@ -28,7 +28,6 @@ from edge.api import (
     Source,
     Statistics,
     UsageError,
-    choose_model,
     find_model,
     load_baselines,
     load_model,
@@ -85,19 +84,10 @@ def run(
         posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
         name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
         model = None
-        if options.budget_us is None and not stop.is_set():
+        if not stop.is_set():
             path = find_model(name)  # first, or a name with a slip would wait for links that are slow to open
-            source.begin()  # its links open while the model loads, but not while models are timed
+            source.begin()  # its links open while the model loads
             model = load_model(path, stop=stop)
-        elif options.budget_us is not None:
-            model = choose_model(
-                name,
-                options.budget_us,
-                rate_hz=options.rate_hz,
-                recalibrate=options.recalibrate,
-                stop=stop,
-                tell=lambda line: print(line, file=sys.stderr),
-            )
         if model is None:
             return
         scores = sys.stderr if stdout_taken else sys.stdout

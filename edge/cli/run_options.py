@@ -153,9 +153,7 @@ def replay_parser() -> argparse.ArgumentParser:
     outputs("--fields", metavar="F", help=_FIELDS_HELP)
     _add_view(parser)
     _add_results(parser)
-    parser.set_defaults(
-        source=[], id_map=None, budget_us=None, recalibrate=False, give_up_s=None, realtime=False, poses=[]
-    )
+    parser.set_defaults(source=[], id_map=None, give_up_s=None, realtime=False, poses=[])
     return parser
 
 
@@ -220,9 +218,6 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 def _add_model(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("model").add_argument
     add("--model", metavar="M", help=_MODEL_HELP)
-    budget_help = "choose the most accurate model that takes less than N microseconds a scan, with no more taps than M"
-    add("--budget-us", metavar="N", type=positive, help=budget_help)
-    add("--recalibrate", action="store_true", help="with --budget-us: measure the run times of the models again")
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
@@ -337,5 +332,7 @@ def devices_parser() -> argparse.ArgumentParser:
 
 
 def models_parser() -> argparse.ArgumentParser:
-    """Return the parser of `edge-sr models`, which has no options."""
-    return Parser(prog="edge-sr models", description="Lists the bundled models.")
+    """Return the parser of `edge-sr models`."""
+    parser = Parser(prog="edge-sr models", description="Lists the bundled models, with their error.")
+    parser.add_argument("--measure", action="store_true", help="measure the run time of each here, 1.5 s a model")
+    return parser

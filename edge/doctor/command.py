@@ -62,7 +62,6 @@ def run(
             known,
             presses=not options.no_press,
             weighs=options.weight_g is not None,
-            grips=not (options.no_press or options.no_grip),
         )
     before = references(options.baseline, known)
     with stop_on_signals() as stop:
@@ -97,7 +96,6 @@ def run(
                     {name: one for name, one in examined.baselines.items() if name not in examined.loaded},
                     mountings,
                     visit.newtons,
-                    visit.gains,
                     emulated="emulated" in (watch.link.kind, watch.link.origin),
                 )
             except SensorFileError as error:

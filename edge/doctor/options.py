@@ -7,8 +7,8 @@ from typing import Final
 from edge.terminal.argument_types import Parser, add_source, positive
 
 DOCTOR_HELP: Final = """\
-Keep the pad still, with nothing touching it, until you are asked to press its corners and to grip something flat. \
-Hold it in the orientation in which patterns are to be drawn: it defines top and left.
+Keep the pad still, with nothing touching it, until you are asked to press its corners. Hold it in the \
+orientation in which patterns are to be drawn: it defines top and left.
 
 examples:
   edge-sr doctor
@@ -41,7 +41,6 @@ def doctor_parser() -> argparse.ArgumentParser:
     drift_help = f"seconds to measure the free, still pad (default {DOCTOR_DRIFT_S:g})"
     measure("--drift-s", metavar="T", type=positive, default=DOCTOR_DRIFT_S, help=drift_help)
     measure("--no-press", action="store_true", help="skip the presses on the corners")
-    measure("--no-grip", action="store_true", help="skip the grips of something flat")
     weight_help = "weight in grams to lay on the pad, which gives forces in newtons"
     measure("--weight-g", metavar="G", type=positive, help=weight_help)
     results = parser.add_argument_group("results").add_argument

@@ -9,16 +9,12 @@ from typing import TextIO
 from edge.doctor.examine import Examined
 from edge.doctor.felt_line import FeltLine, enter_pressed
 from edge.doctor.findings import Finding
-from edge.doctor.flat_grip_guide import GuidedGrips
-from edge.doctor.grip_findings import judge_grips
 from edge.doctor.press_findings import judge_press
 from edge.doctor.press_guide import Guide, GuidedPress
 from edge.doctor.watch import Watch
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.text_wrap import columns, wrapped
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
@@ -29,7 +25,6 @@ class Visit:
 
     Attributes:
         newtons: counts per newton of the sensors that were weighed.
-        gains: pads with the gains of the sensors that were gripped.
         watched: True when the free pads were watched for the whole time.
         unfinished: True when a measurement was asked of a person, and not made.
     """
@@ -52,7 +47,6 @@ class Visit:
             clock_s: the clock of the scans, monotonic, in [s].
         """
         self.newtons: dict[str, float] = {}
-        self.gains: dict[str, Pad] = {}
         self.watched = self.unfinished = False
         self._options = options
         self._err = err
@@ -80,7 +74,7 @@ class Visit:
         self.watched = not self._stop.is_set()
 
     def press(self, examined: Examined) -> dict[str, Mounting]:
-        """Ask for presses and grips on every pad that may be zeroed; returns the corrections of their mountings.
+        """Ask for presses on every pad that may be zeroed; returns the corrections of their mountings.
 
         Raises:
             LinkLostError: the link is gone.
@@ -93,8 +87,6 @@ class Visit:
                 mounting = self._press_one(name, examined, len(names) > 1)
                 if mounting is not None:
                     found[name] = mounting
-                if not self._options.no_grip and self._watch.known.geometry == USPA44:
-                    self._grip_one(name, examined, mounting, len(names) > 1)
             elif why is not None or name not in examined.baselines:
                 reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
@@ -112,14 +104,6 @@ class Visit:
         if guide.answer.counts_per_newton is not None:
             self.newtons[name] = guide.answer.counts_per_newton
         return found
-
-    def _grip_one(self, name: str, examined: Examined, found: Mounting | None, several: bool) -> None:
-        guide = GuidedGrips(self._watch.known.geometry)
-        self._lead(guide, name, examined, f"Sensor {name}: " if several else "")
-        finding, gains = judge_grips(guide, found, self._options.out is not None)
-        self._add([finding], name, examined)
-        if gains is not None:
-            self.gains[name] = gains
 
     def _add(self, findings: list[Finding], name: str, examined: Examined) -> None:
         """Add findings of what was asked of a person."""

@@ -3,13 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 
 from firmware_bridge import in_place
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
@@ -17,7 +15,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 _AS_WIRED = frozenset({"mounting"})
 
 
-def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool, grips: bool) -> None:
+def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
     Args:
@@ -25,7 +23,6 @@ def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool
         known: sensor file that the doctor started with.
         presses: presses will be asked for.
         weighs: a weight will be asked for.
-        grips: flat grips will be asked for.
 
     Raises:
         SensorFileError: the file cannot be written, or holds values that this visit cannot measure.
@@ -41,7 +38,7 @@ def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool
             entry,
             counts_per_newton=entry.counts_per_newton if weighs else None,
             assumed=entry.assumed if presses else entry.assumed | _AS_WIRED,
-            pad=entry.pad if grips and _of_gains_alone(entry.pad) else None,
+            pad=None,
             learned=None,
             emulated=frozenset(),
         )
@@ -57,7 +54,6 @@ def keep(
     baselines: Mapping[str, Baseline],
     found: Mapping[str, Mounting],
     counts_per_newton: Mapping[str, float],
-    gains: Mapping[str, Pad] = MappingProxyType({}),
     *,
     emulated: bool = False,
 ) -> SensorFile:
@@ -70,14 +66,13 @@ def keep(
         baselines: of the free pads as they were read, by sensor.
         found: corrections of the mounting, by sensor.
         counts_per_newton: of the sensors that were weighed.
-        gains: pads with gains, along the pads' axes, of the sensors that were gripped.
         emulated: all results are of emulated sensors.
 
     Raises:
         SensorFileError: the file cannot be written, or holds values that were not measured this time.
     """
     with changing(path):
-        return _kept(path, known, port, baselines, found, counts_per_newton, gains, emulated=emulated)
+        return _kept(path, known, port, baselines, found, counts_per_newton, emulated=emulated)
 
 
 def _kept(
@@ -87,7 +82,6 @@ def _kept(
     baselines: Mapping[str, Baseline],
     found: Mapping[str, Mounting],
     counts_per_newton: Mapping[str, float],
-    gains: Mapping[str, Pad],
     *,
     emulated: bool,
 ) -> SensorFile:
@@ -96,9 +90,9 @@ def _kept(
     if known.path is not None and known.path.resolve() == path.resolve():  # a run may have learned gains meanwhile
         for name, entry in before.sensors.items():
             entries[name] = replace(entries.get(name, entry), learned=entry.learned)
-    for name in sorted({*baselines, *found, *counts_per_newton, *gains}):
+    for name in sorted({*baselines, *found, *counts_per_newton}):
         entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
-        parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines, "gains": gains}
+        parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
         renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
         turned = found.get(name, as_wired)
         baseline = baselines.get(name, entry.baseline)
@@ -107,9 +101,6 @@ def _kept(
             baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
         per_newton = counts_per_newton.get(name, entry.counts_per_newton)
         pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
-        if name in gains:
-            found_gains = gains[name]
-            pads[0] = replace(pads[0] or Pad(), gains=found_gains.gains, gain_half_widths=found_gains.gain_half_widths)
         entries[name] = SensorEntry(
             entry.mounting.then(turned),
             per_newton,
@@ -165,11 +156,6 @@ def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
         *["place on the robot"] * (entry.frame is not None and written.frame is None),
         *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
     ]
-
-
-def _of_gains_alone(pad: Pad | None) -> bool:
-    """Return whether grips find again all that a pad holds."""
-    return pad is not None and not pad.constants and not pad.intervals
 
 
 def _serial_number(port: str) -> str | None:

@@ -8,8 +8,6 @@ from edge.errors import ModelError, UsageError
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
 TAXELS: Final = BUNDLE_DIR / "taxels.npz"
 """File of the estimator of dead taxels."""
-FLAT_GRIPS: Final = BUNDLE_DIR / "grips.npz"
-"""File of the table by which flat grips give the gains of a sensor."""
 CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
 """File of the distribution of contacts by which a running sensor learns its gains."""
 DEFAULT_MODEL: Final = "stsr-int8"
@@ -45,18 +43,6 @@ def find_model(name: str | Path) -> Path:
             return file
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
-
-
-def alternatives(model: Path) -> list[Path]:
-    """Return files of models that may replace a model: for a bundled one the others, else its own int8 file.
-
-    A network that is not bundled was trained on other surfaces, and the bundled ones cannot stand in for it.
-    """
-    bundled = bundled_models()
-    if model.resolve() in bundled:
-        return [path for path in bundled if path != model.resolve()]
-    int8 = model.with_name(f"{model.stem}{INT8_SUFFIX}{model.suffix}")
-    return [int8] if int8.is_file() else []
 
 
 def demo_recording() -> Path:

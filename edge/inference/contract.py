@@ -51,11 +51,6 @@ DETERMINED: Final = 0.4
 """Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 LEAST_UNIT: Final = 1e-6
 """Least divisor in counts, newtons or millimetres, so that float32 holds the quotient."""
-STAND_IN_KEYS: Final = (
-    *("scale", "angle_step_deg", "output_unit", "output_full_scale", "sensor", "rows", "cols", "pitch_mm"),
-    "traction_scale",
-)
-"""Keys that two models must share for one to replace the other: the same taps, and patterns of one meaning."""
 
 Shape = tuple[Any, ...]
 """Shape of an input or output, the batch first: a number for each dimension, or a name where it is free."""
@@ -216,20 +211,6 @@ class Contract:
                     f"{self.sensor} of {self.rows} x {self.cols} taxels, the sensor is a {geometry.name} of "
                     f"{geometry.rows} x {geometry.cols}; give a --model trained for it, or the sensor's own --id-map"
                 )
-
-    def check_stands_in(self, other: "Contract") -> None:
-        """Refuse to replace a model whose patterns mean something else.
-
-        Raises:
-            ModelError: a key differs; the message names it.
-        """
-        keys = {key: (getattr(self, key), getattr(other, key)) for key in STAND_IN_KEYS}
-        keys["interval_factor"] = (self.interval_factor is not None, other.interval_factor is not None)
-        if self.taps > 1:  # a single tap is the same with poses and without
-            keys["takes_poses"] = (self.takes_poses, other.takes_poses)
-        for key, (got, expected) in keys.items():
-            if got != expected:
-                raise ModelError(f"contract key '{key}' is {got!r}, that of the model asked for {expected!r}")
 
     def read_trust(self) -> Trust | None:
         """Return the forward model and the checks; None if the model has none."""

@@ -22,7 +22,7 @@ SHIFTED: Final = 0.01
 _LEAST_CERTAINTY: Final = 0.1
 CONTRADICTED: Final = 6.0
 """Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
-gains reached in a thousand contacts is 4.4, on 48 simulated sensors (reports/gains-from-contacts.md)."""
+gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
 CONTRADICTED_CONTACTS: Final = 25
 """Fewest distinct contacts by which that is decided."""
 

@@ -17,7 +17,7 @@ from firmware_bridge.poses.pose_track import PoseTrack
 LEAST_APART_MM: Final = 0.5
 """Least distance between the pads of two taps, in [mm], root mean square over their taxels. The error of a taxel is the
 same in all taps at one place, and the model takes it for seen several times: on real grips such taps made five times as
-many holes as one alone (docs/log.md)."""
+many holes as one alone (docs/decisions.md)."""
 
 
 class PosedTaps(NamedTuple):

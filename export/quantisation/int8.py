@@ -2,7 +2,7 @@
 
 Ranges are percentiles over training taps. For a network that takes poses they are widened to what windows beyond any
 touch give: its layers exchange values between taps, which such windows take far out of every range. Those of the newest
-tap's own layers are widened a little only, since coarser steps there cost most (docs/log.md).
+tap's own layers are widened a little only, since coarser steps there cost most (docs/decisions.md).
 """
 
 import contextlib
@@ -28,7 +28,6 @@ from edge.inference.pose_input import scheduled_rows
 from export.errors import ExportError
 from export.graphs.joined import branches
 from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
-from export.quantisation.rounding import MOST_VALUE
 from firmware_bridge.pad_geometry import AXES
 from train.data.batch import Batch
 from train.data.batches import Draw
@@ -45,6 +44,7 @@ With the whole range the bundled models lose .03 to .07 dB more, because a few l
 """
 _WIDEST: Final = np.float32(1.3)
 """Factor by which windows beyond any touch may widen the ranges of the newest tap's own layers."""
+MOST_VALUE: Final = 255
 _CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
 _SET_FORCE_N: Final = (0.3, 8.0)

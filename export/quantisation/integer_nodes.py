@@ -2,7 +2,7 @@
 
 Layers that take most of the time are quantised: the convolutions of the largest grid except for those of the outputs.
 Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and no later layer
-recovers their losses (docs/log.md). A network that takes poses also quantises what encodes its earlier taps, a third of
+recovers their losses. A network that takes poses also quantises what encodes its earlier taps, a third of
 its time with four taps, except for the convolutions of the inputs. Those that read logarithms stay in float: a step of
 their range is a factor.
 """

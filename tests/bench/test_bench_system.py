@@ -1,26 +1,22 @@
 """The bench of the whole program: what it measures, what it makes of it, and where it shows it."""
 
-import json
+import csv
 import time
 from dataclasses import replace
 
 import pytest
-from edge_samples import FakeModel, make_contract
 
-from edge.bench import gate_savings as scene
 from edge.bench import system, system_section
 from edge.bench.program import Line, Play, edge_sr, plain_loop
-from edge.bench.soak import Soak, Window
+from edge.bench.provenance import read_provenance
 from edge.bench.system import Losses, StartUp, SystemRow, latencies_ns
 from edge.bench.targets import verdicts
 from edge.bench.timing import summary
 from edge.cli.main import main
-from edge.evaluation.test_set import load_frozen_set
-from edge.inference.bundled import BUNDLE_DIR
 
 HAND = system.hand_names(system.HAND)
 QUICK = summary([700_000] * 1000)
-ROW = SystemRow(system.IDLE, 1000, 5000.0, 1.0, (0.6, 0.4), 70.0, None, None, None, 3, 20.0, 0.5)
+ROW = SystemRow(0.2, 1.0, (0.6, 0.4), 70.0, 3, 20.0, 0.5, system.IDLE, 1000)
 ROWS = {
     row.name: row
     for row in (
@@ -73,7 +69,7 @@ def test_who_lost_scans_has_no_latency():
     lines = [
         Line(9, {"sensor": "4", "scan": 0, "run_time_us": 5.0, "counters": counters | {"overruns": n}}) for n in (0, 1)
     ]
-    used = system._Used(1.0, 1.0, (1.0,), 70.0, 0, 0.0, 0.0)
+    used = system.Used(1.0, 1.0, (1.0,), 70.0, 0, 0.0, 0.0)
     row = system._recorded("x", lines, used, {"4": [1]})
     assert row.latency is None and row.losses == Losses(0, 0, 1, 0)
     assert system._recorded("x", lines[:1], used, {"4": [1]}).latency == summary([8])
@@ -103,46 +99,23 @@ def test_the_page_the_json_and_the_table_tell_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(system_section, "rows", lambda scans, tell: (r for r in ROWS.values() if r.name not in HAND))
     monkeypatch.setattr(system_section, "hand_rows", lambda sensors, scans, tell: (ROWS[name] for name in HAND))
     monkeypatch.setattr(system_section, "start_up", lambda: STARTED)
-    soaked = Soak(1.0, 0.01, 0.02, 1.1, (Window(5.0, 70.0, 900.0, 2, 9, 0),))
-    monkeypatch.setattr(
-        system_section, "soak", lambda minutes, sensors: soaked if (minutes, sensors) == (0.5, 1) else None
-    )
-    assert main(["bench", "--system", "--soak", "0.5", "--out", str(tmp_path)]) == 0
+    assert main(["bench", "--system", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert out.count("| yes |") == 13 and "+0.010 MB a minute" in out and "0.90, 0.20, 0.30 s" in out
-    told = json.loads((tmp_path / "bench.json").read_text())
-    assert {row["name"] for row in told["system"]["rows"]} == set(ROWS)
-    assert told["system"]["soak"]["latency_ratio"] == 1.1 and len(told["system"]["verdicts"]) == 13
-    table = (tmp_path / "bench.csv").read_text().splitlines()
-    assert len(table) == 1 + len(ROWS) and "latency_p999_us" in table[0]
-    assert main(["bench", "--soak", "1"]) == 2
-    assert "--soak is a part of --system: add it" in capsys.readouterr().err
+    assert out.count("| yes |") == 13 and "0.90, 0.20, 0.30 s" in out
+    page = (tmp_path / "bench.md").read_text()
+    assert out.split("\n\n", 1)[1].strip() in page and read_provenance(page) is not None
+    table = list(csv.DictReader((tmp_path / "bench.csv").open()))
+    assert [row["method"] for row in table] == [*(name for name in ROWS if name not in HAND), *HAND]
+    assert "latency_p999_us" in table[0]
 
 
 def test_a_hand_is_measured_alone_and_row_by_row(tmp_path, monkeypatch, capsys):
     """Six sensors on two buses, for a moment each."""
     monkeypatch.setattr(system, "SETTLE_S", 0.5)
     assert main(["bench", "--sensors", "6", "--ticks", "30", "--out", str(tmp_path)]) == 0
-    told = json.loads((tmp_path / "bench.json").read_text())["system"]
+    rows = list(csv.DictReader((tmp_path / "bench.csv").open()))
     names = system.hand_names(6)
-    assert [row["name"] for row in told["rows"]] == list(names) and told["start_up"] is None
-    assert f"| {names[3]} |" in capsys.readouterr().out
-    recorded = told["rows"][3]
-    assert recorded["run_time"] is not None and recorded["resident_mb"] > 20
-    assert told["verdicts"] == [], "the targets are of one, two and sixteen sensors"
-
-
-def test_each_thing_left_out_spares_inferences(monkeypatch):
-    monkeypatch.setattr(scene, "_EVERY", 40)
-    monkeypatch.setattr(scene, "HELD_SCANS", 12)
-    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    model = FakeModel(make_contract(taps=2, counts_per_unit=(500.0, 500.0, 1000.0)))
-    rows = list(scene.savings(model, frozen))
-    assert [row.left_out.removeprefix("+ ") for row in rows][1:3] == [
-        "where nothing touches",
-        "where nothing has changed",
-    ]
-    nothing, touching, changed, _ = (row.inferred for row in rows)
-    assert nothing == rows[0].scans > touching > changed > 0
-    assert rows[0].psnr_db == rows[1].psnr_db
-    assert rows[0].taps_used > 1
+    assert [row["method"] for row in rows] == list(names)
+    out = capsys.readouterr().out
+    assert f"| {names[3]} |" in out and "Targets" not in out, "the targets are of one, two and sixteen sensors"
+    assert float(rows[3]["run_time_p50_us"]) > 0 and float(rows[3]["resident_mb"]) > 20

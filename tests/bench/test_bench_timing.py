@@ -1,12 +1,10 @@
-"""Run times on a clock of its own, their ratios, and the front."""
+"""Run times on a clock of its own, and the front."""
 
 import numpy as np
 import pytest
 
-from edge.bench.peer_ratios import alternated
-from edge.bench.ratios import Ratio, ratio_of
-from edge.bench.record import front
-from edge.bench.timing import BLOCKS, back_to_back, paced, summary
+from edge.bench.command import front
+from edge.bench.timing import back_to_back, paced, summary
 
 
 class Clock:
@@ -84,14 +82,12 @@ def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
     assert found.missed == 10
 
 
-def test_percentiles_and_block_medians():
+def test_percentiles():
     took_ns = np.arange(1, 3001) * 1000
     times = summary(took_ns)
     assert times.p50_us == 1500.5
     assert (times.p99_us, times.p999_us) == pytest.approx((2970.01, 2997.001))
     assert (times.max_us, times.runs) == (3000, 3000)
-    assert times.block_p50_us == tuple(50.5 + 100 * block for block in range(BLOCKS))
-    assert len(summary(took_ns[:7]).block_p50_us) == 7
 
 
 @pytest.mark.parametrize(
@@ -103,54 +99,6 @@ def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
     found = back_to_back(run, most, clock)
     assert found.runs == runs
     assert found.p50_us == took_ms * 1000
-
-
-def test_two_are_timed_in_turn_and_the_first_run_of_a_block_is_not_counted():
-    clock = Clock()
-    order = []
-
-    def work(name, *took_ms):
-        def run(number):
-            order.append(name)
-            clock.now_ns += round(1e6 * took_ms[number % len(took_ms)])
-
-        return run
-
-    one_us, other_us = alternated(work("one", 9, 7, 8), work("other", 90, 30, 40), 4, clock)
-    assert (one_us, other_us) == ([7500] * 4, [35_000] * 4)
-    blocks = [name for i, name in enumerate(order) if i == 0 or order[i - 1] != name]
-    assert blocks == ["one", "other", "one", "other", "one", "other"]  # after the estimate: who begins changes
-
-
-def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
-    rng = np.random.default_rng(3)
-    weather = rng.uniform(1, 3, 30)
-    paired = ratio_of(2 * weather, weather, paired=True)
-    assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2))
-    loose = ratio_of(2 * weather, weather, paired=False)
-    assert loose.low < 1.9 < 2.1 < loose.high
-
-
-def test_an_interval_holds_the_truth_about_as_often_as_it_says():
-    rng = np.random.default_rng(4)
-    held = 0
-    for _ in range(60):
-        found = ratio_of(rng.normal(12, 1, 30), rng.normal(10, 1, 30), paired=False)
-        held += found.low <= 1.2 <= found.high
-    assert 50 <= held < 60
-
-
-def test_blocks_that_cannot_be_compared_are_refused():
-    with pytest.raises(ValueError, match="3 blocks over 2"):
-        ratio_of([1, 2, 3], [1, 2], paired=True)
-    with pytest.raises(ValueError, match="0 blocks over 2"):
-        ratio_of([], [1, 2], paired=False)
-
-
-def test_a_ratio_is_shown_with_three_digits_and_says_whether_it_differs():
-    assert str(Ratio(1178.2, 1140.1, 1209.9)) == "1180 (1140..1210)"
-    assert Ratio(1.2, 1.1, 1.3).differs
-    assert not Ratio(1.2, 0.9, 1.3).differs
 
 
 def test_the_front_is_who_is_not_beaten():

@@ -105,12 +105,6 @@ class TestContract:
         with pytest.raises(ModelError, match=re.escape(f"'{key}' is ") + ".*" + re.escape(expected)):
             Contract.from_metadata(make_pad_contract().to_metadata() | {f"tactile.{key}": value})
 
-    def test_one_that_gives_other_traction_does_not_stand_in_but_one_that_takes_another_pad_does(self):
-        make_pad_contract(pad_inputs=(), takes_gains=False).check_stands_in(make_pad_contract())
-        make_contract(version=4).check_stands_in(make_contract())
-        with pytest.raises(ModelError, match="'traction_scale' is None, that of the model asked for 2"):
-            make_contract().check_stands_in(make_pad_contract())
-
 
 class TestSession:
     @pytest.mark.parametrize("version", [4, 5])

@@ -56,10 +56,10 @@ def pages(site) -> dict[Path, Page]:
 
 
 def test_the_first_page_and_the_reports_are_there(site, pages):
-    assert {"index.html", "trouble.html", "reports/bench.html", "reports/load/bench.html", "log.html"} <= {
+    assert {"index.html", "trouble.html", "reports/bench.html", "reports/system/bench.html", "decisions.html"} <= {
         path.relative_to(site).as_posix() for path in pages
     }
-    assert (site / "reports" / "bench.png").read_bytes() == (ROOT / "reports" / "bench.png").read_bytes()
+    assert (site / "reports" / "families.png").read_bytes() == (ROOT / "reports" / "families.png").read_bytes()
     assert not list(site.rglob("*.py"))
     assert "<code>echo 1 | sudo tee /sys/" in (site / "trouble.html").read_text()
 

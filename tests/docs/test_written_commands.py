@@ -47,13 +47,13 @@ ENOUGH = 60
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
-    r"edge-sr .*--budget-us .*": "measures run times for seconds; test_run_times runs it",
+    r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr map .*": "is of poses that a robot sends, and without them writes nothing; test_map_command runs it",
     r"edge-sr .*--realtime.*": "takes a processor from the other tests; test_realtime runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python tests/system/(faults|zenoh_load)\.py.*": "takes minutes; test_fault_bench, test_zenoh_programs run them",
-    r"python tests/system/hand_soak\.py.*": "takes minutes; test_soak runs it",
+    r"python tests/system/(hand_)?soak\.py.*": "takes minutes; test_soak runs it",
     r"python tests/system/page_cost\.py": "takes minutes; test_progress runs its rounds",
     r"python tests/system/page_clients.*": "takes minutes, and a person looks at the memory",
     r"python tests/system/fault_emulator\.py .*--loop.*": "plays until ended; test_fault_bench runs it",

@@ -217,7 +217,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     person = Person(sits)
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         monkeypatch.setenv("COLUMNS", "40")
-        asked = ("--rate-hz", 400, "--weight-g", 200, "--no-grip", "--out", file)
+        asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
         done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
     assert f"taxel order: {turn.split()[0]}" in done.out, done.out
     shown = (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines()
@@ -232,7 +232,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
 
     person = Person(sits)
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
-        asked = ("--rate-hz", 400, "--no-grip", "--json", "--sensor", file)
+        asked = ("--rate-hz", 400, "--json", "--sensor", file)
         done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
     assert verdicts(done) == {}, done.out
     settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
@@ -242,7 +242,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
 def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong(monkeypatch):
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
     with Emulator([recording(*people, rate_hz=300.0)], jitter_s=0.0) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--no-grip", "--rate-hz", 300, people=people, drift_s=0.5)
+        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 300, people=people, drift_s=0.5)
     found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
@@ -250,7 +250,7 @@ def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wr
 
 def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     monkeypatch.setattr(visit, "GIVEN_UP_S", 0.3)
-    options = doctor_parser().parse_args(["--drift-s", "0.1", "--json", "--no-grip"])
+    options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
     monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])
     assert command.run(options, out, Terminal(Person())) == 1
@@ -280,7 +280,7 @@ def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(monkeypatc
         os.write(leader, b"\n")  # before anything is asked: no answer to it
         person = Impatient(lambda: os.write(leader, b"\n"))
         with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
-            asked = ("--rate-hz", 400, "--no-grip", "--json")
+            asked = ("--rate-hz", 400, "--json")
             done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
     os.close(leader)
     settled = {one["name"]: (one["verdict"], one["measured"]) for one in json.loads(done.out)["findings"]}
@@ -293,7 +293,7 @@ def test_ctrl_c_at_a_request_keeps_the_baseline(monkeypatch, tmp_path):
     file = tmp_path / "s.toml"
     person = Impatient(lambda: signal.raise_signal(signal.SIGINT))
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
-        asked = ("--rate-hz", 400, "--no-grip", "--out", file)
+        asked = ("--rate-hz", 400, "--out", file)
         done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
     entry = load_sensor_file(file).sensors["4"]
     assert done.code == 130 and f"kept in {file}" in done.out

@@ -115,12 +115,12 @@ class TestLoss:
             keep.keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE)
 
     def test_what_cannot_be_found_is_told_before_the_visit(self, good):
-        check_writable(good, SensorFile(adapter="D30BL366"), presses=True, weighs=True, grips=True)
-        check_writable(good, load_sensor_file(good), presses=False, weighs=False, grips=True)
+        check_writable(good, SensorFile(adapter="D30BL366"), presses=True, weighs=True)
+        check_writable(good, load_sensor_file(good), presses=False, weighs=False)
         with pytest.raises(SensorFileError, match="would be lost: counts per newton of sensor 4"):
-            check_writable(good, SensorFile(), presses=True, weighs=False, grips=True)
+            check_writable(good, SensorFile(), presses=True, weighs=False)
         with pytest.raises(SensorFileError, match="would be lost: order and axes of sensor 4"):
-            check_writable(good, SensorFile(), presses=False, weighs=True, grips=True)
+            check_writable(good, SensorFile(), presses=False, weighs=True)
 
     def test_what_was_found_of_a_device_is_not_replaced_by_what_is_emulated(self, tmp_path):
         path = tmp_path / "s.toml"

@@ -1,29 +1,22 @@
 """Every experiment runs, in miniature, and leaves a page, a table and a plot."""
 
 import csv
-import json
 import re
 from dataclasses import replace
 
 import pytest
 from edge_samples import ROOT
 
-from train.errors import CheckpointError
 from train.experiments.__main__ import EXPERIMENTS, main, module_of
 from train.experiments.support import workbench
-from train.experiments.support.trainings import OUT
 from train.experiments.support.workbench import Workbench
 
 COLUMNS = {
     "table3": {"method", "validation PSNR dB", "test PSNR dB", "test SSIM", "parameters", "MMAC", "run time ms"},
-    "trained_out": {"network", "epochs", "test PSNR dB", "MMAC", "run time ms", "its own min", "trained on"},
     "table4": {"scale", "test PSNR dB", "paper's test PSNR dB", "MMAC", "run time ms"},
     "angle": {"network", "angle deg", "test PSNR dB", "over STSR dB", "run time ms"},
     "taps": {"network", "taps given", "test PSNR dB", "over STSR dB", "run time ms"},
     "fig5": {"surface"},
-    "free_sides": {"contact", "stiffness, bare", "stiffness, corrected"},
-    "curved": {"surface", "method"},
-    "psf_speed": {"route", "times the direct"},
     "fig7": {"method", "error %", "ms a pattern"},
 }
 
@@ -74,30 +67,6 @@ def test_table3_has_every_method_and_the_papers_figures(folder):
     assert {"bilinear", "bicubic", "linear map", "srgan", "stsr", "mtsr2", "compact stsr", "compact mtsr7"} <= set(rows)
     assert rows["mtsr2"]["paper's test PSNR dB"] == "23.8"
     assert float(rows["stsr"]["MMAC"]) == pytest.approx(7321, abs=1)
-
-
-def test_networks_brought_from_elsewhere_are_judged_as_they_are(folder, tmp_path):
-    """Whatever data they were trained on, and without any here; what is not there is named."""
-    run(folder, "trained_out")
-    (tmp_path / "checkpoints").mkdir()
-    names = ("quick-out-compact-stsr-40", "quick-out-compact-mtsr2-40+20")
-    for name in names:
-        weights, report = ((folder / "checkpoints" / f"{name}{suffix}").read_bytes() for suffix in (".pt", ".json"))
-        (tmp_path / "checkpoints" / f"{name}.pt").write_bytes(weights)
-        told = json.loads(report) | {"training_sha256": "of other data", "device": "a faster one"}
-        (tmp_path / "checkpoints" / f"{name}.json").write_text(json.dumps(told))
-    page = run(tmp_path, "trained_out", "--found").with_suffix(".md").read_text()
-    with (tmp_path / "reports" / "trained_out.csv").open() as file:
-        rows = {row["network"]: row for row in csv.DictReader(file)}
-    assert list(rows) == ["compact stsr 40", "compact mtsr2 40+20"]
-    assert rows["compact mtsr2 40+20"]["epochs"] == "60.0"
-    assert rows["compact mtsr2 40+20"]["trained on"] == "a faster one"
-    assert "Missing, so not evaluated: stsr 10, stsr 40," in page
-    assert "compact mtsr2 40+20 over compact mtsr2 40+20, one tap given" in page
-    assert not list((tmp_path / "data").glob("quick-seen*"))
-    stale = replace(OUT[0], name=names[0].removeprefix("quick-"))
-    with pytest.raises(CheckpointError, match="another recipe"):
-        Workbench(tmp_path / "data", tmp_path / "checkpoints", quick=True).brought(stale)
 
 
 def test_networks_and_data_are_made_once(folder, capsys):

@@ -14,6 +14,8 @@ from edge.inference.onnx_session import ModelSession
 from train.errors import TrainError
 from train.experiments.sensor import interval_coverage
 from train.experiments.sensor.interval_coverage import Held
+from train.experiments.support.gratings import save_grating
+from train.surfaces.named_surfaces import is_flat, surface_mesh
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +78,14 @@ def test_the_trusted_half_is_that_of_the_least_expected_error():
     assert interval_coverage._half(errors, np.array([4.0, 3.0, 2.0, 1.0])) == pytest.approx(np.sqrt((9 + 16) / 2))
     assert interval_coverage._half(errors, errors) == pytest.approx(np.sqrt((1 + 4) / 2))
     assert interval_coverage._risk(errors, errors)[-1] == pytest.approx(np.sqrt(30 / 4))
+
+
+def test_a_grating_is_a_surface_of_bars_half_a_wavelength_wide(tmp_path):
+    path = tmp_path / "new" / "grating-5.stl"
+    save_grating(path, 5.0)
+    mesh = surface_mesh(f"mesh:{path}")
+    assert is_flat(mesh) and mesh.is_watertight
+    bars = sorted(mesh.split(), key=lambda bar: bar.bounds[0, 0])
+    np.testing.assert_allclose([bar.extents[0] for bar in bars], 2.5, atol=1e-4)
+    np.testing.assert_allclose(np.diff([bar.centroid[0] for bar in bars]), 5.0, atol=1e-4)
+    assert mesh.extents[0] > 50

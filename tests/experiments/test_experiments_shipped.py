@@ -13,14 +13,11 @@ from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import load_frozen_presses
-from train.errors import TrainError
-from train.experiments.sensor import families, pads, wrench
+from train.experiments.sensor import families, pads
 from train.experiments.support import baselines, kriging, nominal, oracle, scores, shipped
-from train.experiments.support.tap_oracle import KnownTaps
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import NOMINAL
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.tap_schedules import SCHEDULES
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +43,6 @@ class TestScores:
         truth = np.zeros((2, 4, 4))
         truth[0, 0, 0], truth[1, 0, 0] = 0.5, 0.05
         assert scores.own_peak_db(np.array([30.0, 30.0]), truth, 0.5) == pytest.approx([30, 10])
-
-    def test_share_beside_an_offset_is_found_again(self):
-        reading = np.linspace(-5, 5, 101)
-        error = 0.12 * np.abs(reading) + 0.05
-        assert scores.share_beside(error, reading, 0.05) == pytest.approx(12)
-        assert scores.share_beside(-error, reading, 0.05) == pytest.approx(12)
-        assert scores.share_beside(np.full(101, 0.04), reading, 0.05) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -119,28 +109,6 @@ class TestBaselines:
         assert off[2.0] < 0.1 and off[2.0] < off[0.5]
 
 
-class TestWrench:
-    def test_tractions_sum_up_to_the_loads_they_are_of(self):
-        wide = load_frozen_presses().pick(np.arange(40))
-        truth, summed = wrench.true_loads(wide), wrench.loads(wide.presses.traction_kpa, 2)
-        assert summed[:, :3] == pytest.approx(truth[:, :3], abs=0.02)
-        cells = wrench.error_cells(truth, truth)
-        assert cells["z N"] == 0 and cells["tangential %"] < 1e-3 and cells["centre mm"] == 0
-
-    def test_what_a_method_does_not_give_has_no_cell(self):
-        truth = np.ones((4, 6))
-        only_z = np.full((4, 6), np.nan)
-        only_z[:, 2] = 1.15
-        cells = wrench.error_cells(only_z, truth)
-        assert cells["z %"] == pytest.approx(10) and cells["z bias %"] == pytest.approx(15)
-        assert not {"tangential N", "centre mm"} & set(cells)
-
-    def test_a_model_without_traction_is_refused_in_one_line(self, bench, tmp_path):
-        write_model(tmp_path / "stsr-int8.onnx", make_contract(taps=1))
-        with pytest.raises(TrainError, match="gives no traction"):
-            wrench.run(replace(bench, models=tmp_path), tmp_path)
-
-
 def test_the_oracle_finds_a_press_again_from_a_place_nearby():
     known = oracle.KnownSurface("small triangle", NOMINAL)
     start = oracle.PRIOR_MEAN + np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0])
@@ -152,37 +120,6 @@ def test_the_oracle_finds_a_press_again_from_a_place_nearby():
         for pattern in (known.press(start[None]).patterns[0], found)
     ]
     assert off[1] < 0.2 * off[0]
-
-
-def test_the_oracle_of_several_taps_finds_them_again_though_their_poses_are_off():
-    shifts = SCHEDULES["half-pitch"](np.random.default_rng(0), 3)
-    taps = KnownTaps(oracle.KnownSurface("small triangle", NOMINAL), shifts)
-    place = np.array([0.5, 0.0, 10.0])
-    start, off = taps.mean(place), np.zeros_like(taps.spread)
-    off[:5] = 0.4, -0.3, 3, 0.002, 0
-    off[-6:] = 0.2, 0.1, 1, -0.2, 0.2, -1
-    press = taps.press((start + off)[None])
-    assert len(press.counts) == 3 and taps.off(off)[1:].ravel() == pytest.approx(off[-6:])
-    moved = np.abs(press.counts[0] - press.counts[1]).max() / np.abs(press.counts[0]).max()
-    assert moved > 0.1, "taps are at other places"
-    found = taps.fit(press.counts.reshape(3, -1), place, 3)
-    off = [
-        np.sqrt(np.mean((pattern - press.patterns[0]) ** 2)) for pattern in (taps.press(start[None]).patterns[0], found)
-    ]
-    assert off[1] < 0.2 * off[0]
-
-
-def test_the_oracle_of_several_taps_keeps_the_more_probable_of_two_optima():
-    shifts = SCHEDULES["half-pitch"](np.random.default_rng(0), 2)
-    taps = KnownTaps(oracle.KnownSurface("small triangle", NOMINAL), shifts)
-    place = np.array([0.5, 0.0, 10.0])
-    truth, far = taps.mean(place), taps.mean(place) + np.pad([4.0, 0, 120], (0, len(taps.spread) - 3))
-    press = taps.press(truth[None])
-    for starts in ((truth, far), (far, truth)):
-        found = taps.fit(press.counts.reshape(2, -1), place, 0, starts)
-        np.testing.assert_allclose(found, press.patterns[0], atol=1e-6)
-    assert len(taps.first(1, truth)) == len(oracle.PRIOR_SD)
-    assert taps.first(2, truth) == pytest.approx(truth)
 
 
 def test_what_is_common_to_all_taxels_of_an_axis_covaries():
@@ -236,10 +173,3 @@ class TestPages:
         rows = rows_of(tmp_path / "pads.csv")
         assert [row["constant"] for row in rows] == list(pads.CONSTANTS[:2])
         assert all(row["model before, down"] and row["model, all known, up"] for row in rows)
-
-    def test_wrench(self, bench, tmp_path):
-        wrench.run(bench, tmp_path)
-        rows = {row["method"]: row for row in rows_of(tmp_path / "wrench.csv")}
-        assert {"model", "model, counts/N known", "linear", "summed z"} <= set(rows)
-        assert rows["summed z"]["twist N mm"] == "" and float(rows["model"]["twist N mm"]) > 0
-        assert len(rows_of(tmp_path / "wrench-families.csv")) == 21

@@ -74,7 +74,7 @@ def test_it_runs_in_miniature(models, tmp_path, capsys):
             tables[part] = list(csv.DictReader(file))
     assert {row["schedule"] for row in tables["schedules"]} == set(SCHEDULES)
     assert {row["taps"] for row in tables["schedules"]} == {"1", "2", "3", "4", "7"}
-    assert all(row["run time us"] and row["over the peer"] for row in tables["schedules"] + tables["begun"])
+    assert all(row["run time us"] for row in tables["schedules"] + tables["begun"])
     mapped = {(row["schedule"], row["taps"]) for row in tables["schedules"] if row["linear map dB"]}
     assert mapped == {(name, taps) for name in ("half-pitch", "turns") for taps in ("1", "4")}
     assert all(row["over one tap, not stated, guarded"] and row["left out %"] for row in tables["wrong-poses"])
@@ -88,25 +88,6 @@ def test_taps_that_do_not_belong_are_left_out_alone(models):
     kept, left_out = _guarded(ModelSession(models / f"{MODEL}.onnx"), windows, poses)
     assert left_out.tolist() == [[False, True, False, False], [False, False, True, True]]
     assert not kept[left_out].any() and np.array_equal(kept[~left_out], windows[~left_out])
-
-
-def test_limits_of_taps_in_miniature(models, tmp_path, capsys):
-    places = [f"--{place}={tmp_path / place}" for place in ("reports", "data", "checkpoints")]
-    main(["tap-limits", "--quick", *places, f"--models={models}"])
-    report = tmp_path / "reports" / "tap-limits"
-    assert capsys.readouterr().out.endswith(f"{report}.md\n")
-    tables = {}
-    for part in ("", "-known", "-mirrored", "-oracle"):
-        with report.with_name(f"tap-limits{part}.csv").open() as file:
-            tables[part] = list(csv.DictReader(file))
-    assert [row["known"] for row in tables["-known"]] == ["nothing", "pad", "gains", "pad and gains"]
-    figures = {tuple(row[name] for name in row if "dB" in name or "gain of" in name) for row in tables["-known"]}
-    assert len(figures) == 4, "each row knows something else"
-    assert len({row["without"] for row in tables[""]}) == 7
-    assert [row["method"] for row in tables["-oracle"]] == ["oracle", "model", "model, all known"]
-    assert all(row["gain of 4 taps"] and int(row["4 taps us"]) > 0 for row in tables["-oracle"])
-    plain, both = tables["-mirrored"]
-    assert plain["one tap dB"] != both["one tap dB"] and int(both["one tap us"]) > int(plain["one tap us"])
 
 
 def test_the_papers_schedule_in_miniature(tmp_path, capsys):

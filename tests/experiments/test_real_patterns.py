@@ -13,7 +13,7 @@ RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)
 LEAST_SHARE, MOST_UNEVEN, MOST_DOUBTED = 0.9, 0.3, 0.02
 DENTED = "data_sample_2022-02-22-08-10-01"
-"""The weakest grip, a documented fault: on both fingers the pattern has a dent below half (docs/log.md)."""
+"""The weakest grip, a documented fault: on both fingers the pattern has a dent below half (docs/decisions.md)."""
 
 pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
 

@@ -269,33 +269,22 @@ def test_the_command_ends_in_one_line(frozen, tmp_path, monkeypatch):
 
 
 def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, monkeypatch, capsys):
-    """First weights tell nothing apart, so two steps of training change nothing that is seen."""
     frozen.save(tmp_path / "frozen.npz")
     make_sequences(count=40).save(tmp_path / "taps.npz")
     monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
     monkeypatch.setattr(to_onnx, "held_out", lambda split: make_sequences(count=6, seed=2))
     monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
     path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=16, blocks=1)
-    command = [str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz"), "--fine-tune-steps", "2"]
     with pytest.raises(
         SystemExit, match=r"^export: quantisation costs too much in one-int8\.onnx .*: use the float32 model"
     ):
-        main(command)
-    *before, line = capsys.readouterr().out.splitlines()
-    assert line.startswith("one-int8.onnx") and "fine-tuned 2 steps" in line
-    contract = ModelSession(tmp_path / "one-int8.onnx").contract
-    assert contract.arithmetic == "int8"
-    assert (contract.training_sha256 == "ab" * 32) == ("not taken" in line)
-    # What was trained on comes in float32, too: integers alone could not be compared with what they are of.
-    assert [text.partition(":")[0] for text in before] == ([] if "not taken" in line else ["one.onnx"])
-    for _ in before:
-        in_float = ModelSession(tmp_path / "one.onnx").contract
-        assert (in_float.arithmetic, in_float.training_sha256) == ("float32", contract.training_sha256)
+        main([str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz")])
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("one-int8.onnx") and "convolutions in int8" in line
+    assert ModelSession(tmp_path / "one-int8.onnx").contract.arithmetic == "int8"
 
 
-@pytest.mark.parametrize(
-    "option", [["--all-integers"], ["--fine-tune-steps", "3"], ["--int8", "x", "--fine-tune-steps", "-1"]]
-)
+@pytest.mark.parametrize("option", [["--all-integers"], ["--trust", "x"], ["--intervals", "x"]])
 def test_options_that_do_not_fit_are_a_usage_error(option):
     with pytest.raises(SystemExit) as end:
         main(["one.pt", *option])

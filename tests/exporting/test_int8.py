@@ -15,17 +15,17 @@ from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun
 from export.quantisation.int8 import calibration_batch, convolutions, quantised, rounded_ranges
 from export.quantisation.integer_nodes import integer_nodes, newest_values
-from export.quantisation.rounding import folded
 from export.to_onnx import export
 from firmware_bridge.pad_geometry import USPA44
 from train.data.batch import Batch
 from train.networks.registry import build
+from train.networks.symmetric import write_out
 
 
 @pytest.fixture(scope="module")
 def net():
     torch.manual_seed(0)
-    return folded(build("compact-mtsr2", 10, channels=16, blocks=2))
+    return write_out(build("compact-mtsr2", 10, channels=16, blocks=2).eval())
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ FRONT = {
         "edge.cli.new_recording",
         "edge.cli.new_map",
     ),  # the page, and the notes about a recording and a map
-    *("edge.doctor.command", "edge.bench.command"),  # commands of their own
+    *("edge.doctor.command", "edge.bench.command", "edge.cli.models_command"),  # commands of their own
 }
 NAN = float("nan")
 OURS = ("edge", "firmware_bridge", "train", "export")
@@ -180,12 +180,6 @@ def stream(source, model=None, **settings):
         (lambda: api.examine("demo", baselines={"4": 1}), UsageError, "baseline of sensor 4 is a int, expected"),
         (lambda: api.examine("demo", "demo"), UsageError, "^2 sources, expected one: examine them one after"),
         (lambda: load_model("stsr", threads=-1), UsageError, "threads is -1, expected a whole number from 1"),
-        (lambda: api.choose_model("stsr", NAN), UsageError, "budget_us is nan, expected a positive number"),
-        (
-            lambda: api.choose_model("stsr", 9e3, rate_hz="50"),
-            UsageError,
-            "rate_hz is '50', expected a positive number",
-        ),
         (lambda: load_model("nothing"), ModelError, r"no model 'nothing': .*bundled: .*stsr-int8\.onnx"),
     ],
 )
@@ -362,10 +356,3 @@ def test_the_doctors_findings_are_those_of_the_api(files):
 def test_devices_are_listed(monkeypatch):
     monkeypatch.setattr("firmware_bridge.links.discovery.devices", lambda: (["found"], ["note"]))
     assert api.devices() == (["found"], ["note"])
-
-
-def test_a_model_within_a_budget(files, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    lines = []
-    model = api.choose_model(files / "tiny.onnx", 1e6, rate_hz=1000, tell=lines.append)
-    assert model is not None and model.name == "tiny" and lines[-1].startswith("budget 1e+06 us: tiny (")

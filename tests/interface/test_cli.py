@@ -13,6 +13,7 @@ from edge_samples import BASELINE, ROOT, make_contract, write_model
 
 from edge import __version__
 from edge.cli import main as cli
+from edge.cli import models_command
 from edge.inference import bundled as bundle
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
@@ -58,7 +59,7 @@ class TestHelp:
     def test_help_names_all_there_is(self):
         text = run("--help").stdout
         options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
-        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps", "budget-us", "recalibrate")]
+        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps")]
         for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "npz:FILE", "models", "reset"):
             assert word in text
 
@@ -211,6 +212,16 @@ class TestModels:
         assert out[1].split() == ["mtsr4", "4", "x10", f"{size_mb:.1f}", "MB", "float32", *figures]
         figures = ["psnr_db", "30.1,", "coverage_90", "0.903"]
         assert out[2].split() == ["stsr", "1", "x10", f"{size_mb:.1f}", "MB", "float32", *figures]
+
+    def test_run_times_are_measured_next_to_the_error(self, monkeypatch, capsys, tmp_path):
+        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+        monkeypatch.setattr(models_command, "RATE_HZ", 2000.0)
+        write_model(tmp_path / "mtsr4.onnx")
+        assert cli.main(["models", "--measure"]) == 0
+        head, row, note, *_ = capsys.readouterr().out.splitlines()
+        assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"
+        p50, p99, *figures = row.split()[6:]
+        assert 0 < int(p50) <= int(p99) and figures == ["psnr_db", "33.2,", "rmse_percent", "2.1"]
 
     def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
         monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)

@@ -26,8 +26,6 @@ class TestRefusals:
             (["--counts-per-newton", "1e8"], ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
             (["--duration-s", "nan"], ["--duration-s: 'nan' is not a positive number"]),
             (["--counts-per-newton", "x"], ["--counts-per-newton: 'x' is not"]),
-            (["--budget-us", "0"], ["--budget-us: '0' is not a positive number"]),
-            (["--recalibrate"], ["--recalibrate requires --budget-us"]),
             (["--mode", "x"], ["unrecognized arguments: --mode"]),
             (["model"], ["no command 'model': did you mean models?"]),
             (["doctro"], ["no command 'doctro': did you mean doctor?"]),

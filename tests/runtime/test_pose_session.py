@@ -153,14 +153,6 @@ def test_a_graph_without_the_poses_of_its_contract_is_refused(tmp_path):
         ModelSession(write_model(tmp_path / "tiny.onnx", metadata=metadata))
 
 
-def test_only_a_model_that_takes_poses_or_one_tap_stands_in_for_one():
-    asked = make_posed_contract(taps=4)
-    make_posed_contract(taps=2).check_stands_in(asked)
-    make_contract(taps=1).check_stands_in(asked)
-    with pytest.raises(ModelError, match="'takes_poses' is False, that of the model asked for True"):
-        make_contract(taps=4).check_stands_in(asked)
-
-
 def test_features_of_pairs_hold_the_pose_in_place_of_the_turns():
     window, poses = random_taps(3)
     poses[1:] = [[2.5, -5, 90, 0.5, 10], [0, 0, -30, 100, 1e5]]

@@ -13,9 +13,9 @@ from fault_records import Ran
 from fault_run import CALM_S
 from fault_server import GARBAGE_EVERY, ServerFound, ServerRan
 from fault_stretches import LINK_FAULTS
+from soak import slope
 
-from edge.bench.report import head, line
-from edge.bench.soak import slope
+from edge.bench.live_report import head, line
 
 EXIT_SINK: Final = 5
 MEMORY_MB_PER_MINUTE: Final = 0.2

@@ -3,16 +3,10 @@
 import json
 import re
 from functools import partial
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 from fuzz_samples import FOLDER, as_file, refused
 
-from edge.bench.compare import compared
-from edge.bench.errors import BenchError
-from edge.bench.record import read_record
-from edge.budgeting.run_time_cache import CalibrationCache
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
@@ -21,25 +15,6 @@ from edge.inference.onnx_session import ModelSession
 from train.data.dataset import Sequences, load_sequences
 from train.errors import DatasetError
 from train.physics.simulated_sensor import FRAMES
-
-
-def calibration(data: bytes) -> None:
-    """Read the cache of run times; its keys are of this machine, so one entry stands for every key."""
-    cache = CalibrationCache(as_file("calibration.json", data), 100.0, unix_time_s=lambda: 2e9)
-    entry = next(iter(cache._entries.values()), None)
-    cache._entries[cache._key(MODEL_LIKE)] = entry
-    found = cache.find(MODEL_LIKE)
-    assert found is None or (0 < found[0].p50_us <= found[0].p99_us < 1e12 and 0 <= found[1] < 1e12)
-    assert all("\n" not in note for note in cache.notes)
-
-
-MODEL_LIKE = as_file("like.onnx", b"model")
-
-
-def calibration_seeds() -> list[bytes]:
-    entry = {"model": "m", "p50_us": 900.5, "p99_us": 1200, "unix_s": 1.7e9}
-    return [json.dumps({"ab" * 32: entry}).encode(), b"{}"]
-
 
 CONTRACT = {
     "version": 4,
@@ -191,30 +166,3 @@ def sequences_seeds() -> list[bytes]:
     )
     made.save(FOLDER / "taps.npz")
     return [(FOLDER / "taps.npz").read_bytes()]
-
-
-def bench(data: bytes) -> None:
-    """Read an earlier bench, and compare it with a new one."""
-    told = refused(lambda: read_record(as_file("bench.json", data)), BenchError)
-    if told is not None:
-        refused(lambda: compared(BENCH_RECORD, told, Path("bench.json")), BenchError)
-
-
-def bench_seeds() -> list[bytes]:
-    return [BENCH_RECORD.to_json().encode(), b'{"format": "tactile bench", "version": 1}']
-
-
-def _bench_record() -> SimpleNamespace:
-    from edge.bench.machine import this_machine
-    from edge.bench.record import Record, RunTimeRow
-    from edge.bench.timing import Pace, Times
-
-    times = Times(3000, 9.0, 10.0, 11.0, 12.0, tuple(9.0 + block % 3 for block in range(10)))
-    record = Record("2026-01-02", "edge-sr bench", this_machine(), {"rate_hz": 100.0, "ticks": 3000}, complete=True)
-    record.peak_gmac_s[1] = 50.0
-    row = RunTimeRow("m", 1, False, times, Pace(times, 3000, 2, 7.5), 10.0, 20.0, 300.0, 70.0)
-    record.run_times = [row]
-    return record
-
-
-BENCH_RECORD = _bench_record()

@@ -8,10 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from fuzz_models import (
-    bench,
-    bench_seeds,
-    calibration,
-    calibration_seeds,
     contract,
     contract_seeds,
     frozen,
@@ -90,8 +86,6 @@ TARGETS = {
         Target("npy in npz", npy_in_npz, npy_in_npz_seeds, 1024, 10),
         Target("baseline JSON", baseline, baseline_seeds, 8192, 80),
         Target("commands", commands, commands_seeds, 4096, 200),
-        Target("calibration JSON", calibration, calibration_seeds, 1024, 5),
-        Target("bench JSON", bench, bench_seeds, 8192, 10),
         Target("contract", contract, contract_seeds, 4096, 5),
         Target("ONNX walk", onnx_walk, onnx_seeds, 4096, 180),
         Target("ONNX model", model, model_seeds, 8192, 10),

@@ -17,12 +17,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from soak import Soak, Window, evaluated, slope
+
 from edge.bench.errors import BenchError
-from edge.bench.live_report import Page
+from edge.bench.live_report import Page, head, line
 from edge.bench.program import PROGRAM_SOURCES, Line, Play, Program, edge_sr, emulating
 from edge.bench.provenance import provenance
-from edge.bench.report import head, line
-from edge.bench.soak import Soak, Window, evaluated, slope
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.terminal.argument_types import whole
 from edge.terminal.progress_bar import tracked

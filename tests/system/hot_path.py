@@ -25,7 +25,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from edge.bench.ratios import Ratio, ratio_of
+from ratios import Ratio, ratio_of
 
 ROOT: Final = Path(__file__).parents[2]
 MOST_RATIO: Final = 1.1

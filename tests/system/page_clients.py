@@ -20,8 +20,8 @@ from typing import Final
 import numpy as np
 from page_cost import free_port
 
+from edge.bench.live_report import head, line
 from edge.bench.program import Play, Program, edge_sr
-from edge.bench.report import head, line
 from edge.terminal.argument_types import whole
 
 WARM_UP_S: Final = 20.0

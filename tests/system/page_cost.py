@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from ratios import ratio_of
 
 from edge.bench.program import Line, Play, Program, edge_sr
-from edge.bench.ratios import ratio_of
 from edge.terminal.argument_types import positive, whole
 from edge.terminal.progress_bar import Progress
 

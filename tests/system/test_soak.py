@@ -13,9 +13,9 @@ from dataclasses import replace
 import hand_soak
 import pytest
 from edge_samples import ROOT
+from soak import Window, evaluated
 
 from edge.bench.program import Line
-from edge.bench.soak import Window, evaluated
 
 MINUTES = float(os.environ.get("EDGE_SOAK_MINUTES", "1"))
 
@@ -27,7 +27,7 @@ STILL = [Window(5.0 * (n + 1), 78.0 + 0.1 * (n % 2), 1000.0 + 100 * (n % 3), 3, 
 @pytest.mark.soak
 @pytest.mark.timeout(60 * MINUTES + 240)
 def test_memory_stays_flat_and_latency_does_not_drift():
-    command = [sys.executable, "-m", "edge.bench.soak", str(MINUTES)]
+    command = [sys.executable, "tests/system/soak.py", str(MINUTES)]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
     )

@@ -100,7 +100,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     }, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "mtsr7-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
-        *("contacts.npz", "demo.npz", "grips.npz", "taxels.npz"),
+        *("contacts.npz", "demo.npz", "taxels.npz"),
     }
 
 
@@ -162,7 +162,7 @@ def test_licence_and_version_are_in_the_wheel(fresh):
     ("typed", "offered"),
     [
         ("edge-sr re", {"record", "replay"}),
-        ("edge-sr doctor --no", {"--no-press", "--no-grip"}),
+        ("edge-sr doctor --no", {"--no-press"}),
         ("edge-sr --model stsr-s", {"stsr-small", "stsr-small-int8"}),
         ("edge-sr replay pre", {"press.mcap"}),
     ],
@@ -218,7 +218,7 @@ def test_the_demo_runs_from_the_wheel(demo):
 def test_the_second_wheel_adds_models_and_bench(both, tmp_path):
     listed = run([str(both / "edge-sr"), "models"]).splitlines()
     assert any(line.startswith("stsr ") for line in listed)
-    assert "--by-surface" in run([str(both / "edge-sr"), "bench", "--help"])
+    assert "--sensors" in run([str(both / "edge-sr"), "bench", "--help"])
     done = subprocess.run(
         [str(both / "python"), "-m", "train.generate", "x.npz"],
         cwd=tmp_path,

@@ -26,14 +26,13 @@ import numpy as np
 
 from edge.bench.contenders import FROZEN_FILE
 from edge.bench.errors import BenchError
-from edge.bench.gate_savings import REST, stream
-from edge.bench.live_report import Page
+from edge.bench.live_report import Page, head, line
 from edge.bench.provenance import provenance
-from edge.bench.report import head, line
 from edge.errors import EdgeError
-from edge.evaluation.test_set import load_frozen_set
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
+from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
@@ -44,10 +43,14 @@ from edge.sinks.zenoh import ZenohSink
 from edge.terminal.argument_types import positive, whole
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import Link
-from firmware_bridge.scans.scan import Scan
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.scan import Scan, ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 
 PERIOD_NS: Final = 10_000_000
+HELD_SCANS: Final = 100
+REST: Final = np.full(USPA44.scan_shape, 20_000, dtype=np.int32)
+SEED: Final = 1
 APART_SCANS: Final = 97
 """Scans by which each sensor is ahead of the one before it in the same stream."""
 SETTLE_S: Final = 1.0
@@ -116,10 +119,22 @@ class PacedLink(Link):
         return {"scans": self._tick * len(self._sensors)}
 
 
+def taps(frozen: FrozenSet) -> list[Scan]:
+    """Return scans of every fourth tap of the test set, its end held for a second, with a second of rest after it."""
+    series, rng, scans = ScanSeries("4", USPA44), np.random.default_rng(SEED), []
+    for tap in range(0, len(frozen.touched), 4):
+        frames = frozen.newest[frozen.tap == tap]
+        held, rest = np.repeat(frames[-1:], HELD_SCANS, axis=0), np.zeros((HELD_SCANS, *REST.shape))
+        for zeroed in (*frames, *held, *rest):
+            counts = np.rint(zeroed + NOISE_COUNTS * rng.standard_normal(REST.shape)).astype(np.int32)
+            scans.append(series.close(REST + counts, len(scans) * PERIOD_NS))
+    return scans
+
+
 def write(pipe: Connection, setup: str, endpoint: str, sensors: list[str], ticks: int) -> None:
     """Write in a process of its own: report when it is ready, wait for a word, and report what was written."""
     model = ModelSession(find_model(DEFAULT_MODEL))
-    scans, _ = stream(load_frozen_set(FROZEN_FILE), 1)
+    scans = taps(load_frozen_set(FROZEN_FILE))
     rest, now_s = REST.astype(np.float32), time.time()
     baselines = {name: Baseline.of(name, rest, created_unix_s=now_s, scans=100, origin="file") for name in sensors}
     runtime = Runtime(model, source="emulated", baselines=baselines, options=RuntimeOptions(every_scan=True))

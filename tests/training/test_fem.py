@@ -83,8 +83,6 @@ def test_nothing_pulls_nothing_sinks_in_and_contact_grows():
     assert (gap_mm > -1e-3 * steps_mm[:, None, None]).all()
     assert np.abs(gap_mm[presses.touching]).max() < 1e-9
     assert (np.diff(presses.touching.sum(axis=(1, 2))) > 0).all()
-    assert presses.board_n == pytest.approx(presses.force_n, rel=1e-5)
-    assert (presses.below_board_mm == 0).all()
     # A node that the surface would cover if the pad did not give way is not touched for that alone.
     assert presses.touching[-1].sum() < (depth_mm < 0.3).sum()
 
@@ -119,30 +117,8 @@ def test_patterns_are_the_nodes_or_lie_straight_between_them():
 
 def test_a_leap_too_far_is_named():
     pad = FemPad(3, 2)
-    with pytest.raises(NoEquilibriumError, match=r"step 2 of 2, indentation 4\.4 mm.*other steps") as caught:
+    with pytest.raises(NoEquilibriumError, match=r"step 2 of 2, indentation 4\.4 mm.*other steps"):
         pad.press(disc(pad.nodes_mm, 3.0), np.array([0.1, 4.4]))
-    assert caught.value.reached_mm == 0.1
-    with pytest.raises(NoEquilibriumError) as caught:
-        pad.press(disc(pad.nodes_mm, 3.0), np.array([4.4]))
-    assert caught.value.reached_mm == 0.0
-
-
-def test_a_strong_press_squeezes_the_sides_past_the_board():
-    pad = FemPad(3, 3, Layer(poisson=0.495))
-    presses = pad.press(np.zeros((pad.size, pad.size)), np.array([0.3, 0.6, 0.9, 1.2, 1.4]))
-    assert presses.below_board_mm[:3].tolist() == [0.0] * 3
-    assert presses.below_board_mm[-1] > 0.1
-
-
-@pytest.mark.parametrize(("poisson", "least", "most"), [(0.0, 0.99, 1.01), (0.4999, 2.0, np.inf)])
-def test_displacement_alone_is_the_same_pad_but_for_locking(poisson, least, most):
-    # A layer between plates that only gets thinner strains its elements evenly: there is nothing to lock at nu = 0.
-    layer, steps_mm = Layer(poisson=poisson), np.array([0.1, 0.2])
-    mixed, alone = (FemPad(3, 2, layer, mixed=mixed) for mixed in (True, False))
-    face = np.zeros((mixed.size, mixed.size))
-    ratio = alone.press(face, steps_mm).force_n / mixed.press(face, steps_mm).force_n
-    assert (least < ratio).all()
-    assert (ratio < most).all()
 
 
 def test_wrong_input_is_refused():

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from experiment_samples import quick_bench
 
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
@@ -8,7 +7,6 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
-from train.experiments.sensor import gains_from_contacts as experiment
 from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z
 from train.learning.gain_estimate import learned, pad_of
 
@@ -114,14 +112,6 @@ def test_a_folder_without_recordings_is_one_line(tmp_path, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "expected a folder of TRIAL/xela_SENSOR.csv" in said
-
-
-def test_the_report_is_of_simulated_sensors_where_there_are_no_recordings(tmp_path, tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path))
-    page = experiment.run(quick_bench(tmp_path_factory), tmp_path / "reports").read_text()
-    assert "Gains from mixed contacts, each once, 3 sensors." in page
-    assert "Gains from three flat grips with tilt, 3 sensors." in page
-    assert "No recordings were there" in page
 
 
 @pytest.mark.skipif(not recording_paths(FOLDER), reason=f"no real recordings at {FOLDER} (TACTILE_RECORDINGS)")

@@ -30,18 +30,6 @@ def test_stress_is_the_slope_of_the_energy_and_stiffness_that_of_the_stress(rubb
     assert np.allclose(rubber.stiffness(gradient), slope(rubber.stress, gradient), atol=1e-8)
 
 
-def test_the_volumetric_stress_and_stiffness_are_slopes_too():
-    gradient = gradients()
-    assert np.allclose(RUBBER.volumetric_stress(gradient), slope(RUBBER.volumetric_energy, gradient), atol=1e-7)
-    assert np.allclose(RUBBER.volumetric_stiffness(gradient), slope(RUBBER.volumetric_stress, gradient), atol=1e-7)
-
-
-def test_the_volumetric_part_is_paid_for_swelling_alone():
-    assert RUBBER.volumetric_energy(1.1 * np.eye(3)) == pytest.approx(6.0 / 2 * (1.1**3 - 1) ** 2)
-    assert RUBBER.volumetric_stress(1.1 * np.eye(3)) == pytest.approx(6.0 * (1.1**3 - 1) * 1.1**2 * np.eye(3))
-    assert RUBBER.volumetric_energy(np.diag([1.25, 0.8, 1.0])) == pytest.approx(0, abs=1e-12)
-
-
 def test_turning_and_swelling_cost_nothing():
     gradient = gradients()
     turn = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]

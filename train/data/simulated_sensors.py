@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import AXES, USPA44
-from train.data.grip_ramps import even_gains
 from train.data.presses import PressSet
 from train.data.world import World
 from train.physics.gripped import GrippedPad
@@ -40,3 +39,10 @@ def contacts_of(presses: PressSet, world: World, number: int) -> NDArray[np.floa
     mine = presses.pick(presses.pad == np.unique(presses.pad)[number])
     clean = mine.counts[:, 0] * sensor_of(world, number)[1].astype(np.float32)
     return read_windows(clean[None, :, None], 1.0, Nuisances().without("gain_spread"), [world.seed, number])[0]
+
+
+def even_gains(gripped: GrippedPad, perfect: GrippedPad) -> NDArray[np.float64]:
+    """Return what the seats and moments of a pad's magnets do to z under an even load, (rows, cols)."""
+    even = np.full((1, 1, gripped.size, gripped.size), 0.02, dtype=np.float32)
+    z = AXES.index("z")
+    return gripped.skin.frames(even)[0, 0, z].astype(np.float64) / perfect.skin.frames(even)[0, 0, z]

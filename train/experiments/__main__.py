@@ -21,45 +21,27 @@ EXPERIMENTS: Final = {
     "pads": "the shipped model on pads that are off the nominal one",
     "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
     "posed-taps": "taps from known poses: one to seven, by schedule, and with wrong poses",
-    "tap-limits": "what limits the gain of several taps",
     "paper-schedule": "several taps over one in the paper's own comparison, on ten times its sequences",
-    "map": "a figure larger than the pad, from slides over it",
-    "wrench": "the shipped model's force, twist and centre of pressure",
     "table3": "all methods at x10 on the same targets",
-    "trained_out": "the paper's and compact networks, trained for many epochs",
     "table4": "STSR at five scales",
     "angle": "MTSR-2 by angle between its taps",
     "taps": "one to seven taps",
-    "bound": "the least error that taps allow",
     "force": "error by contact force",
     "force-recovery": "force through press, hold and release",
     "unseen": "surfaces that were not trained on",
     "real": "real grips: shape of faces, patterns against readings",
-    "robust": "error against the severity of nuisances",
     "dead": "dead taxels, detected and undetected",
-    "gains-from-contacts": "gains and constants of a sensor from its own contacts",
-    "learned-patterns": "patterns with what was learned of a sensor, and with the truth",
-    "zeroing": "drift followed, holds not absorbed",
-    "calibration": "coverage of the deviations",
     "interval-coverage": "intervals by region and family, and the error of what is trusted most",
-    "confidence": "expected error and early stop against true error",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
-    "free_sides": "the pad's free sides by FEM against the infinite layer",
-    "curved": "several PSFs by height against FEM",
-    "psf_speed": "patterns a second of the PSF by FFT and direct",
 }
-_PAPER: Final = {
-    *("table3", "table4", "fig5", "fig7", "angle", "taps", "bound", "trained_out"),
-    *("force", "force-recovery", "unseen", "curved", "psf_speed"),
-}
+_PAPER: Final = {"table3", "table4", "fig5", "fig7", "angle", "taps", "force", "force-recovery", "unseen"}
 """Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
 
 
 def module_of(name: str) -> str:
     """Return the module of an experiment."""
-    module = {"map": "object_map"}.get(name, name.replace("-", "_"))  # map is a function
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{module}"
+    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -80,18 +62,13 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="use tiny settings, as a test of the command")
     parser.add_argument(
-        "--found",
-        action="store_true",
-        help="trained_out: evaluate the networks in --checkpoints, trained on any machine, and leave out missing ones",
-    )
-    parser.add_argument(
         "--models", type=Path, default=BUNDLE_DIR, help="folder of the shipped models (default: the bundled ones)"
     )
     parser.add_argument(
         "--before", type=Path, metavar="FILE", help="pads: model of an earlier release, to compare with the shipped one"
     )
     options = parser.parse_args(arguments)
-    bench = Workbench(options.data, options.checkpoints, options.quick, options.found, options.models, options.before)
+    bench = Workbench(options.data, options.checkpoints, options.quick, options.models, options.before)
     try:
         names = list(EXPERIMENTS) if "all" in options.names else options.names
         for name in tracked(names, "experiments", "page"):

@@ -2,7 +2,7 @@
 
 Compared with the paper's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force
 from the newest one, and leaves out the layers at full resolution and batch normalisation, which cost 8 dB after 1000
-steps here (docs/log.md). It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an
+steps here. It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an
 input; and it is exactly symmetric under quarter turns.
 """
 
@@ -325,7 +325,7 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta
     / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b^beta. Its minimum is where b is the
     mean error, whatever beta is. With 0, the likelihood alone, its slope over log b is unbounded, and pixels that are
     accurate already have the largest weight; with 1 the slope is b - e, of the error's own size, and pixels in the
-    contact are covered as well as those around it (docs/log.md). The error is a constant in this term, so a larger
+    contact are covered as well as those around it. The error is a constant in this term, so a larger
     uncertainty never allows a worse pattern.
 
     Source: Seitzer et al. 2022, Eq. 5, for a Laplace density.

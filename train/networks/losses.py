@@ -21,7 +21,7 @@ def relative_rms_error(patterns: Tensor, truth: Tensor) -> Tensor:
     """Return the mean over (n, H, W) of each pattern's RMS error as a share of its truth's RMS.
 
     Its minimum is near the mean of the possible patterns, that of the mean absolute error at their median; it gains .1
-    dB (docs/log.md).
+    dB (docs/decisions.md).
     """
     share = (patterns - truth) / truth_size(truth)
     return (share.square().mean(dim=(1, 2)) + _LEAST_SHARE_SQUARED).sqrt().mean()

@@ -6,7 +6,7 @@ the bounding box of the cells that a press can reach is computed: the kernel is 
 result is that of the whole pad. Poses with boxes of one shape are solved in a batch.
 
 The load of a cell at a surface's edge is proportional to its covered share: readings then change continuously while the
-surface moves, where whole cells alone make them jump by 1 to 2 % (docs/log.md).
+surface moves, where whole cells alone make them jump by 1 to 2 % (docs/decisions.md).
 """
 
 from collections.abc import Callable

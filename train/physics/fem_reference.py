@@ -43,15 +43,7 @@ _REMEDY: Final = "press in other steps: smaller ones or, near a Poisson's ratio 
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
-    """Failure of the elements to converge; the message names step and indentation.
-
-    Attributes:
-        reached_mm: indentation of the last equilibrium before, in [mm]; 0 if there was none.
-    """
-
-    def __init__(self, message: str, reached_mm: float = 0.0) -> None:  # a default, because unpickling passes no value
-        super().__init__(message)
-        self.reached_mm = reached_mm
+    """Failure of the elements to converge; the message names step and indentation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +53,6 @@ class FemPresses:
     Attributes:
         indentation_mm: (s,), in [mm].
         push_n: (s, size, size), force down on each node, in [N]; 0 without contact.
-        board_n: (s,), force of the board on the pad, in [N]: the sum of all pushes, up to the residual.
-        below_board_mm: (s,), depth of the bulging sides below the board, in [mm]. Nothing supports them: where it
-            is more than 0 the pad is softer than it should be.
         displacement_mm: (s, size, size), of the surface's nodes, downwards, in [mm]; row = y, column = x.
         touching: (s, size, size), the nodes that touch.
         newton_steps: (s,), linear systems solved, over all active sets.
@@ -73,8 +62,6 @@ class FemPresses:
 
     indentation_mm: NDArray[np.float64]
     push_n: NDArray[np.float64]
-    board_n: NDArray[np.float64]
-    below_board_mm: NDArray[np.float64]
     displacement_mm: NDArray[np.float64]
     touching: NDArray[np.bool_]
     newton_steps: NDArray[np.int64]
@@ -96,7 +83,6 @@ class FemPad:
         layer: thickness, and the material at small strain.
         c2_share: C2 / (C1 + C2).
         geometry: of a square sensor.
-        mixed: use the mixed formulation. Without it the elements lock near incompressibility, which a test shows.
 
     Attributes:
         nodes_mm: (size,), places of the nodes along a side, from the centre, in [mm].
@@ -110,13 +96,11 @@ class FemPad:
         layer: Layer = Layer(),  # noqa: B008 - frozen
         c2_share: float = C2_SHARE,
         geometry: SensorGeometry = USPA44,
-        mixed: bool = True,
     ) -> None:
         self.cell_mm = geometry.pixel_pitch_mm(scale)
         self.nodes_mm = _nodes_mm(geometry, scale)
         self._geometry = geometry
         self._rubber = MooneyRivlin.of_layer(layer, c2_share)
-        self._mixed = mixed
         heights_mm = np.linspace(0, layer.thickness_mm, cells_high + 1)
         self._mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, heights_mm)
         self._region = felupe.RegionHexahedron(self._mesh)
@@ -140,7 +124,7 @@ class FemPad:
         """
         steps_mm = np.asarray(indentation_mm, dtype=np.float64)
         self._check(depth_mm, steps_mm)
-        press = _Press(self._region, self._rubber, self.size, self._mixed)
+        press = _Press(self._region, self._rubber, self.size)
         found = [
             press.advance(step_mm, step_mm - depth_mm, f"step {i + 1} of {len(steps_mm)}, indentation {step_mm:.3g} mm")
             for i, step_mm in enumerate(steps_mm)
@@ -167,14 +151,13 @@ class FemPad:
 class _Press:
     """State of a press: the current equilibrium and its touching nodes."""
 
-    def __init__(self, region: Any, rubber: MooneyRivlin, size: int, mixed: bool) -> None:
+    def __init__(self, region: Any, rubber: MooneyRivlin, size: int) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
-        self._body = _body(self._field, rubber, mixed)
+        self._body = _body(self._field, rubber)
         self._solver = _TangentSolver()
         self._touching = np.zeros((size, size), dtype=bool)
         self._indentation_mm = 0.0
         points = region.mesh.npoints
-        self._points_mm = region.mesh.points
         self._top = np.arange(points - size**2, points)
         self._board = np.arange(size**2)
 
@@ -201,21 +184,14 @@ class _Press:
                 break
             self._touch(self._touching & ~pulled | sunk)
         else:
-            raise NoEquilibriumError(
-                f"{name}: what touches still changes after {_MAX_SETS} rounds; {_REMEDY}",
-                self._indentation_mm,
-            )
+            raise NoEquilibriumError(f"{name}: what touches still changes after {_MAX_SETS} rounds; {_REMEDY}")
         self._indentation_mm = indentation_mm
         residual = float(result.fnorms[-1])
-        board_n = float(upwards_n[self._board].sum())
         run_s = perf_counter() - start
-        return push_n, board_n, self._below_board_mm(), down_mm, self._touching.copy(), newton_steps, residual, run_s
+        return push_n, down_mm, self._touching.copy(), newton_steps, residual, run_s
 
     def _down_mm(self) -> NDArray[np.float64]:
         return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
-
-    def _below_board_mm(self) -> float:
-        return -float((self._points_mm + self._field[0].values)[:, 2].min()) + 0.0  # no -0
 
     def _touch(self, touching: NDArray[np.bool_]) -> None:
         if (touching != self._touching).any():
@@ -242,40 +218,16 @@ class _Press:
                     verbose=False,
                 )
         except felupe.NewtonConvergenceError as error:
-            raise NoEquilibriumError(
-                f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; {_REMEDY}",
-                self._indentation_mm,
-            ) from error
+            raise NoEquilibriumError(f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; {_REMEDY}") from error
 
 
-def rest_tangent(
-    x_mm: NDArray[np.floating], y_mm: NDArray[np.floating], z_mm: NDArray[np.floating], layer: Layer
-) -> csr_matrix:
-    """Return the stiffness of a block at small strain without boundary conditions, in [N/mm].
-
-    Args:
-        x_mm: nodes along x, rising; with those of y and z they make a grid, x changing fastest, (x, y, z) in each node.
-        y_mm: nodes along y.
-        z_mm: nodes along z.
-        layer: the material.
-    """
-    field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(felupe.Grid(x_mm, y_mm, z_mm)), dim=3)])
-    return _body(field, MooneyRivlin.of_layer(layer), mixed=True).assemble.matrix()
-
-
-def _body(field: Any, rubber: MooneyRivlin, mixed: bool) -> Any:
-    """Return the pad's elements; the mixed ones include the volumetric part, the others take it from the rubber."""
-    if mixed:
-        material = felupe.Material(
-            stress=lambda x: [rubber.stress(x[0]), x[-1]],
-            elasticity=lambda x: [rubber.stiffness(x[0])],
-        )
-        return felupe.SolidBodyNearlyIncompressible(material, field, bulk=rubber.bulk_mpa)
+def _body(field: Any, rubber: MooneyRivlin) -> Any:
+    """Return the pad's mixed elements, which add the volumetric part."""
     material = felupe.Material(
-        stress=lambda x: [rubber.stress(x[0]) + rubber.volumetric_stress(x[0]), x[-1]],
-        elasticity=lambda x: [rubber.stiffness(x[0]) + rubber.volumetric_stiffness(x[0])],
+        stress=lambda x: [rubber.stress(x[0]), x[-1]],
+        elasticity=lambda x: [rubber.stiffness(x[0])],
     )
-    return felupe.SolidBody(material, field)
+    return felupe.SolidBodyNearlyIncompressible(material, field, bulk=rubber.bulk_mpa)
 
 
 class _TangentSolver:

@@ -148,29 +148,6 @@ class GrippedPad:
             )
         return self._result(covers, depth_mm, cells_mm, pressure, depth, slide_mm, twist_rad, friction)
 
-    def uneven_cells_mm(self) -> NDArray[np.float32]:
-        """Return the depth of the pad's own face below its mean, cell by cell, (size, size) in [mm]."""
-        return self._uneven_mm.reshape(self.size, SAMPLES, self.size, SAMPLES).mean(axis=(1, 3))
-
-    def read_faces(
-        self,
-        depth_mm: NDArray[np.floating],
-        indentation_mm: NDArray[np.floating],
-        slide_mm: NDArray[np.floating],
-        friction: NDArray[np.floating],
-    ) -> NDArray[np.float32]:
-        """Return clean counts (n, 3, rows, cols) of faces without detail, without the truth that `press` makes.
-
-        Args:
-            depth_mm: (n, size, size) below the point of first contact, cell by cell, in [mm].
-            indentation_mm: (n,), of that point, in [mm].
-            slide_mm: (n, 2), movement of the face to the right and down the rows, in [mm].
-            friction: (n,), Coulomb's coefficient.
-        """
-        pressure = self._solver(BARE).solve(depth_mm, indentation_mm).pressure_mpa
-        sideways = self._friction.solve(pressure, slide_mm, np.zeros(len(slide_mm)), friction).traction_mpa
-        return self.skin.frames(pressure[:, None], sideways[:, None])[:, 0]
-
     def _pressed(
         self,
         cover: Cover,

@@ -128,7 +128,7 @@ FIELDS: Final[dict[str, Callable[[Magnet, Vectors, Vectors], Vectors]]] = {
 _DIPOLE_CLEARANCE: Final = 0.75
 """Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %.
 
-At the default magnet's rest it is off by 7 %, pressed by .5 mm by 12 % (reports/stability.md).
+At the default magnet's rest it is off by 7 %, pressed by .5 mm by 12 % (docs/decisions.md).
 """
 
 

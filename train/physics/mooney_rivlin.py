@@ -78,22 +78,6 @@ class MooneyRivlin:
         second = _curvature(inverse, volume, 4 / 3, i2, slope2, curve2)
         return self.c1_mpa * first + self.c2_mpa * second
 
-    def volumetric_energy(self, gradient: Tensors) -> Tensors:
-        """Return U = K (J - 1)^2 / 2 per undeformed volume, (...) in [MPa], of deformation gradients F (3, 3, ...)."""
-        return self.bulk_mpa / 2 * (_volume(gradient) - 1) ** 2
-
-    def volumetric_stress(self, gradient: Tensors) -> Tensors:
-        """Return the first Piola-Kirchhoff stress dU / dF, (3, 3, ...) in [MPa]."""
-        volume = _volume(gradient)
-        return self.bulk_mpa * (volume - 1) * volume * _inverse_transposed(gradient)
-
-    def volumetric_stiffness(self, gradient: Tensors) -> Tensors:
-        """Return the stiffness d^2 U / dF dF, (3, 3, 3, 3, ...) in [MPa]."""
-        volume = _volume(gradient)
-        inverse = _inverse_transposed(gradient)
-        pair = _outer(inverse, inverse)
-        return self.bulk_mpa * volume * ((2 * volume - 1) * pair - (volume - 1) * np.swapaxes(pair, 1, 3))
-
 
 def _volume(gradient: Tensors) -> Tensors:
     """Return J."""

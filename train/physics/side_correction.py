@@ -6,7 +6,7 @@ curve. The added displacement falls with distance d alike, so that the addition 
     u(d, y) += amplitude / (G h) sum_sides sum_k a_k exp(-(d + d') / (h b_k)) exp(-(y - y')^2 / (2 (h c_k)^2)) F(d', y')
 
 The magnets' movement gains a term of the same kind, with its own lengths. All constants are fitted to finite elements
-of a frictionless 20 mm pad at four Poisson ratios (reports/free_sides.md), with the same values for all four.
+of a frictionless 20 mm pad at four Poisson ratios (docs/decisions.md), with the same values for all four.
 Amplitude 0 is the infinite layer. Lengths in [mm], forces in [N].
 """
 

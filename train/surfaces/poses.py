@@ -26,7 +26,7 @@ HELD_OUT_RADIUS_MM: Final = 1.0
 """Distance that random poses keep from the two held-out positions, in [mm].
 
 Only C, F, L, P, T and U are new there in every sense: the other surfaces are symmetric, and look as they do at another
-position to a pad turned by 90, 120 or 180 degrees. It has no visible effect, see docs/log.md.
+position to a pad turned by 90, 120 or 180 degrees. It has no visible effect, see docs/decisions.md.
 """
 REACH_MM: Final = 3.5
 """Largest distance of random poses from the surface's centre along x and along y, in [mm]."""

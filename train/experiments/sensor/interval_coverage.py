@@ -27,7 +27,7 @@ from train.data.generation_config import SEED, random_figures
 from train.data.presses import join_presses
 from train.errors import TrainError
 from train.experiments.sensor.pads import SHAPES, OffPad, draw_shapes, pressed
-from train.experiments.support.band_limit import gratings
+from train.experiments.support.gratings import gratings
 from train.experiments.support.nominal import TEST_FIGURES, TEST_SEED, at_full_press
 from train.experiments.support.shipped import ALL, NOTHING, known_pads
 from train.experiments.support.workbench import Workbench

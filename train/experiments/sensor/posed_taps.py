@@ -1,6 +1,6 @@
-"""Taps from known poses: one to seven, by schedule, next to linear methods for the same taps, and with wrong poses.
+"""Taps from known poses: one to seven, by schedule, next to a linear map of the same taps, and with wrong poses.
 
-No choice depended on these presses: network, peer and limits were settled on other pads and figures.
+No choice depended on these presses: network and limits were settled on other pads and figures.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from train.data.make_presses import make_presses
 from train.data.posed_batches import stated_poses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.experiments.support import kalman_fusion, linear_taps
+from train.experiments.support import linear_taps
 from train.experiments.support.linear_taps import LinearTaps, fit_linear_taps
 from train.experiments.support.shipped import ALL, NOTHING, infer, known_pads
 from train.experiments.support.workbench import Workbench
@@ -32,8 +32,8 @@ from train.surfaces.poses import MAX_TAPS
 
 MODEL: Final = "mtsr7-int8"
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
-PEER_ON: Final = World(count=40_000, taps=4, seed=3)
-"""Settings of data/taps4.npz in the Makefile, of which the peer is fitted."""
+LINEAR_ON: Final = World(count=40_000, taps=4, seed=3)
+"""Settings of data/taps4.npz in the Makefile, on which the linear map is fitted."""
 _COUNT: Final = 420
 _SEED: Final = 2_000_003
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
@@ -45,10 +45,9 @@ _WINDOW: Final = 4
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Evaluate the model that takes poses, and its peer, and write the report `posed-taps`."""
+    """Evaluate the model that takes poses and write the report `posed-taps`."""
     model = ModelSession(bench.use(bench.models / f"{MODEL}.onnx"))
-    fitted_on = bench.presses("taps4", PEER_ON, quick_taps=4)
-    peer = kalman_fusion.fit(fitted_on)
+    fitted_on = bench.presses("taps4", LINEAR_ON, quick_taps=4)
     linear = {name: fit_linear_taps(fitted_on, name) for name in linear_taps.SCHEDULES}
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
@@ -58,28 +57,27 @@ def run(bench: Workbench, folder: Path) -> Path:
         + "; ".join(f"{name} {len(one)} (sha256 {one.presses.sha256()[:12]})" for name, one in sets.items())
         + f". All nuisances, gains N(1, .075); stated and true errors of the poses {PLACE_ERROR_MM} mm and "
         f"{TURN_ERROR_DEG:g} degree. PSNR in dB, full scale {MAX_INDENTATION_MM} mm; gains are over the same model "
-        "with the newest tap alone, paired, 95 % intervals by figure. The peer fuses the same taps with the same poses "
-        "by a Kalman filter with linear operators and no learned shape. The linear map knows the places of a schedule "
+        "with the newest tap alone, paired, 95 % intervals by figure. The linear map knows the places of a schedule "
         "alone. Run time of the model: median of a scan, one thread."
     )
     rows = [
         row
         for name, one in tracked(sets.items(), "taps", "set")
-        for row in _rows(model, peer, name, one, NOTHING, linear=linear.get(name))
+        for row in _rows(model, name, one, NOTHING, linear=linear.get(name))
     ]
     report.table(rows, "By schedule and number of taps, nothing known of pad and gains.", "schedules")
-    known = [row for name in SCHEDULES[:3] for row in _rows(model, None, name, sets[name], ALL, (1, 4, 7))]
+    known = [row for name in SCHEDULES[:3] for row in _rows(model, name, sets[name], ALL, (1, 4, 7))]
     report.table(known, "The same with the pad's constants and the gains known.", "known")
     wide = freeze_presses(presses_of(bench, "mixed", figures=False), SEED)
     report.table(
-        _rows(model, peer, "mixed", wide, NOTHING, (1, 2, 4, 7)),
+        _rows(model, "mixed", wide, NOTHING, (1, 2, 4, 7)),
         f"Every family, as many presses of each ({len(wide)}, sha256 {wide.presses.sha256()[:12]}), in schedules of "
         "all kinds.",
         "families",
     )
     begun = {name: presses_of(bench, name, figures=True, begun=1.0) for name in SCHEDULES}
     light = {name: freeze_presses(presses, SEED) for name, presses in begun.items()}
-    rows = [row for name, one in light.items() for row in _rows(model, peer, name, one, NOTHING, (1, 4, 7))]
+    rows = [row for name, one in light.items() for row in _rows(model, name, one, NOTHING, (1, 4, 7))]
     report.table(rows, "The newest press has only begun, at a fifth of the earlier ones' depth and more.", "begun")
     report.table(
         _wrong(model, sets["near"]),
@@ -112,7 +110,6 @@ def presses_of(bench: Workbench, schedule: str, *, figures: bool, begun: float =
 
 def _rows(
     model: ModelSession,
-    peer: kalman_fusion.KalmanFusion | None,
     schedule: str,
     frozen: FrozenPresses,
     known: str,
@@ -127,11 +124,6 @@ def _rows(
         found, run_time_us = _psnr(model, frozen, poses[:, :taps], known)
         row: Row = {"schedule": schedule, "taps": taps, "model dB": with_interval(found, each)}
         row["over one tap"] = None if taps == 1 else with_interval(found - alone, each)
-        if peer is not None:
-            pattern = peer(frozen.windows(taps), poses[:, :taps])
-            theirs = psnr_db(pattern, frozen.patterns(), MAX_INDENTATION_MM)
-            row["peer dB"] = round(float(theirs.mean()), 2)
-            row["over the peer"] = with_interval(found - theirs, each)
         if linear is not None and taps in linear.matrices:
             mapped = linear(frozen.windows(taps), poses[:, :taps])
             row["linear map dB"] = round(float(psnr_db(mapped, frozen.patterns(), MAX_INDENTATION_MM).mean()), 2)

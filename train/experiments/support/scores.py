@@ -1,15 +1,10 @@
 """Errors of patterns and forces in the forms that the reports of shipped models use."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from train.experiments.support.workbench import Figures
 from train.report import Row, with_interval
-
-_MOST_SHARE: Final = 100.0
-_HALVINGS: Final = 50
 
 
 def pooled_db(psnr_db: NDArray[np.floating]) -> float:
@@ -33,18 +28,3 @@ def pattern_cells(figures: Figures, truth: NDArray[np.floating], full_scale: flo
         "edge mm": round(float(figures["boundary_mm"].mean()), 3),
         "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
     }
-
-
-def share_beside(error: NDArray[np.floating], reading: NDArray[np.floating], offset: float) -> float:
-    """Return the p for which 'p % of reading + offset' is the root mean square of errors (n,).
-
-    At this p the errors over (p / 100 |reading| + offset) have a root mean square of 1; it is 0 where the offset alone
-    suffices.
-    """
-    squares, size = np.square(error), np.abs(reading)
-    low, high = 0.0, _MOST_SHARE
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        over = np.mean(squares / np.square(middle * size + offset)) > 1
-        low, high = (middle, high) if over else (low, middle)
-    return 100 * low

@@ -17,8 +17,6 @@ SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
 """Sequences of the 18 surfaces."""
 FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
 """Sequences of random figures, each figure once."""
-SEQUENCES: Final = SEEN.count + FIGURES.count
-"""Sequences of both together: one pass over the mixed data."""
 
 _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
 """Training time of the paper's networks, in [min]: the STSR as long as the compact one; srgan on top of srcnn."""
@@ -105,62 +103,6 @@ SEED_STSR_LONGER: Final = replace(
 )
 """STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
 
-OUT_EPOCHS: Final = 40
-"""Passes over the mixed data for an STSR trained to convergence from random weights."""
-OUT_EPOCHS_MORE: Final = 20
-"""Passes over the mixed data for each network that is trained on from it."""
-_OUT_BATCH: Final = 64
-_OUT_RATES: Final = {"paper": (1e-3, 5e-4), "compact": (2e-3, 5e-4)}
-"""Highest learning rate from random weights, and when trained on. For the paper's, 5e-4, 1e-3 and 2e-3 were tried."""
-
-
-def from_nothing(network: str, epochs: int) -> Training:
-    """Return the training of either kind of network from random weights, limited by epochs."""
-    return Training(f"out-{network}-{epochs}", network, _out_recipe(network, epochs, goes_on=False))
-
-
-def gone_on(network: str, start: Training, epochs: int) -> Training:
-    """Return the training of a network of the start's kind, trained on from it."""
-    name = f"out-{network}-{start.name.rpartition('-')[2]}+{epochs}"
-    return Training(name, network, _out_recipe(network, epochs, goes_on=True), start=start.name)
-
-
-def epochs(training: Training) -> float:
-    """Return the passes over the mixed data, including those of the training it starts from."""
-    own = training.recipe.steps * training.recipe.batch / SEQUENCES
-    return own + (epochs(_STARTS[training.start]) if training.start else 0.0)
-
-
-def _out_recipe(network: str, epochs: int, *, goes_on: bool) -> Recipe:
-    kind, _, name = network.rpartition("-")
-    return Recipe(
-        steps=epochs * SEQUENCES // _OUT_BATCH,
-        batch=_OUT_BATCH,
-        learning_rate=_OUT_RATES[kind or "paper"][goes_on],
-        weight_decay=0.0 if kind else _SEED_DECAY,
-        given=given_taps(int(name.removeprefix("mtsr")) if name.startswith("mtsr") else 1),
-        bf16=True,
-    )
-
-
-_OUT_STARTS: Final = tuple(from_nothing(network, OUT_EPOCHS) for network in ("stsr", "compact-stsr"))
-OUT: Final = (
-    *(
-        training
-        for start in _OUT_STARTS
-        for training in (
-            from_nothing(start.network, OUT_EPOCHS // 4),
-            start,
-            *(
-                gone_on(start.network.replace("stsr", name), start, OUT_EPOCHS_MORE)
-                for name in ("stsr", "mtsr2", "mtsr4")
-            ),
-        )
-    ),
-    from_nothing("compact-stsr", 4 * OUT_EPOCHS),
-)
-"""Trainings of the paper's networks and compact ones, all alike; the compact STSR until it gains little more."""
-
 
 def trained(
     bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
@@ -171,4 +113,4 @@ def trained(
     return bench.network(training, data, validation)
 
 
-_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"), *_OUT_STARTS)}
+_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}

@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +22,6 @@ from train.data.generation_config import SEED, Generation
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.errors import CheckpointError
 from train.freeze import freeze
 from train.generate import generate
 from train.learning.checkpoint import Training, fit_network, load_network
@@ -52,7 +51,6 @@ class Workbench:
         data_folder: datasets, by name.
         checkpoints: trained networks, by name.
         quick: everything tiny, to check that it runs.
-        found: True to evaluate networks brought from another machine as they are, and to leave out absent ones.
         models: folder of the shipped models.
         before: file of a model of an earlier release, to be compared with.
         used: files of models and frozen sets that the experiments of this run have used.
@@ -61,7 +59,6 @@ class Workbench:
     data_folder: Path = Path("data")
     checkpoints: Path = Path("checkpoints")
     quick: bool = False
-    found: bool = False
     models: Path = BUNDLE_DIR
     before: Path | None = None
     used: set[Path] = field(default_factory=set)
@@ -102,21 +99,6 @@ class Workbench:
         net, report = load_network(self.use(path))
         if path.stat().st_mtime_ns != before:
             sys.stdout.write(f"{training.name}: {report['steps']} steps in {report['elapsed_s']:.0f} s\n")
-        return net, report
-
-    def brought(self, training: Training) -> tuple[PatternNet, dict[str, Any]] | None:
-        """Return a network trained by the same recipe on any machine, or None if it does not exist.
-
-        The hash of its data is not compared: data differ in the last bits between machines.
-        """
-        if self.quick:
-            training = _quick(training)
-        path = self.checkpoints / f"{training.name}.pt"
-        if not path.exists():
-            return None
-        net, report = load_network(self.use(path))
-        if report["config"] != json.loads(json.dumps(asdict(training))):
-            raise CheckpointError(f"{path} was trained by another recipe than '{training.name}' has now: delete it")
         return net, report
 
     def training_cells(self, report: Mapping[str, Any]) -> Row:

@@ -1,6 +1,6 @@
 """The whole program for minutes, taking turns between rest and contact, for growth of memory and drift of latency.
 
-    python -m edge.bench.soak MINUTES [SENSORS]
+    python tests/system/soak.py MINUTES [SENSORS]
 
 writes the result as JSON.
 """
@@ -117,7 +117,7 @@ def slope(times: Sequence[float], values: Sequence[float]) -> tuple[float, float
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns 0 when done, 1 on a clear error."""
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.soak", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python tests/system/soak.py", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("minutes", type=float, metavar="MINUTES", help="length of the run, .25 at least")
     parser.add_argument("sensors", type=whole(1), nargs="?", default=1, metavar="SENSORS", help="default: 1")
     options = parser.parse_args(arguments)

@@ -1,1 +1,0 @@
-"""Choice of the model that fits into a budget of run time."""

@@ -1,0 +1,82 @@
+"""`edge-sr models`: the bundled models with their error, and with --measure their run time on this machine."""
+
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TextIO
+
+import numpy as np
+
+from edge.api import ModelError, bundled_models, load_model
+from edge.terminal.progress_bar import Progress
+from firmware_bridge.schedule import Ticker
+
+if TYPE_CHECKING:
+    from edge.api import Model
+
+RATE_HZ: Final = 100.0
+ROUNDS: Final = 3
+"""Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
+ROUND_TICKS: Final = 50
+WINDOWS: Final = 16
+SEED: Final = 1
+UNEVEN: Final = 3.0
+"""Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine."""
+
+
+def run(*, measure: bool, stdout: TextIO) -> int:
+    """Print the bundled models, and return the exit code.
+
+    Raises:
+        ModelError: none is bundled, or one cannot be used.
+    """
+    paths = bundled_models()
+    if not paths:
+        raise ModelError("no models are bundled with this installation")
+    models = [load_model(path) for path in paths]
+    took_us = run_times_us(models) if measure else []
+    widest = max(len(path.stem) for path in paths)
+    head = f"{'model':{widest}s} taps scale    size arithmetic "
+    stdout.write(head + (" p50 us p99 us" if measure else "") + " error on the frozen test set, with all taps\n")
+    for index, (path, model) in enumerate(zip(paths, models, strict=True)):
+        contract = model.contract
+        error = contract.test_error.get(str(contract.taps), {})
+        figures = ", ".join(f"{name} {value:.3g}" for name, value in error.items())
+        size_mb = path.stat().st_size / 1e6
+        cells = f"{path.stem:{widest}s} {contract.taps:4d} {f'x{contract.scale}':>5s} {size_mb:4.1f} MB "
+        times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
+        stdout.write(f"{cells}{contract.arithmetic:10s} {times} {figures or 'not known'}\n")
+    if measure:
+        stdout.writelines(_notes(paths, took_us))
+    return 0
+
+
+def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
+    """Return median and 99th percentile of each model's run time in [us], each run at its tick as on a robot.
+
+    Windows are random, with all taps: run time does not depend on their values.
+    """
+    rng = np.random.default_rng(SEED)
+    took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
+    with Progress("run times", took_us.size, "run") as bar:
+        for round_ in range(ROUNDS):
+            for index, model in enumerate(models):
+                contract = model.contract
+                shape = (WINDOWS, contract.taps, 3, contract.rows, contract.cols)
+                windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
+                ticker = Ticker(RATE_HZ)
+                for tick in range(ROUND_TICKS):
+                    ticker.wait()
+                    start_ns = time.perf_counter_ns()
+                    model.run(contract.scale_window(windows[tick % WINDOWS]))
+                    took_us[index, round_, tick] = (time.perf_counter_ns() - start_ns) / 1e3
+                bar.advance(ROUND_TICKS)  # not while it measures
+    both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
+    return [(float(p50), float(p99)) for p50, p99 in both.T]
+
+
+def _notes(paths: list[Path], took_us: list[tuple[float, float]]) -> Iterator[str]:
+    yield f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n"
+    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
+    if uneven:
+        yield f"those of {', '.join(uneven)} are uneven, as on a busy machine: measure again when it is quiet\n"

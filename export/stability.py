@@ -1,0 +1,381 @@
+"""Stiff and extreme cases, as one table; the exit code is 1 where a row is broken.
+
+python -m export.stability --out reports
+
+Three parts: the simulated pad (nearly incompressible, thin, thick, touched by a cell or by a ball of a metre), the
+bundled graphs (no touch, denormals, presses beyond any sensor, soft and stiff pads, in int8 and in float32, on one and
+on several threads), and the program from raw counts to records (saturated, wrapped, absent and single taxels).
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edge.api import infer
+from edge.errors import EdgeError, UsageError, WindowError
+from edge.inference.bundled import DEFAULT_MODEL, INT8_SUFFIX, POSED_MODEL, bundled_models, find_model
+from edge.inference.contract import Contract
+from edge.inference.onnx_session import ModelSession
+from edge.terminal.progress_bar import tracked
+from export.graphs.parity import FULL_RANGE_COUNTS, extreme_windows
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ABSENT
+from train.errors import TrainError
+from train.physics.contact import ContactSolver
+from train.physics.elastic_layer import Layer
+from train.physics.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.pad_draws import RANGES
+from train.report import Report, Row
+
+SIZE: Final = 42
+CELL_MM: Final = 0.47
+INDENTATION_MM: Final = 0.3
+FAR_MM: Final = 1e3
+"""Depth outside the shape, in [mm]."""
+RESIDUAL: Final = 1e-3
+DOUBLE: Final = 1e-4
+"""Largest difference of the force between float32 and float64, as a share."""
+WIDE: Final = 24
+"""Factor of a grid whose copies are farther away than any thickness requires."""
+INT8_PRESS, INT8_BEYOND = 0.25, 0.75
+"""Largest difference of int8 from float32 in any pixel, as a share of the largest value: on presses, as `export.verify`
+has it, and on windows beyond any touch, where the bound is against nonsense."""
+SAME: Final = 1e-5
+"""Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
+steps."""
+TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
+QUIET: Final = 1e-3
+"""The difference of int8 where nothing touches, as a share of full scale."""
+MOST_MM: Final = 5.0
+"""Bound of a pattern and its deviation in a record: the pad is 4.5 mm thick."""
+THREADS: Final = 4
+TOGETHER: Final = 16
+REST: Final = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None]
+LARGEST: Final = 65_535
+PRESS: Final = 3000
+FREE_SCANS, TOUCHED_SCANS, KEPT_SCANS = 30, 40, 10
+"""Scans of the free pad and of the case; a taxel's last reading is kept for a few scans."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One row of the table.
+
+    Attributes:
+        name: of the stiff or extreme input, with its unit.
+        what: measured quantity.
+        value: its value, or None where the case must be refused.
+        most: upper bound.
+        note: the error that refuses the case, or the states of the records.
+        model: of which the case is, or "".
+    """
+
+    name: str
+    what: str
+    value: float | None
+    most: float
+    note: str = ""
+    model: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """True within the bound, which NaN never is, or if refused."""
+        return bool(self.note) if self.value is None else self.value <= self.most
+
+    def cells(self) -> Row:
+        """Return the case as cells of a table."""
+        verdict = ("refused" if self.value is None else "holds") if self.holds else "BROKEN"
+        cells: Row = {"case": self.name, "measured": self.what, "value": self.value, "at most": self.most}
+        return cells | {"model": self.model, "verdict": verdict, "note": self.note}
+
+
+def refused(name: str, work: Callable[[], object], by: type[Exception], model: str = "") -> Case:
+    """Return a case that must end in an error; broken if it does not."""
+    try:
+        work()
+    except by as error:
+        return Case(name, "refused", None, 0.0, str(error), model)
+    return Case(name, "refused", float("nan"), 0.0, f"expected {by.__name__}, but there was none", model)
+
+
+def pad_cases() -> Iterator[Case]:
+    """Yield the cases of the simulated pad: contact, layer and magnets."""
+    whole = Layer()
+    stiff = {f"Poisson's ratio {one:g}": replace(whole, poisson=one) for one in (0.0, 0.3, 0.45, 0.49, 0.499, 0.4999)}
+    stiff |= {f"{one:g} mm thick": replace(whole, thickness_mm=one) for one in (0.1, 0.5, 2.0, 10.0, 50.0)}
+    for name, layer in stiff.items():
+        yield from _pressed(name, layer, punch())
+    shapes = {"one cell touches": punch(0.4 * CELL_MM, CELL_MM / 2), "the whole face touches": np.zeros((SIZE, SIZE))}
+    shapes |= {f"ball of radius {radius_mm:g} mm": ball(radius_mm) for radius_mm in (0.5, 10.0, 1000.0)}
+    for name, depth_mm in shapes.items():
+        yield from _pressed(name, whole, depth_mm)
+    for thickness_mm in (4.5, 50.0):
+        yield against_a_wide_grid(replace(whole, thickness_mm=thickness_mm), f"{thickness_mm:g} mm thick")
+    solver = ContactSolver(whole, SIZE, CELL_MM)
+    yield refused("nothing touches", lambda: solver.solve(punch(-1.0)[None], INDENTATION_MM), ValueError)
+    yield refused("pressed by 0 mm", lambda: solver.solve(punch()[None], 0.0), ValueError)
+    yield refused("Poisson's ratio 0.5", lambda: replace(whole, poisson=0.5), ValueError)
+    yield refused("dipole near its chip", lambda: MagnetArray(USPA44, Magnet(height_mm=1.0)), ValueError)
+    exact = MagnetArray(USPA44, Magnet(), "cylinder")
+    through = np.zeros((1, USPA44.taxel_count, len(MOVEMENT)), np.float32)
+    through[..., MOVEMENT.index("down_mm")] = Magnet().clearance_mm
+    yield refused("magnet pressed through its chip", lambda: exact.change_mt(through), ValueError)
+    arrays = {dtype: MagnetArray(USPA44, Magnet()) for dtype in (np.float32, np.float64)}
+    rng = np.random.default_rng(0)
+    for size_mm in (1e-6, 0.5):
+        moved = rng.uniform(-size_mm, size_mm, (100, USPA44.taxel_count, len(MOVEMENT)))
+        single, double = (array.change_mt(moved.astype(dtype)) for dtype, array in arrays.items())
+        name = f"magnets moved by {size_mm:g} mm"
+        yield Case(name, "float32 to float64, mT (two counts are 2e-3)", float(np.abs(single - double).max()), 2e-3)
+
+
+def punch(radius_mm: float = 4.0, middle_mm: float = 0.0) -> NDArray[np.float64]:
+    """Return the depth image of a flat round punch, (size, size) in [mm]; with a radius below 0 nothing touches."""
+    return np.where(_off_mm(SIZE, middle_mm) <= radius_mm, 0.0, FAR_MM)
+
+
+def ball(radius_mm: float) -> NDArray[np.float64]:
+    """Return the depth image of a ball, (size, size) in [mm], without cancellation."""
+    square = np.minimum(np.square(_off_mm(SIZE, 0.0)), radius_mm**2)
+    return square / (radius_mm + np.sqrt(radius_mm**2 - square))
+
+
+def _off_mm(size: int, middle_mm: float) -> NDArray[np.float64]:
+    """Return the distance of each cell to a point on the diagonal, (size, size) in [mm]."""
+    along_mm = (np.arange(size) - (size - 1) / 2) * CELL_MM - middle_mm
+    return np.hypot(along_mm, along_mm[:, None])
+
+
+def _pressed(name: str, layer: Layer, depth_mm: NDArray[np.float64]) -> Iterator[Case]:
+    single, double = (
+        ContactSolver(layer, SIZE, CELL_MM, dtype).solve(depth_mm[None], INDENTATION_MM)
+        for dtype in (torch.float32, torch.float64)
+    )
+    note = f"{single.steps} steps"
+    yield Case(name, "residual, share of the indentation", float(single.residual[0]), RESIDUAL, note)
+    apart = abs(float(single.force_n[0] / double.force_n[0]) - 1)
+    yield Case(name, "force, float32 to float64", apart, DOUBLE)
+
+
+def against_a_wide_grid(layer: Layer, name: str) -> Case:
+    """Return the case of the periodic grid of the pad's response, whose copies must have no effect."""
+    wide = np.full((WIDE * SIZE, WIDE * SIZE), FAR_MM)
+    middle = slice((WIDE - 1) * SIZE // 2, (WIDE + 1) * SIZE // 2)
+    wide[middle, middle] = punch()
+    narrow_n, wide_n = (
+        float(ContactSolver(layer, len(depth), CELL_MM, torch.float64).solve(depth[None], INDENTATION_MM).force_n[0])
+        for depth in (punch(), wide)
+    )
+    return Case(name, f"force, to a grid {WIDE} times as wide", abs(narrow_n / wide_n - 1), RESIDUAL)
+
+
+def graph_cases() -> Iterator[Case]:
+    """Yield the cases of every bundled graph, through the session of the runtime."""
+    for path in bundled_models():
+        one, several = ModelSession(path), ModelSession(path, threads=THREADS)
+        in_float = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
+        peer = ModelSession(in_float) if in_float != path and in_float.exists() else None
+        for name, window in windows(one.contract).items():
+            yield from _graph(name, window, one, several, peer)
+        for name, pad in pads(one.contract).items():
+            row = one.contract.pad_row(pad)
+            window = windows(one.contract)["press"]
+            yield Case(name, "largest, mm", largest(one, window, row), MOST_MM, model=path.stem)
+    for model in (DEFAULT_MODEL, POSED_MODEL):
+        session = ModelSession(find_model(model))
+        good = windows(session.contract)["press"]
+        for bad in (np.nan, np.inf, -np.inf):
+            yield refused(f"{bad} in one place", partial(session.run, _with(good, bad)), WindowError, model)
+
+
+def windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
+    """Return windows (K, 3, rows, cols) in network units by name, from no touch to beyond any sensor."""
+    shape = (contract.taps, *USPA44.scan_shape)
+    press, tangential = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    press[:, 2, 1:3, 1:3] = PRESS
+    tangential[:, :2] = FULL_RANGE_COUNTS
+    rows, cols = np.indices(shape[2:])
+    opposite = np.broadcast_to(np.where((rows + cols) % 2, -1, 1), shape) * np.float32(PRESS)
+    counts = {f"press x {scale:g}": press * np.float32(scale) for scale in (1e-6, 1e-3, 1e3, 1e6)}
+    counts |= {"press": press, "tangential alone, full range": tangential, "neighbours opposite": opposite}
+    counts["earlier taps opposite"] = press * np.where(np.arange(shape[0]) % 2, -1, 1)[:, None, None, None]
+    made = {name: contract.scale_window(values.astype(np.float32)) for name, values in counts.items()}
+    return made | {name: window.reshape(shape) for name, window in extreme_windows(contract).items()}
+
+
+def pads(contract: Contract) -> Mapping[str, Pad]:
+    """Return the softest and the stiffest pad of the training, of the constants that a model takes."""
+    names = [name for name, *_ in contract.pad_inputs]
+    soft: dict[str, Any] = {name: RANGES[name][name == "thickness_mm"] for name in names}
+    stiff: dict[str, Any] = {name: RANGES[name][name != "thickness_mm"] for name in names}
+    return {"the softest pad": Pad(**soft), "the stiffest pad": Pad(**stiff)} if names else {}
+
+
+def _graph(
+    name: str,
+    window: NDArray[np.float32],
+    one: ModelSession,
+    several: ModelSession,
+    peer: ModelSession | None,
+) -> Iterator[Case]:
+    pattern = one.run(window).copy()
+    size, full_scale = float(np.abs(pattern).max()), one.contract.output_full_scale
+    strength = max(1.0, float(np.abs(window).max()))  # patterns grow with the readings: no bound beyond them
+    yield Case(name, "largest over the largest reading, mm", largest(one, window) / strength, MOST_MM, model=one.name)
+    spread = float(np.abs(several.run(window) - pattern).max())
+    together = one.run_together([window] * TOGETHER)
+    spread = max(spread, float(np.abs(together - pattern).max()))
+    touch = name in TOUCHES or name.endswith("taps")
+    most = SAME if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
+    what = f"{THREADS} threads and {TOGETHER} windows, to one"
+    yield Case(name, what, spread / max(size, full_scale), most, model=one.name)
+    if peer is not None and (touch or name in extreme_windows(one.contract)):
+        apart = float(np.abs(peer.run(window) - pattern).max())
+        quiet = name in ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
+        share = apart / full_scale if quiet else apart / max(size, full_scale)
+        most = QUIET if quiet else INT8_PRESS if touch else INT8_BEYOND
+        yield Case(name, "int8 to float32", share, most, model=one.name)
+
+
+def largest(session: ModelSession, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> float:
+    """Return the largest value of pattern and deviation; NaN unless all are finite and every deviation is above 0."""
+    pattern = session.run(window, pad)
+    maps = [pattern] if session.deviation is None else [pattern, session.deviation]
+    return largest_of(maps, session.deviation)
+
+
+def largest_of(maps: list[NDArray[np.float32]], deviation: NDArray[np.float32] | None) -> float:
+    """Return the largest value of maps; NaN unless all are finite and every deviation is above 0."""
+    sure = all(np.isfinite(one).all() for one in maps) and (deviation is None or bool((deviation > 0).all()))
+    return max(float(np.abs(one).max()) for one in maps) if sure else float("nan")
+
+
+def _with(window: NDArray[np.float32], value: float) -> NDArray[np.float32]:
+    changed = window.copy()
+    changed[0, 2, 1, 1] = value
+    return changed
+
+
+def program_cases() -> Iterator[Case]:
+    """Yield the cases of raw counts, through edge.api, by the default model and the one for poses."""
+    for model in (DEFAULT_MODEL, POSED_MODEL):
+        session = ModelSession(find_model(model))
+        for name, (raw, patterns) in scans().items():
+            yield played(name, session, raw, patterns)
+        for rest in (0, 1, LARGEST - 1, LARGEST):
+            yield resting(f"free pad at {rest}, wraps by noise", session, rest)
+        wrong = np.full((1, *USPA44.scan_shape), np.nan)
+        yield refused("NaN counts", partial(infer, session, wrong, _free(1)), UsageError, model)
+
+
+def scans() -> Mapping[str, tuple[NDArray[np.int32], bool]]:
+    """Return raw scans by name, as a broken chip or bus may send them, and whether patterns may be made of them."""
+    rest = _free(1)[0]
+    rows, cols = np.indices(rest.shape[1:])
+    names: dict[str, tuple[NDArray[np.int32], bool]] = {"a press": (_pressed_raw(PRESS), True)}
+    names["a press of 26000 counts in every taxel"] = (rest + np.array([0, 0, 26_000])[:, None, None], True)
+    names["tangential alone, 15000 counts"] = (rest + np.array([15_000, -15_000, 0])[:, None, None], True)
+    one = rest.copy()
+    one[2, 3, 3] += PRESS
+    absent, wild = _pressed_raw(PRESS), _pressed_raw(PRESS)
+    absent[:, 0, 0], wild[:, 0, 0] = ABSENT, LARGEST
+    names |= {"one taxel": (one, True), "a chip sends nothing": (absent, True), "a chip at its end": (wild, True)}
+    names["neighbours at both ends"] = (np.where((rows + cols) % 2, 0, LARGEST) + 0 * rest, False)
+    return names | {"all at zero": (0 * rest, False), "all at the largest": (0 * rest + LARGEST, False)}
+
+
+def played(name: str, model: ModelSession, raw: NDArray[np.int32], patterns: bool) -> Case:
+    """Return the case of a scan that stays, after a free pad: bounded, and without a pattern where nothing is known."""
+    noise = np.arange(TOUCHED_SCANS)[:, None, None, None] % 2  # a taxel without noise is stuck
+    touched = np.where((raw <= 0) | (raw == LARGEST), raw, raw + noise)  # a saturated one has none, nor an absent one
+    results = infer(model, np.concatenate([_free(FREE_SCANS), touched]), _free(FREE_SCANS))[FREE_SCANS:]
+    made = [result for result in results[KEPT_SCANS:] if result.pattern is not None]
+    states = ", ".join(dict.fromkeys(result.state for result in results))
+    if not patterns:
+        return Case(name, "patterns made of it", float(len(made)), 0.0, states, model.name)
+    sizes = [
+        largest_of([one for one in (result.pattern, result.deviation) if one is not None], result.deviation)
+        for result in made
+    ]
+    return Case(name, "largest in a record, mm", float(np.max(sizes, initial=0.0)), MOST_MM, states, model.name)
+
+
+def resting(name: str, model: ModelSession, rest: int) -> Case:
+    """Return the case of a free pad whose taxels rest where 16 bits wrap around: every scan must be idle."""
+    noise = np.arange(TOUCHED_SCANS)[:, None, None, None] % 2
+    counts = (np.full((TOUCHED_SCANS, *USPA44.scan_shape), rest) + noise) % (LARGEST + 1)
+    states = [result.state for result in infer(model, counts, np.full((1, *USPA44.scan_shape), rest))]
+    return Case(name, "scans that are not idle", float(len(states) - states.count("idle")), 0.0, model=model.name)
+
+
+def _free(count: int) -> NDArray[np.int32]:
+    return np.broadcast_to(REST, (count, *USPA44.scan_shape)) + (np.arange(count) % 2)[:, None, None, None]
+
+
+def _pressed_raw(counts: int) -> NDArray[np.int32]:
+    raw = _free(1)[0]
+    raw[2, 1:3, 1:3] += counts
+    return raw
+
+
+PARTS: Final[Mapping[str, Callable[[], Iterator[Case]]]] = {
+    "The simulated pad": pad_cases,
+    "Bundled graphs": graph_cases,
+    "From raw counts to records": program_cases,
+}
+
+
+def worst(cases: list[Case]) -> list[Case]:
+    """Return, of rows that differ in the model alone, those that are broken, or else the one nearest to its bound."""
+    alike: dict[tuple[str, str, float], list[Case]] = {}
+    for case in cases:
+        alike.setdefault((case.name, case.what, case.most), []).append(case)
+    kept: list[Case] = []
+    for same in alike.values():
+        kept += [case for case in same if not case.holds] or [max(same, key=lambda case: case.value or 0.0)]
+    return kept
+
+
+def run(folder: Path) -> list[Case]:
+    """Write the report `stability`, and return the rows that are broken."""
+    report = Report("stability", folder, __file__, [find_model(path.stem) for path in bundled_models()])
+    cases = {part: list(work()) for part, work in tracked(PARTS.items(), "stability", "part")}
+    every = [case for same in cases.values() for case in same]
+    broken = [case for case in every if not case.holds]
+    report.say(
+        f"{len(every)} rows, {sum(case.value is None for case in every)} of them refused by a clear error; "
+        f"{len(broken)} are broken. A value that is not a number is broken, whatever its bound. Of the models the one "
+        "that is nearest to its bound is shown."
+    )
+    for part, same in cases.items():
+        report.show([case.cells() for case in worst(same)], f"## {part}")
+    report.write()
+    return broken
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m export.stability", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("reports"), help="folder of the report (default: reports)")
+    options: Any = parser.parse_args(arguments)
+    try:
+        broken = run(options.out)
+    except (TrainError, EdgeError) as error:
+        sys.exit(f"stability: {error}")
+    sys.stdout.write(f"{options.out / 'stability.md'}\n")
+    if broken:
+        names = "\n".join(f"  {case.name}, {case.what}: {case.value}, at most {case.most}" for case in broken)
+        sys.exit(f"stability: {len(broken)} rows are broken:\n{names}")
+
+
+if __name__ == "__main__":
+    main()

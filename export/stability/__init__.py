@@ -1,1 +1,0 @@
-"""Numerical stability of all computations: stiff and extreme cases, their errors, and the limits."""
