@@ -225,7 +225,7 @@ REFUSALS = (
     "bench --only none",
     "nothing",
 )
-"""What a person may type, with what stands in the folder: press.csv, short.csv, text.csv and press.txt."""
+"""Command lines of a person, in a folder with press.csv, short.csv, text.csv and press.txt."""
 
 
 @scene

@@ -1,4 +1,4 @@
-"""What edge-sr and edge.api do, frozen: records, events, notes, exit codes and messages of each scene."""
+"""Behaviour of edge-sr and edge.api, frozen: records, events, notes, exit codes and messages of each scene."""
 
 import json
 
