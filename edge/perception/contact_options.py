@@ -24,7 +24,6 @@ class RuntimeOptions:
         every_scan: infer also where nothing has changed beyond noise since the last pattern.
         every_tap: use all available taps, also those that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
-        fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the channels from contacts.
         taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
             none: its taps then follow the paper's schedule.
@@ -39,7 +38,6 @@ class RuntimeOptions:
     every_scan: bool = False
     every_tap: bool = False
     follow_drift: bool = True
-    fallback: bool = True
     learn: bool = True
     taps: int | None = None
 

@@ -147,12 +147,6 @@ class PatternCheck:
             reason = "sensor"
         return Verdict(mismatch, reason)
 
-    def smooth(
-        self, newest: NDArray[np.float32], shape: tuple[int, int]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the smooth pattern of readings (3, rows, cols) in network units, and its deviation, both (H, W)."""
-        return self._trust.forward.smooth(newest, shape)
-
     def _weigh(self, tap: int, strength: float, score: float) -> None:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
         if tap != self._tap:

@@ -109,7 +109,7 @@ class Runtime:
         self._options = options
         # Plain attributes, since every scan reads them.
         self._every_scan, self._every_tap = options.every_scan, options.every_tap
-        self._follow_drift, self._fallback = options.follow_drift, options.fallback
+        self._follow_drift = options.follow_drift
         # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
         self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
@@ -341,11 +341,10 @@ class Runtime:
                 pattern=patterns[row].copy(),
                 deviation=deviation,
                 traction=traction,
-                estimate="network",
                 run_time_us=run_time_us,
             )
             sensor = touch.sensor
-            made = self._describe(checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback), sensor)
+            made = self._describe(checked(made, sensor, touch.tap, windows[row][0]), sensor)
             sensor.last = made
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
             sensor.taps_that_matter.judge(made.force_counts or 0.0, made.another_tap)

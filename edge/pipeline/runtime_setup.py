@@ -53,7 +53,6 @@ def open_runtime(
     every_scan: bool = False,
     every_tap: bool = False,
     follow_drift: bool = True,
-    fallback: bool = True,
     learn: bool = True,
     taps: int | None = None,
 ) -> Runtime:
@@ -74,7 +73,6 @@ def open_runtime(
         every_scan: infer also where nothing has changed since the last pattern.
         every_tap: use also taps that are not expected to reduce the error.
         follow_drift: let the rest level follow the readings of a free pad.
-        fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
         taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
             none: taps then follow the paper's schedule, each turned by 5 degrees from the one before.
@@ -99,7 +97,7 @@ def open_runtime(
         measured=known.measured_pads if pad is None else None,
         options=RuntimeOptions(
             *(contact_on_counts, contact_off_counts, idle_reset_s),
-            *(every_scan, every_tap, follow_drift, fallback, learn, taps),
+            *(every_scan, every_tap, follow_drift, learn, taps),
         ),
         unix_time_s=source.unix_time_s,
     )

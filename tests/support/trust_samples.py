@@ -30,12 +30,8 @@ def make_forward(limit: float = 0.2) -> ForwardModel:
     cells = np.kron(np.eye(16).reshape(16, 4, 4), np.ones((1, 2, 2))).reshape(16, GRID**2)
     operator[0, 32:, : GRID**2] = cells / 4
     operator[0, :32, GRID**2 :] = KPA * np.eye(32)
-    inverse = np.zeros((GRID**2, 48), dtype=np.float32)
-    inverse[:, 32:] = cells.T
     return ForwardModel(
         operator=operator,
-        inverse=inverse,
-        spread=np.full(GRID**2, 0.125, dtype=np.float32),
         noise=np.full(3, 0.03125, dtype=np.float32),
         model_error=np.full(3, 0.125, dtype=np.float32),
         unexplained=0.0625,

@@ -86,7 +86,6 @@ def _checks(model: ModelSession, windows: NDArray[np.floating]) -> dict[str, Cal
         "familiar": lambda at: trust.contact.network(contact_features(made[at][0], pad)),
         "mismatch": lambda at: trust.forward.mismatch(operator, *made[at], 0.075),
         "both, and the evidence": lambda at: check.judge(at, *made[at], 0),
-        "smooth": lambda at: check.smooth(made[at][0], made[at][1].shape),
     }
     if contract.taps > 1:
         runs["earlier taps"] = lambda at: check.belonging(units[at], contract.taps)
