@@ -17,7 +17,7 @@ from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 7
+CONTRACT_VERSION: Final = 8
 ADDED: Final = MappingProxyType(
     {
         5: ("pad_inputs", "takes_gains", "traction_scale"),
@@ -25,7 +25,9 @@ ADDED: Final = MappingProxyType(
         7: ("takes_poses", "reach_mm"),
     },
 )
-"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose."""
+"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose.
+
+Version 8 added none, and took from `trust` what the runtime no longer reads."""
 FIRST_VERSION: Final = 4
 """First version that is still loaded."""
 TAP_ORDER: Final = "newest first"

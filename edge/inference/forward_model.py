@@ -4,7 +4,6 @@ Made by train.trust from the simulated world, kept in the model's contract, in n
 only in part, because pads, gains and large deformations differ; what it leaves is weighed by that.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -25,8 +24,8 @@ _DRAG_GRID: Final = 4
 FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
 _INPUTS: Final = 3 * _CELLS
 _KEYS: Final = ("operator", "noise", "model_error")
-_FORMER: Final = ("inverse", "spread")
-"""Keys of earlier releases, by which they replaced a pattern that was not to be believed."""
+_FORMER: Final = ("inverse", "spread", "unexplained", "limit")
+"""Keys of earlier releases, of a limit for each model and of the pattern shown in place of one not to be believed."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +36,11 @@ class ForwardModel:
         operator: (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of each constant.
         noise: (3,), deviation of a reading of x, y, z from drift, field and noise.
         model_error: (3,), RMS of what the operator leaves of true patterns' readings, over their amplitude.
-        unexplained: share of the readings' energy that it leaves of true patterns on pads of which nothing is known.
-        limit: mismatch that one in two hundred patterns of simulated contacts exceeds; infinite before it is set.
     """
 
     operator: NDArray[np.float32]
     noise: NDArray[np.float32]
     model_error: NDArray[np.float32]
-    unexplained: float
-    limit: float = math.inf
 
     def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the operator of a pad for `features`, by its constants (p,) over their spread, 0 where unknown."""
@@ -91,10 +86,7 @@ class ForwardModel:
 
     def to_json(self) -> dict[str, Any]:
         """Return the model as JSON."""
-        return {name: packed(getattr(self, name)) for name in _KEYS} | {
-            "unexplained": self.unexplained,
-            "limit": self.limit,
-        }
+        return {name: packed(getattr(self, name)) for name in _KEYS}
 
 
 def forward_model(value: Any, constants: int) -> ForwardModel:
@@ -103,8 +95,8 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
     Raises:
         ValueError: it is none, or of other constants.
     """
-    if not isinstance(value, dict) or set(value) - {*_FORMER} != {*_KEYS, "unexplained", "limit"}:
-        raise ValueError(f"expected {', '.join(_KEYS)}, unexplained and limit")
+    if not isinstance(value, dict) or set(value) - {*_FORMER} != {*_KEYS}:
+        raise ValueError(f"expected {', '.join(_KEYS)}")
     arrays = {name: unpacked(value[name]) for name in _KEYS}
     readings = arrays["operator"].shape[1] if arrays["operator"].ndim > 1 else 0
     expected = {
@@ -115,12 +107,9 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} is {arrays[name].shape}, expected {shape}")
-    numbers = {name: value[name] for name in ("unexplained", "limit")}
-    if not all(isinstance(number, float) and 0 < number < math.inf for number in numbers.values()):
-        raise ValueError(f"{numbers}, expected numbers above 0")
     if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all()):
         raise ValueError("noise and model_error, expected above 0")
-    return ForwardModel(**arrays, **numbers)
+    return ForwardModel(**arrays)
 
 
 def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:

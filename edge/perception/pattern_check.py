@@ -1,8 +1,9 @@
 """Decision whether a pattern is to be believed, by its own readings, its earlier taps and the contacts before.
 
-Two things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
-do not), and does it explain them? Of each earlier tap: does it belong to the contact that goes on? What repeats over
-contacts speaks against the sensor, not the contact.
+Three things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
+do not), does it explain them, and is the model itself sure of it? Of each earlier tap: does it belong to the contact
+that goes on? What repeats over contacts speaks against the sensor, not the contact. The limits are one for all models,
+so that the same reading gets the same verdict as far as their patterns agree.
 """
 
 import math
@@ -14,24 +15,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
+from edge.inference.expected_error import doubt
 from edge.inference.familiarity import contact_features, pose_tap_features, tap_features
 from edge.inference.trust import Trust
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
-Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor"]
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; contacts together are unfamiliar, or contradict the gains of the sensor file."""
-REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor")
+its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
+error."""
+REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain")
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
     "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
     "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
+    "uncertain": "the model expects a large error (a light contact? fine detail? press harder, or elsewhere)",
 }
 """Reasons in a user's words, each with what to look for."""
 
 LEAST_COUNTS: Final = 100.0
 """Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+MOST_MISMATCH: Final = 0.8
+"""Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
+one in 300 right ones."""
+MOST_DOUBT: Final = 0.65
+"""RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
+
+With the other limits some 2 % of simulated contacts less than 30 % off are not believed, and three in ten of those more
+than 50 % off: `python -m train.experiments trust-checks`."""
+_DOUBT_POWER: Final = 0.15
+"""Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
@@ -76,7 +90,7 @@ class PatternCheck:
     def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
         self._constants = len(contract.pad_inputs)
-        self._least = LEAST_COUNTS / contract.counts_per_unit[2]
+        self._unit_counts = contract.counts_per_unit[2]
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
@@ -115,6 +129,7 @@ class PatternCheck:
         tap: int,
         newest: NDArray[np.float32],
         pattern: NDArray[np.float32],
+        deviation: NDArray[np.float32] | None,
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> Verdict:
@@ -124,25 +139,30 @@ class PatternCheck:
             tap: number of the contact.
             newest: (3, rows, cols) in network units, the readings that it was made from.
             pattern: (H, W) in [mm].
-            traction: (3, h, w) in [kPa].
+            deviation: (H, W) in [mm], if the model gives one.
+            traction: (3, h, w) in [kPa], if the model gives one.
             repeats: scans for which some taxel has repeated itself while most others were new.
         """
         strength = float(newest[2].max())
-        if strength < self._least:
+        z_counts = strength * self._unit_counts
+        if z_counts < LEAST_COUNTS:
             return Verdict(checked=False, reason="stuck" if repeats >= REPEATS else None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
         self._weigh(tap, strength, score)
-        mismatch = None
+        mismatch, explained = None, True
         if traction is not None:
             mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
+            explained = mismatch <= MOST_MISMATCH and np.isfinite(traction).all()
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
         elif not score <= trust.contact.limit:  # NaN fails here too, as below
             reason = "unfamiliar"
-        elif mismatch is not None and not mismatch <= trust.forward.limit:
+        elif not explained:
             reason = "unexplained"
+        elif deviation is not None and not doubt(pattern, deviation)[0] <= _most_doubt(z_counts):
+            reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
         return Verdict(mismatch, reason)
@@ -170,6 +190,10 @@ def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
     """
     found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
     return found if posed or not found else list(range(found[0], len(belonging) + 1))
+
+
+def _most_doubt(z_counts: float) -> float:
+    return MOST_DOUBT * (z_counts / 1e3) ** _DOUBT_POWER
 
 
 def _share(log_odds: float) -> float:

@@ -80,7 +80,7 @@ def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32
     if sensor.check is None or pattern is None:
         return result
     suspected = sensor.check.suspected
-    verdict = sensor.check.judge(tap, newest, pattern, result.traction, sensor.watch.most_repeats)
+    verdict = sensor.check.judge(tap, newest, pattern, deviation, result.traction, sensor.watch.most_repeats)
     if sensor.check.suspected != suspected:
         sensor.report("cleared" if suspected else "suspected")
     return replace(result, mismatch=verdict.mismatch, trusted=verdict.trusted, untrusted_reason=verdict.reason)

@@ -192,7 +192,7 @@ FIELDS: Final = (
           "a contact that is too light to check, and for models without checks", byte=592),
     # Four bytes after it are free: an earlier release had a further word there.
     Field("untrusted_reason", replace(_one_of(*REASONS, unknown=""), packed="i4x"), "untrusted_reason",
-          "why not: `stuck`, `unfamiliar`, `unexplained` or `sensor`", byte=596),
+          "why not: see [the reasons](trust.md#the-reasons)", byte=596),
     Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
           "without, because they do not belong to this contact; unknown without earlier taps",
           out=_RECORD_NPZ, byte=604),

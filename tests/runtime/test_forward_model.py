@@ -130,4 +130,3 @@ class TestJson:
         again = forward_model(one.to_json(), CONSTANTS)
         for name in ("operator", "noise", "model_error"):
             assert np.array_equal(getattr(again, name), getattr(one, name))
-        assert (again.limit, again.unexplained) == (one.limit, one.unexplained)

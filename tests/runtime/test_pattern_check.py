@@ -5,7 +5,7 @@ import pytest
 from edge_samples import FakeModel
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
-from edge.perception.pattern_check import LEAST_COUNTS, REPEATS, PatternCheck, Verdict, strangers
+from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, strangers
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -24,13 +24,14 @@ def make_tap(z=2.0, x=0.0):
     return tap
 
 
-def judge(check, tap, number=0, repeats=0, factor=1.0) -> Verdict:
+def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> Verdict:
     """Return the verdict on the pattern that the fake model makes of a tap, times a factor."""
     model = FakeModel(CONTRACT)
     window = np.zeros((4, *tap.shape), dtype=np.float32)
     window[0] = tap
-    pattern = model.run(window, PAD_ROW)
-    return check.judge(number, tap, np.float32(factor) * pattern, model.traction, repeats)
+    pattern = np.float32(factor) * model.run(window, PAD_ROW)
+    deviation = np.full_like(pattern, doubt * np.sqrt(np.mean(pattern**2)))
+    return check.judge(number, tap, pattern, deviation, model.traction, repeats)
 
 
 class TestReasons:
@@ -63,28 +64,35 @@ class TestReasons:
     def test_a_pattern_that_does_not_explain_its_readings_is_told(self):
         wrong = judge(make_check(), make_tap(), factor=2)
         assert (wrong.trusted, wrong.reason) == (False, "unexplained")
-        assert wrong.mismatch is not None and wrong.mismatch > 0.2
+        assert wrong.mismatch is not None and wrong.mismatch > MOST_MISMATCH
+
+    @pytest.mark.parametrize(("z", "limit"), [(0.2, 0.51), (1.0, 0.65), (3.0, 0.766)])
+    def test_a_pattern_that_the_model_is_not_sure_of_is_told_the_sooner_the_lighter_it_is(self, z, limit):
+        assert judge(make_check(), make_tap(z), doubt=limit - 0.01).trusted is True
+        unsure = judge(make_check(), make_tap(z), doubt=limit + 0.01)
+        assert (unsure.trusted, unsure.reason) == (False, "uncertain")
 
     def test_without_traction_readings_are_still_checked(self):
         check, tap = make_check(), make_tap(x=1)
         pattern = np.ones((40, 40), dtype=np.float32)
-        verdict = check.judge(0, tap, pattern, None, 0)
+        verdict = check.judge(0, tap, pattern, None, None, 0)
         assert (verdict.mismatch, verdict.reason) == (None, "unfamiliar")
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_what_is_not_finite_is_never_believed(self, bad):
         tap, pattern, traction = make_tap(), np.ones((40, 40), dtype=np.float32), np.zeros((3, 8, 8), dtype=np.float32)
-        for place in (tap, pattern, traction):
+        deviation = 0.1 * pattern
+        for place in (tap, pattern, deviation, traction):
             kept = place.flat[-1]
             place.flat[-1] = bad
             with np.errstate(all="ignore"):
-                assert make_check().judge(0, tap, pattern, traction, 0).trusted is not True
+                assert make_check().judge(0, tap, pattern, deviation, traction, 0).trusted is not True
             place.flat[-1] = kept
 
     def test_readings_that_are_not_finite_are_of_no_contact(self):
         tap = make_tap()
         tap[0, 0, 0] = np.nan
-        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, 0).reason == "unfamiliar"
+        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, None, 0).reason == "unfamiliar"
 
     @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
     def test_readings_of_any_size_give_a_verdict(self, scale):
@@ -102,7 +110,7 @@ class TestReasons:
         certain.use_pad(np.append(PAD_ROW[:-1], np.float32(1)))
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)
-        shares = [check.judge(0, tap, pattern, traction, 0).mismatch for check in (certain, sure, unsure)]
+        shares = [check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, sure, unsure)]
         assert shares[0] > shares[1] == shares[2]
 
 

@@ -48,10 +48,7 @@ DAMAGE = {
     "an endless shape": put("forward", "noise", "shape", [math.inf]),
     "bytes cut short": put("forward", "noise", "f2", "AAAA"),
     "noise below 0": put("forward", "noise", packed(np.array([1.0, 1.0, -1.0]))),
-    "a forward limit of 0": put("forward", "limit", 0.0),
-    "no forward limit": put("forward", "limit", None),
-    "an endless forward limit": put("forward", "limit", math.inf),
-    "unexplained is text": put("forward", "unexplained", "much"),
+    "more in the forward model": put("forward", "more", 1.0),
     "a contact limit that is no number": put("contact", "limit", math.nan),
     "a contact network without layers": put("contact", "layers", []),
     "a contact network of a tap's features": lambda value: value.update(contact=value["tap"]),
@@ -88,7 +85,7 @@ class TestContract:
     def test_a_model_file_keeps_its_checks(self, tmp_path):
         model = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract()))
         trust = model.contract.read_trust()
-        assert trust is not None and trust.forward.limit == pytest.approx(0.2)
+        assert trust is not None and trust.contact.limit == pytest.approx(5.0)
 
     @pytest.mark.parametrize("damage", DAMAGE)
     def test_damage_is_told_in_a_line_that_names_the_key(self, damage):

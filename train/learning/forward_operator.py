@@ -15,8 +15,6 @@ from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
 _RIDGE: Final = 1e-6
-_NO_LIMIT: Final = 1.0
-"""Limit until a model's own patterns set it, at export."""
 _UNIT: Final = np.array(COUNTS_PER_UNIT)
 
 
@@ -33,13 +31,10 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
     weights = _least_squares(columns, clean / size)
     operator = weights.reshape(1 + len(INPUTS), inputs.shape[1], -1).transpose(0, 2, 1)
     left = (clean / size - columns @ weights).reshape(len(presses), len(AXES), -1)
-    unknown = clean / size - inputs @ operator[0].T
     found = ForwardModel(
         operator=operator.astype(np.float32),
         noise=_noise().astype(np.float32),
         model_error=np.sqrt(np.mean(left**2, axis=(0, 2))).astype(np.float32),
-        unexplained=float(np.sum(unknown**2) / np.sum((clean / size) ** 2)),
-        limit=_NO_LIMIT,
     )
     return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
 
