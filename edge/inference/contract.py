@@ -49,6 +49,8 @@ MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
+OUTSIDE: Final = 1.5
+"""Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
 DETERMINED: Final = 0.4
 """Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 LEAST_UNIT: Final = 1e-6
@@ -270,6 +272,18 @@ class Contract:
         if self.takes_gains and pad is not None:
             row[-1] = pad.gains_certainty
         return row
+
+    def is_outside(self, pad: Pad | None) -> bool:
+        """Return whether a constant of a pad that the model takes is far outside of its range in training.
+
+        Where it has an interval, the whole interval must be.
+        """
+        for name, centre, spread in self.pad_inputs:
+            if pad is not None and name in pad.constants:
+                low, high = pad.intervals.get(name, (pad.constants[name],) * 2)
+                if max(low - centre, centre - high) > OUTSIDE * spread:
+                    return True
+        return False
 
 
 def _keys(version: int) -> list[str]:

@@ -20,17 +20,19 @@ from edge.inference.familiarity import contact_features, pose_tap_features, tap_
 from edge.inference.trust import Trust
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
-Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain"]
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
 its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
-error."""
-REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain")
+error; it was trained on no press so deep or strong, or on no such pad."""
+REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad")
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
     "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
     "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
     "uncertain": "the model expects a large error (a light contact? fine detail? press harder, or elsewhere)",
+    "beyond": "a press deeper or stronger than the model was trained on (press less)",
+    "pad": "the sensor file's pad is far outside those that the model was trained on (the file? train for this pad)",
 }
 """Reasons in a user's words, each with what to look for."""
 
@@ -46,6 +48,14 @@ With the other limits some 2 % of simulated contacts less than 30 % off are not 
 than 50 % off: `python -m train.experiments trust-checks`."""
 _DOUBT_POWER: Final = 0.15
 """Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
+_MOST_CHECKERBOARD: Final = 0.9
+"""Share of z's variation over the pad that alternates from taxel to taxel, beyond which no layer transmits it: crossed
+bars of two pitches reach 0.84 in simulation."""
+_DEEPEST: Final = 1.1
+"""Largest depth of a pattern over the declared full scale, which is the deepest press in training."""
+MOST_Z: Final = 6_500.0
+MOST_SUM: Final = 58_000.0
+"""Largest z of a taxel, and of all, in counts: but for one press in a thousand, those of the training, up to 40 N."""
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
@@ -91,6 +101,7 @@ class PatternCheck:
         self._trust = trust
         self._constants = len(contract.pad_inputs)
         self._unit_counts = contract.counts_per_unit[2]
+        self._deepest = _DEEPEST * contract.output_full_scale
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
@@ -101,9 +112,14 @@ class PatternCheck:
         """Believe no further pattern: the sensor file holds the gains of another sensor."""
         self.suspected = self._wrong_file = True
 
-    def use_pad(self, pad_row: NDArray[np.float32]) -> None:
-        """Check from now on with a pad as model input; what contacts have shown so far stays."""
-        self._pad_row = pad_row
+    def use_pad(self, pad_row: NDArray[np.float32], *, outside: bool = False) -> None:
+        """Check from now on with a pad as model input; what contacts have shown so far stays.
+
+        Args:
+            pad_row: see `Contract.pad_row`.
+            outside: the pad is far outside those of the training.
+        """
+        self._pad_row, self._outside = pad_row, outside
         self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
         certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
         self._gain_error = GAIN_SPREAD * (1 - certainty)
@@ -157,8 +173,12 @@ class PatternCheck:
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif not score <= trust.contact.limit:  # NaN fails here too, as below
+        elif self._outside:
+            reason = "pad"
+        elif not score <= trust.contact.limit or _alternates(newest[2]):  # NaN fails here too, as below
             reason = "unfamiliar"
+        elif pattern.max() > self._deepest or z_counts > MOST_Z or newest[2].sum() * self._unit_counts > MOST_SUM:
+            reason = "beyond"
         elif not explained:
             reason = "unexplained"
         elif deviation is not None and not doubt(pattern, deviation)[0] <= _most_doubt(z_counts):
@@ -190,6 +210,13 @@ def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
     """
     found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
     return found if posed or not found else list(range(found[0], len(belonging) + 1))
+
+
+def _alternates(z: NDArray[np.float32]) -> bool:
+    """Return whether z (rows, cols) is a checkerboard that no layer transmits."""
+    change = z - z.mean()
+    along = change[::2, ::2].sum() + change[1::2, 1::2].sum() - change[::2, 1::2].sum() - change[1::2, ::2].sum()
+    return float(along) ** 2 > _MOST_CHECKERBOARD * z.size * float(np.vdot(change, change))
 
 
 def _most_doubt(z_counts: float) -> float:

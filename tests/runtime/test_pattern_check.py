@@ -56,7 +56,7 @@ class TestReasons:
         assert (stuck.trusted, stuck.reason) == (False, "stuck")
 
     def test_readings_of_no_contact_are_unfamiliar_whatever_the_force(self):
-        for z in (0.5, 2.0, 10.0):
+        for z in (0.5, 2.0, 3.5):
             assert judge(make_check(), make_tap(z, x=0.4)).trusted is True
             strange = judge(make_check(), make_tap(z, x=0.6))
             assert (strange.trusted, strange.reason) == (False, "unfamiliar")
@@ -78,6 +78,29 @@ class TestReasons:
         verdict = check.judge(0, tap, pattern, None, None, 0)
         assert (verdict.mismatch, verdict.reason) == (None, "unfamiliar")
 
+    @pytest.mark.parametrize("low", [0.0, 0.5])
+    def test_a_checkerboard_is_of_no_contact_and_neither_a_row_nor_a_taxel_is_one(self, low):
+        tap = make_tap()
+        tap[2] = np.where(np.indices((4, 4)).sum(axis=0) % 2, 2, 2 * low)
+        assert judge(make_check(), tap).reason == "unfamiliar"
+        for place in (np.s_[1], np.s_[1, 2], np.s_[::2]):
+            tap[2] = 2 * low
+            tap[2][place] = 2
+            assert judge(make_check(), tap).trusted is True
+
+    @pytest.mark.parametrize(("z", "taxels"), [(6.6, 1), (3.7, 16)])
+    def test_a_press_stronger_than_in_training_is_told(self, z, taxels):
+        for factor, reason in ((1.0, "beyond"), (0.95, None)):
+            tap = make_tap()
+            tap[2] = 0
+            tap[2].flat[:taxels] = factor * z
+            assert judge(make_check(make_trusted_contract(output_full_scale=10.0)), tap).reason == reason
+
+    def test_a_pattern_deeper_than_in_training_is_told(self):
+        for full_scale, reason in ((1.8, "beyond"), (1.9, None)):
+            check = make_check(make_trusted_contract(output_full_scale=full_scale))
+            assert judge(check, make_tap(2.0)).reason == reason
+
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_what_is_not_finite_is_never_believed(self, bad):
         tap, pattern, traction = make_tap(), np.ones((40, 40), dtype=np.float32), np.zeros((3, 8, 8), dtype=np.float32)
@@ -97,7 +120,7 @@ class TestReasons:
     @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
     def test_readings_of_any_size_give_a_verdict(self, scale):
         verdict = judge(make_check(), make_tap(2 * scale))
-        assert verdict.trusted in (True, None) and (verdict.trusted is None) == (scale < 0.1)
+        assert (verdict.trusted, verdict.reason) == ((None, None) if scale < 0.1 else (False, "beyond"))
         assert verdict.mismatch is None or np.isfinite(verdict.mismatch)
         wrong = judge(make_check(), make_tap(2 * scale), factor=3)
         assert wrong.trusted is (None if scale < 0.1 else False)

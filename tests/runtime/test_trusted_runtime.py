@@ -13,6 +13,7 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
 from firmware_bridge.pad_geometry import USPA46
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -118,6 +119,25 @@ class TestVerdict:
         assert result.zeroed is not None and result.pattern is not None
         window[0] = result.zeroed / np.array([500, 500, 1000], dtype=np.float32)[:, None, None]
         assert np.allclose(result.pattern, model.run(window, np.zeros(5, dtype=np.float32)))
+
+    @pytest.mark.parametrize(
+        ("pad", "reason"),
+        [
+            (Pad(), None),
+            (Pad(thickness_mm=5.2), None),
+            (Pad(thickness_mm=5.3), "pad"),
+            (Pad(thickness_mm=3.7), "pad"),
+            (Pad(thickness_mm=5.3, intervals={"thickness_mm": (5.0, 5.6)}), None),
+            (Pad(thickness_mm=7.0, intervals={"thickness_mm": (5.5, 8.5)}), "pad"),
+            (Pad(counts_per_newton=2000.0), "pad"),
+        ],
+    )
+    def test_a_pad_far_outside_the_training_is_told(self, pad, reason):
+        """The sample was trained on pads of 4.5 mm, half a millimetre either way."""
+        pressed = Pressed()
+        pressed.runtime = make_runtime(FakeModel(make_trusted_contract()), options=EVERY, pad=pad)
+        result = pressed.scan(PRESS)
+        assert (result.trusted, result.untrusted_reason) == (reason is None, reason)
 
     def test_one_that_explains_its_readings_is_believed(self):
         result = Pressed().scan(PRESS)

@@ -167,7 +167,7 @@ class TestLayout:
             "state": ("zeroing", "incomplete", "idle", "contact", "dropped"),
             "filled": ("rest", "neighbours"),
             "wrench_origin": ("nominal", "calibrated"),
-            "untrusted_reason": ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain"),
+            "untrusted_reason": ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad"),
         }
 
     def test_the_header_tells_where_maps_lie(self, sink, name):

@@ -54,7 +54,9 @@ def make_posed_trust(farthest_mm: float) -> Trust:
 
 def make_trusted_contract(**changes) -> Contract:
     """Return the contract of the fake model with these checks."""
-    return make_pad_contract(**({"trust": make_trust().to_json(), "interval_factor": 1.6} | changes))
+    return make_pad_contract(
+        **({"trust": make_trust().to_json(), "interval_factor": 1.6, "output_full_scale": 10.0} | changes)
+    )
 
 
 class WrongModel(FakeModel):
