@@ -181,7 +181,7 @@ class PatternCheck:
             reason = "beyond"
         elif not explained:
             reason = "unexplained"
-        elif deviation is not None and not doubt(pattern, deviation)[0] <= _most_doubt(z_counts):
+        elif deviation is not None and not doubt(pattern, deviation)[0] <= most_doubt(z_counts):
             reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
@@ -219,7 +219,8 @@ def _alternates(z: NDArray[np.float32]) -> bool:
     return float(along) ** 2 > _MOST_CHECKERBOARD * z.size * float(np.vdot(change, change))
 
 
-def _most_doubt(z_counts: float) -> float:
+def most_doubt(z_counts: float) -> float:
+    """Return the largest doubt of a pattern that is believed, by the largest z of its contact."""
     return MOST_DOUBT * (z_counts / 1e3) ** _DOUBT_POWER
 
 
