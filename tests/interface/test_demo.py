@@ -310,7 +310,10 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     trust = make_posed_trust(100.0).to_json()
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     write_posed_model(
-        path, make_posed_contract(interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True)
+        path,
+        make_posed_contract(
+            interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True, output_full_scale=100.0
+        ),
     )
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
     done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")
