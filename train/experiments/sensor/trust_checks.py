@@ -92,8 +92,8 @@ _METHOD: Final = (
     "of a sensor unless a row states it. How far a pattern is off is its RMS error over the RMS of the truth. "
     "Contacts less than 30 % off that are not believed are false alarms, wanted at most 2 %; wanted of those more "
     "than 50 % off are 30 % not believed, of those more than 100 % off 80 %. The limit of the expected error was "
-    "set on half of the families and on pads of its own: there {limit:.2f} would give 2 % for `{model}` without knowledge; shipped"
-    " is {shipped}."
+    "set on half of the families and on pads of its own: there {limit:.2f} would give 2 % for `{model}` without "
+    "knowledge; shipped is {shipped}."
 )
 _FAMILIES: Final = (
     "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
