@@ -138,7 +138,7 @@ def _by_family(verdicts: Judged, presses: FrozenPresses) -> list[Row]:
 def _by_model(models: Sequence[ModelSession], presses: FrozenPresses) -> list[Row]:
     rows: list[Row] = []
     for model in tracked(models, "models", "model"):
-        for known in (NOTHING, ALL):
+        for known in (NOTHING, ALL) if model is models[0] else (NOTHING,):
             one = judged(model, presses, known_pads(presses, known))
             rows.append({"model": model.name, "known": known} | one.cells(~one.light))
     return rows
