@@ -43,7 +43,7 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
     turned = turned.pick(np.flatnonzero(taps == most)).with_taps(most)
     steps = max(_TAP_STEPS // shorten, 1)
     return {
-        "forward": fit_forward_model(presses, seed).to_json(),
+        "forward": fit_forward_model(presses).to_json(),
         "contact": fit_contact_network(presses, seed, max(_CONTACT_STEPS // shorten, 1)).to_json(),
         "tap": fit_tap_network(turned, seed, steps).to_json(),
         "posed_tap": fit_posed_tap_network(several, seed, steps).to_json(),

@@ -268,12 +268,6 @@ def _add_results(parser: argparse.ArgumentParser) -> None:
         "and there are none)",
     )
     checks = parser.add_argument_group("checks of patterns and sensor").add_argument
-    checks(
-        "--no-fallback",
-        dest="fallback",
-        action="store_false",
-        help="keep a pattern that is not to be believed, instead of a smooth estimate",
-    )
     learn_help = "do not learn from contacts how sensitive each taxel is"
     checks("--no-learn", dest="learn", action="store_false", help=learn_help)
     checks("--every-scan", action="store_true", help="compute a pattern even if the readings have not changed")

@@ -17,7 +17,7 @@ from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 7
+CONTRACT_VERSION: Final = 8
 ADDED: Final = MappingProxyType(
     {
         5: ("pad_inputs", "takes_gains", "traction_scale"),
@@ -25,7 +25,9 @@ ADDED: Final = MappingProxyType(
         7: ("takes_poses", "reach_mm"),
     },
 )
-"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose."""
+"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose.
+
+Version 8 added none, and took from `trust` what the runtime no longer reads."""
 FIRST_VERSION: Final = 4
 """First version that is still loaded."""
 TAP_ORDER: Final = "newest first"
@@ -47,6 +49,8 @@ MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
+OUTSIDE: Final = 1.5
+"""Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
 DETERMINED: Final = 0.4
 """Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 LEAST_UNIT: Final = 1e-6
@@ -249,6 +253,18 @@ class Contract:
         if self.takes_gains and pad is not None:
             row[-1] = pad.gains_certainty
         return row
+
+    def is_outside(self, pad: Pad | None) -> bool:
+        """Return whether a constant of a pad that the model takes is far outside of its range in training.
+
+        Where it has an interval, the whole interval must be.
+        """
+        for name, centre, spread in self.pad_inputs:
+            if pad is not None and name in pad.constants:
+                low, high = pad.intervals.get(name, (pad.constants[name],) * 2)
+                if max(low - centre, centre - high) > OUTSIDE * spread:
+                    return True
+        return False
 
 
 def _keys(version: int) -> list[str]:

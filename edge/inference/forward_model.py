@@ -1,10 +1,9 @@
-"""Linear forward model of a sensor: readings that a pattern and its tangential traction make, and the way back.
+"""Linear forward model of a sensor: readings that a pattern and its tangential traction make.
 
 Made by train.trust from the simulated world, kept in the model's contract, in network units. It explains a contact
-only in part (`unexplained`), because pads, gains and large deformations differ; what it leaves is weighed by that.
+only in part, because pads, gains and large deformations differ; what it leaves is weighed by that.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -12,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.familiarity import QUIET_UNITS
 from edge.inference.small_network import packed, unpacked
 from firmware_bridge.pad_geometry import AXES
 
@@ -25,7 +23,9 @@ _DRAG_GRID: Final = 4
 """Cells of the drag along a side in the contract; the traction has twice as many, and four of them share a weight."""
 FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
 _INPUTS: Final = 3 * _CELLS
-_KEYS: Final = ("operator", "inverse", "spread", "noise", "model_error")
+_KEYS: Final = ("operator", "noise", "model_error")
+_FORMER: Final = ("inverse", "spread", "unexplained", "limit")
+"""Keys of earlier releases, of a limit for each model and of the pattern shown in place of one not to be believed."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,13 @@ class ForwardModel:
 
     Attributes:
         operator: (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of each constant.
-        inverse: (GRID^2, 48), the smooth pattern of readings: the best linear estimate of a pattern.
-        spread: (GRID^2,), its RMS error, over the amplitude of the readings.
         noise: (3,), deviation of a reading of x, y, z from drift, field and noise.
         model_error: (3,), RMS of what the operator leaves of true patterns' readings, over their amplitude.
-        unexplained: share of the readings' energy that it leaves of true patterns on pads of which nothing is known.
-        limit: mismatch that one in two hundred patterns of simulated contacts exceeds; infinite before it is set.
     """
 
     operator: NDArray[np.float32]
-    inverse: NDArray[np.float32]
-    spread: NDArray[np.float32]
     noise: NDArray[np.float32]
     model_error: NDArray[np.float32]
-    unexplained: float
-    limit: float = math.inf
 
     def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the operator of a pad for `features`, by its constants (p,) over their spread, 0 where unknown."""
@@ -92,29 +84,9 @@ class ForwardModel:
         """Variances (2, 48) of noise, and of the operator's error over the square of the amplitude."""
         return np.repeat(np.square([self.noise, self.model_error]), self.operator.shape[1] // len(AXES), axis=1)
 
-    def smooth(
-        self, tap: NDArray[np.float32], shape: tuple[int, int]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the smooth pattern of a tap's readings, and its deviation, both (H, W) in [mm].
-
-        Args:
-            tap: (3, rows, cols) in network units.
-            shape: (H, W).
-        """
-        z = tap[2].reshape(-1)
-        size = math.sqrt(float(z @ z) / z.size) + QUIET_UNITS
-        tall, wide = _enlarging(shape[0]), _enlarging(shape[1])
-        cells = np.maximum(self.inverse @ tap.reshape(-1), 0).reshape(GRID, GRID)
-        spread = (self.spread * np.float32(size)).reshape(GRID, GRID)
-        smooth, deviation = tall @ cells @ wide.T, tall @ spread @ wide.T
-        return smooth.astype(np.float32, copy=False), deviation.astype(np.float32, copy=False)
-
     def to_json(self) -> dict[str, Any]:
         """Return the model as JSON."""
-        return {name: packed(getattr(self, name)) for name in _KEYS} | {
-            "unexplained": self.unexplained,
-            "limit": self.limit,
-        }
+        return {name: packed(getattr(self, name)) for name in _KEYS}
 
 
 def forward_model(value: Any, constants: int) -> ForwardModel:
@@ -123,26 +95,21 @@ def forward_model(value: Any, constants: int) -> ForwardModel:
     Raises:
         ValueError: it is none, or of other constants.
     """
-    if not isinstance(value, dict) or set(value) != {*_KEYS, "unexplained", "limit"}:
-        raise ValueError(f"expected {', '.join(_KEYS)}, unexplained and limit")
+    if not isinstance(value, dict) or set(value) - {*_FORMER} != {*_KEYS}:
+        raise ValueError(f"expected {', '.join(_KEYS)}")
     arrays = {name: unpacked(value[name]) for name in _KEYS}
-    *_, readings = arrays["inverse"].shape or (0,)
+    readings = arrays["operator"].shape[1] if arrays["operator"].ndim > 1 else 0
     expected = {
         "operator": (1 + constants, readings, FEATURES),
-        "inverse": (GRID**2, readings),
-        "spread": (GRID**2,),
         "noise": (len(AXES),),
         "model_error": (len(AXES),),
     }
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} is {arrays[name].shape}, expected {shape}")
-    numbers = {name: value[name] for name in ("unexplained", "limit")}
-    if not all(isinstance(number, float) and 0 < number < math.inf for number in numbers.values()):
-        raise ValueError(f"{numbers}, expected numbers above 0")
-    if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all() and (arrays["spread"] > 0).all()):
-        raise ValueError("noise, model_error and spread, expected above 0")
-    return ForwardModel(**arrays, **numbers)
+    if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all()):
+        raise ValueError("noise and model_error, expected above 0")
+    return ForwardModel(**arrays)
 
 
 def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -166,10 +133,3 @@ def pooling(length: int, cells: int = GRID) -> NDArray[np.float32]:
     places = np.arange(length)
     share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
     return (share.clip(0) / (length / cells)).astype(np.float32)
-
-
-@lru_cache
-def _enlarging(length: int) -> NDArray[np.float32]:
-    """Return the matrix (length, GRID) of linear interpolation between the cells' centres."""
-    places = ((np.arange(length) + 0.5) / length * GRID - 0.5).clip(0, GRID - 1)
-    return (1 - np.abs(places[:, None] - np.arange(GRID))).clip(0).astype(np.float32)

@@ -23,7 +23,6 @@ class RuntimeOptions:
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
         every_scan: infer also where nothing has changed beyond noise since the last pattern.
         follow_drift: let the rest level follow the readings of a free pad.
-        fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the channels from contacts.
         taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
             none: its taps then follow the paper's schedule.
@@ -37,7 +36,6 @@ class RuntimeOptions:
     idle_reset_s: float = IDLE_RESET_S
     every_scan: bool = False
     follow_drift: bool = True
-    fallback: bool = True
     learn: bool = True
     taps: int | None = None
 

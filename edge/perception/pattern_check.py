@@ -1,8 +1,9 @@
 """Decision whether a pattern is to be believed, by its own readings, its earlier taps and the contacts before.
 
-Two things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
-do not), and does it explain them? Of each earlier tap: does it belong to the contact that goes on? What repeats over
-contacts speaks against the sensor, not the contact.
+Three things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
+do not), does it explain them, and is the model itself sure of it? Of each earlier tap: does it belong to the contact
+that goes on? What repeats over contacts speaks against the sensor, not the contact. The limits are one for all models,
+so that the same reading gets the same verdict as far as their patterns agree.
 """
 
 import math
@@ -14,25 +15,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
+from edge.inference.expected_error import doubt
 from edge.inference.familiarity import contact_features, pose_tap_features, tap_features
 from edge.inference.trust import Trust
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
-Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "baseline"]
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the baseline is in doubt."""
-REASONS: Final[tuple[Reason, ...]] = ("stuck", "unfamiliar", "unexplained", "sensor", "baseline")
+its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
+error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
+REASONS: Final[tuple[Reason, ...]] = (
+    *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
+)
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
     "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
     "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
+    "uncertain": "the model expects a large error (a light contact? fine detail? press harder, or elsewhere)",
+    "beyond": "a press deeper or stronger than the model was trained on (press less)",
+    "pad": "the sensor file's pad is far outside those that the model was trained on (the file? train for this pad)",
     "baseline": "the baseline is in doubt (free the pad and zero again)",
 }
 """Reasons in a user's words, each with what to look for."""
 
 LEAST_COUNTS: Final = 100.0
 """Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+MOST_MISMATCH: Final = 0.8
+"""Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
+one in 300 right ones."""
+MOST_DOUBT: Final = 0.61
+"""RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
+
+With the other limits some 2 % of simulated contacts less than 30 % off are not believed, and three in ten of those more
+than 50 % off: `python -m train.experiments trust-checks`."""
+_DOUBT_POWER: Final = 0.1
+"""Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
+_MOST_CHECKERBOARD: Final = 0.9
+"""Share of z's variation over the pad that alternates from taxel to taxel, beyond which no layer transmits it: crossed
+bars of two pitches reach 0.84 in simulation."""
+_DEEPEST: Final = 1.1
+"""Largest depth of a pattern over the declared full scale, which is the deepest press in training."""
+MOST_Z: Final = 6_500.0
+MOST_SUM: Final = 58_000.0
+"""Largest z of a taxel, and of all, in counts: but for one press in a thousand, those of the training, up to 40 N."""
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
@@ -77,7 +103,8 @@ class PatternCheck:
     def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
         self._constants = len(contract.pad_inputs)
-        self._least = LEAST_COUNTS / contract.counts_per_unit[2]
+        self._unit_counts = contract.counts_per_unit[2]
+        self._deepest = _DEEPEST * contract.output_full_scale
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
@@ -88,9 +115,14 @@ class PatternCheck:
         """Believe no further pattern: the sensor file holds the gains of another sensor."""
         self.suspected = self._wrong_file = True
 
-    def use_pad(self, pad_row: NDArray[np.float32]) -> None:
-        """Check from now on with a pad as model input; what contacts have shown so far stays."""
-        self._pad_row = pad_row
+    def use_pad(self, pad_row: NDArray[np.float32], *, outside: bool = False) -> None:
+        """Check from now on with a pad as model input; what contacts have shown so far stays.
+
+        Args:
+            pad_row: see `Contract.pad_row`.
+            outside: the pad is far outside those of the training.
+        """
+        self._pad_row, self._outside = pad_row, outside
         self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
         certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
         self._gain_error = GAIN_SPREAD * (1 - certainty)
@@ -116,6 +148,7 @@ class PatternCheck:
         tap: int,
         newest: NDArray[np.float32],
         pattern: NDArray[np.float32],
+        deviation: NDArray[np.float32] | None,
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> Verdict:
@@ -125,34 +158,37 @@ class PatternCheck:
             tap: number of the contact.
             newest: (3, rows, cols) in network units, the readings that it was made from.
             pattern: (H, W) in [mm].
-            traction: (3, h, w) in [kPa].
+            deviation: (H, W) in [mm], if the model gives one.
+            traction: (3, h, w) in [kPa], if the model gives one.
             repeats: scans for which some taxel has repeated itself while most others were new.
         """
         strength = float(newest[2].max())
-        if strength < self._least:
+        z_counts = strength * self._unit_counts
+        if z_counts < LEAST_COUNTS:
             return Verdict(checked=False, reason="stuck" if repeats >= REPEATS else None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
         self._weigh(tap, strength, score)
-        mismatch = None
+        mismatch, explained = None, True
         if traction is not None:
             mismatch = trust.forward.mismatch(self._operator, newest, pattern, traction, self._gain_error)
+            explained = mismatch <= MOST_MISMATCH and np.isfinite(traction).all()
         reason: Reason | None = None
         if repeats >= REPEATS:
             reason = "stuck"
-        elif not score <= trust.contact.limit:  # NaN fails here too, as below
+        elif self._outside:
+            reason = "pad"
+        elif not score <= trust.contact.limit or _alternates(newest[2]):  # NaN fails here too, as below
             reason = "unfamiliar"
-        elif mismatch is not None and not mismatch <= trust.forward.limit:
+        elif pattern.max() > self._deepest or z_counts > MOST_Z or newest[2].sum() * self._unit_counts > MOST_SUM:
+            reason = "beyond"
+        elif not explained:
             reason = "unexplained"
+        elif deviation is not None and not doubt(pattern, deviation)[0] <= most_doubt(z_counts):
+            reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
         return Verdict(mismatch, reason)
-
-    def smooth(
-        self, newest: NDArray[np.float32], shape: tuple[int, int]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the smooth pattern of readings (3, rows, cols) in network units, and its deviation, both (H, W)."""
-        return self._trust.forward.smooth(newest, shape)
 
     def _weigh(self, tap: int, strength: float, score: float) -> None:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
@@ -177,6 +213,18 @@ def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
     """
     found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
     return found if posed or not found else list(range(found[0], len(belonging) + 1))
+
+
+def _alternates(z: NDArray[np.float32]) -> bool:
+    """Return whether z (rows, cols) is a checkerboard that no layer transmits."""
+    change = z - z.mean()
+    along = change[::2, ::2].sum() + change[1::2, 1::2].sum() - change[::2, 1::2].sum() - change[1::2, ::2].sum()
+    return float(along) ** 2 > _MOST_CHECKERBOARD * z.size * float(np.vdot(change, change))
+
+
+def most_doubt(z_counts: float) -> float:
+    """Return the largest doubt of a pattern that is believed, by the largest z of its contact."""
+    return MOST_DOUBT * (z_counts / 1e3) ** _DOUBT_POWER
 
 
 def _share(log_odds: float) -> float:

@@ -1,6 +1,5 @@
 """Result of a scan with a pattern: which taps it is made from, whether it is believed, and what follows from it."""
 
-import math
 import sys
 from collections.abc import Sequence
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.expected_error import Expected, expect
+from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import widening
 from edge.perception.pattern_check import SAME_STRENGTH, strangers
@@ -65,15 +64,14 @@ def _which(number: int, *, alone: bool) -> str:
     return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
 
 
-def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32], *, fallback: bool) -> Result:
-    """Return the result with the verdict on its pattern; one that is not to be believed is replaced.
+def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32]) -> Result:
+    """Return the result with the verdict on its pattern.
 
     Args:
         result: with the model's pattern.
         sensor: its state.
         tap: number of the contact.
         newest: (3, rows, cols) in network units, the readings that the pattern was made from.
-        fallback: replace the pattern by the smooth one where it is not to be believed.
     """
     pattern, deviation = result.pattern, result.deviation
     if deviation is not None and result.dead:
@@ -82,16 +80,10 @@ def checked(result: Result, sensor: Sensor, tap: int, newest: NDArray[np.float32
     if sensor.check is None or pattern is None:
         return result
     suspected = sensor.check.suspected
-    verdict = sensor.check.judge(tap, newest, pattern, result.traction, sensor.watch.most_repeats)
+    verdict = sensor.check.judge(tap, newest, pattern, deviation, result.traction, sensor.watch.most_repeats)
     if sensor.check.suspected != suspected:
         sensor.report("cleared" if suspected else "suspected")
-    result = replace(result, mismatch=verdict.mismatch, trusted=verdict.trusted, untrusted_reason=verdict.reason)
-    if verdict.reason is None or not fallback:
-        return result
-    height, width = pattern.shape
-    smooth, spread = sensor.check.smooth(newest, (height, width))
-    deviation = None if deviation is None else np.maximum(deviation, spread)
-    return replace(result, pattern=smooth, deviation=deviation, estimate="smooth")
+    return replace(result, mismatch=verdict.mismatch, trusted=verdict.trusted, untrusted_reason=verdict.reason)
 
 
 class Describer:
@@ -110,10 +102,7 @@ class Describer:
         area_mm2, centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
         interval_mm = expected = None
         if deviation is not None:
-            if result.estimate == "smooth":
-                expected = Expected(math.sqrt(float(np.vdot(deviation, deviation)) / deviation.size), None)
-            else:
-                expected = expect(contract.confidence, result.taps_used, pattern, deviation)
+            expected = expect(contract.confidence, result.taps_used, pattern, deviation)
             if contract.interval_factor is not None and touching.any():
                 interval_mm = contract.interval_factor * float(deviation[touching].mean())
         wrench = wrench_origin = None

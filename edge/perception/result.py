@@ -21,14 +21,13 @@ from firmware_bridge.zeroing.drift_tracker import Drift
 MADE: Final = (
     *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
     *("expected_rmse_mm", "another_tap", "traction", "wrench", "wrench_origin"),
-    *("mismatch", "tap_mismatch", "taps_dropped", "trusted", "untrusted_reason", "estimate"),
+    *("mismatch", "tap_mismatch", "taps_dropped", "trusted", "untrusted_reason"),
 )
 """Fields of a result that are made from a pattern."""
 
 State = Literal["zeroing", "incomplete", "baseline_in_doubt", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
-Estimate = Literal["network", "smooth"]
 
 
 class NextTap(NamedTuple):
@@ -102,7 +101,6 @@ class Result:
     taps_dropped: int | None = None
     trusted: bool | None = None
     untrusted_reason: Reason | None = None
-    estimate: Estimate | None = None
     run_time_us: float | None = None
     latency_us: float | None = None
     baseline: Baseline | None = None

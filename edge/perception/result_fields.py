@@ -7,6 +7,7 @@ into the pages.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from itertools import repeat
 from operator import attrgetter
@@ -191,10 +192,9 @@ FIELDS: Final = (
           "number of the scan whose pattern this is, where nothing has changed since", out=_RECORD_NPZ, byte=40),
     Field("trusted", _YES_OR_NO, "trusted", "whether the pattern is to be believed: see [Trust](trust.md); unknown for "
           "a contact that is too light to check, and for models without checks", byte=592),
-    Field("untrusted_reason", _one_of(*REASONS, unknown=""), "untrusted_reason",
-          "why not: `stuck`, `unfamiliar`, `unexplained`, `sensor` or `baseline`", byte=596),
-    Field("estimate", _one_of("network", "smooth", unknown=""), "estimate", "who made the pattern: `smooth` is the "
-          "linear estimate that replaces one that is not to be believed", byte=600),
+    # Four bytes after it are free: an earlier release had a further word there.
+    Field("untrusted_reason", replace(_one_of(*REASONS, unknown=""), packed="i4x"), "untrusted_reason",
+          "why not: see [the reasons](trust.md#the-reasons)", byte=596),
     Field("taps_dropped", _SMALL_OR_NOT, "taps_dropped", "earlier taps that the pattern is made "
           "without, because they do not belong to this contact; unknown without earlier taps",
           out=_RECORD_NPZ, byte=604),

@@ -106,7 +106,7 @@ class Runtime:
         self._options = options
         # Plain attributes, since every scan reads them.
         self._every_scan = options.every_scan
-        self._follow_drift, self._fallback = options.follow_drift, options.fallback
+        self._follow_drift = options.follow_drift
         # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
         self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
@@ -338,13 +338,11 @@ class Runtime:
                 pattern=patterns[row].copy(),
                 deviation=None if deviations is None else deviations[row].copy(),
                 traction=None if doubted or tractions is None else tractions[row].copy(),
-                estimate="network",
                 run_time_us=run_time_us,
             )
             sensor = touch.sensor
             if not doubted:
-                judged = checked(made, sensor, touch.tap, windows[row][0], fallback=self._fallback)
-                made = self._describe(judged, sensor)
+                made = self._describe(checked(made, sensor, touch.tap, windows[row][0]), sensor)
             sensor.last = results[row] = made
             sensor.last_reading.keep(touch.window[0], touch.made_by, touch.poses)
             if doubted:

@@ -113,7 +113,7 @@ class Sensor:
         if contract.takes_gains and pad is not None and pad.gains is not None:
             self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
         if self.check is not None:
-            self.check.use_pad(self.pad_row)
+            self.check.use_pad(self.pad_row, outside=contract.is_outside(pad))
         calibrated = pad is not None and pad.counts_per_newton is not None
         self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
         takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)

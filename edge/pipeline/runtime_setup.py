@@ -52,7 +52,6 @@ def open_runtime(
     idle_reset_s: float = IDLE_RESET_S,
     every_scan: bool = False,
     follow_drift: bool = True,
-    fallback: bool = True,
     learn: bool = True,
     taps: int | None = None,
 ) -> Runtime:
@@ -72,7 +71,6 @@ def open_runtime(
         idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
         every_scan: infer also where nothing has changed since the last pattern.
         follow_drift: let the rest level follow the readings of a free pad.
-        fallback: replace a pattern that is not to be believed by the smooth one.
         learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
         taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
             none: taps then follow the paper's schedule, each turned by 5 degrees from the one before.
@@ -97,7 +95,7 @@ def open_runtime(
         measured=known.measured_pads if pad is None else None,
         options=RuntimeOptions(
             *(contact_on_counts, contact_off_counts, idle_reset_s),
-            *(every_scan, follow_drift, fallback, learn, taps),
+            *(every_scan, follow_drift, learn, taps),
         ),
         unix_time_s=source.unix_time_s,
     )

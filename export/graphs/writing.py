@@ -103,7 +103,7 @@ class Writer:
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
         if self.trust is not None and contract.pad_inputs and contract.traction_scale:
-            contract.trust.update(self.trust.of(session).to_json())
+            contract.trust.update(self.trust.of(contract).to_json())
         content = _content(model, contract, origin(stated))
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)

@@ -19,7 +19,7 @@ MEMORY_SHAPES = {
     "deviation": "[height][width]",
     "traction": "[3][traction_height][traction_width]",
 }
-PACKED = {"i": "i32", "q": "i64", "Q": "u64", "d": "f64"}
+PACKED = {"i": "i32", "i4x": "i32", "q": "i64", "Q": "u64", "d": "f64"}
 ARRAYS = {"<f4": "f32", "<i4": "i32"}
 
 

@@ -76,7 +76,7 @@ def test_each_reason_and_each_field_of_trust_is_on_its_page():
     page = (ROOT / "docs" / "trust.md").read_text()
     explained = re.findall(r"^\| `(\w+)` \|", page.split("## The reasons", 1)[1].split("##", 1)[0], re.MULTILINE)
     assert sorted(explained) == sorted(REASONS)
-    for field in ("trusted", "untrusted_reason", "estimate", "mismatch", "tap_mismatch", "taps_dropped"):
+    for field in ("trusted", "untrusted_reason", "mismatch", "tap_mismatch", "taps_dropped"):
         assert field in told("Records") and f"`{field}`" in page
 
 

@@ -1,6 +1,5 @@
 import dataclasses
 import re
-from dataclasses import replace
 from itertools import pairwise, takewhile
 
 import cli_samples
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
 from pose_samples import make_posed_contract, write_posed_model
-from trust_samples import make_forward, make_posed_trust
+from trust_samples import make_posed_trust
 
 from edge.api import load_model
 from edge.cli import main as cli
@@ -306,10 +305,13 @@ def taps_of(results):
 def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_path):
     """The whole program with a model that takes poses: each proposal of its records is where the next tap is made."""
     path = tmp_path / "posed.onnx"
-    trust = replace(make_posed_trust(100.0), forward=make_forward(1e6)).to_json()  # all is believed
+    trust = make_posed_trust(100.0).to_json()
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     write_posed_model(
-        path, make_posed_contract(interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True)
+        path,
+        make_posed_contract(
+            interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True, output_full_scale=100.0
+        ),
     )
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
     done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")

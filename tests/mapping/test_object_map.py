@@ -86,7 +86,7 @@ def test_heights_of_a_curved_part_agree_between_presses_that_do_not_share_the_hi
 
 def test_an_untrusted_pattern_is_counted_and_nothing_else():
     whole, pose = ObjectMap(), PadPose(0.0, 0.0, 20.0)
-    whole.add(result_of(letter, pose, trusted=False, estimate="smooth"), pose)
+    whole.add(result_of(letter, pose, trusted=False), pose)
     whole.finish()
     layers = whole.layers()
     assert whole.doubted == 1 and whole.fused == 0

@@ -5,7 +5,7 @@ import pytest
 from edge_samples import FakeModel
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
-from edge.perception.pattern_check import LEAST_COUNTS, REPEATS, PatternCheck, Verdict, strangers
+from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, strangers
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -24,13 +24,14 @@ def make_tap(z=2.0, x=0.0):
     return tap
 
 
-def judge(check, tap, number=0, repeats=0, factor=1.0) -> Verdict:
+def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> Verdict:
     """Return the verdict on the pattern that the fake model makes of a tap, times a factor."""
     model = FakeModel(CONTRACT)
     window = np.zeros((4, *tap.shape), dtype=np.float32)
     window[0] = tap
-    pattern = model.run(window, PAD_ROW)
-    return check.judge(number, tap, np.float32(factor) * pattern, model.traction, repeats)
+    pattern = np.float32(factor) * model.run(window, PAD_ROW)
+    deviation = np.full_like(pattern, doubt * np.sqrt(np.mean(pattern**2)))
+    return check.judge(number, tap, pattern, deviation, model.traction, repeats)
 
 
 class TestReasons:
@@ -55,7 +56,7 @@ class TestReasons:
         assert (stuck.trusted, stuck.reason) == (False, "stuck")
 
     def test_readings_of_no_contact_are_unfamiliar_whatever_the_force(self):
-        for z in (0.5, 2.0, 10.0):
+        for z in (0.5, 2.0, 3.5):
             assert judge(make_check(), make_tap(z, x=0.4)).trusted is True
             strange = judge(make_check(), make_tap(z, x=0.6))
             assert (strange.trusted, strange.reason) == (False, "unfamiliar")
@@ -63,33 +64,63 @@ class TestReasons:
     def test_a_pattern_that_does_not_explain_its_readings_is_told(self):
         wrong = judge(make_check(), make_tap(), factor=2)
         assert (wrong.trusted, wrong.reason) == (False, "unexplained")
-        assert wrong.mismatch is not None and wrong.mismatch > 0.2
+        assert wrong.mismatch is not None and wrong.mismatch > MOST_MISMATCH
+
+    @pytest.mark.parametrize(("z", "limit"), [(0.2, 0.519), (1.0, 0.61), (3.0, 0.681)])
+    def test_a_pattern_that_the_model_is_not_sure_of_is_told_the_sooner_the_lighter_it_is(self, z, limit):
+        assert judge(make_check(), make_tap(z), doubt=limit - 0.01).trusted is True
+        unsure = judge(make_check(), make_tap(z), doubt=limit + 0.01)
+        assert (unsure.trusted, unsure.reason) == (False, "uncertain")
 
     def test_without_traction_readings_are_still_checked(self):
         check, tap = make_check(), make_tap(x=1)
         pattern = np.ones((40, 40), dtype=np.float32)
-        verdict = check.judge(0, tap, pattern, None, 0)
+        verdict = check.judge(0, tap, pattern, None, None, 0)
         assert (verdict.mismatch, verdict.reason) == (None, "unfamiliar")
+
+    @pytest.mark.parametrize("low", [0.0, 0.5])
+    def test_a_checkerboard_is_of_no_contact_and_neither_a_row_nor_a_taxel_is_one(self, low):
+        tap = make_tap()
+        tap[2] = np.where(np.indices((4, 4)).sum(axis=0) % 2, 2, 2 * low)
+        assert judge(make_check(), tap).reason == "unfamiliar"
+        for place in (np.s_[1], np.s_[1, 2], np.s_[::2]):
+            tap[2] = 2 * low
+            tap[2][place] = 2
+            assert judge(make_check(), tap).trusted is True
+
+    @pytest.mark.parametrize(("z", "taxels"), [(6.6, 1), (3.7, 16)])
+    def test_a_press_stronger_than_in_training_is_told(self, z, taxels):
+        for factor, reason in ((1.0, "beyond"), (0.95, None)):
+            tap = make_tap()
+            tap[2] = 0
+            tap[2].flat[:taxels] = factor * z
+            assert judge(make_check(make_trusted_contract(output_full_scale=10.0)), tap).reason == reason
+
+    def test_a_pattern_deeper_than_in_training_is_told(self):
+        for full_scale, reason in ((1.8, "beyond"), (1.9, None)):
+            check = make_check(make_trusted_contract(output_full_scale=full_scale))
+            assert judge(check, make_tap(2.0)).reason == reason
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_what_is_not_finite_is_never_believed(self, bad):
         tap, pattern, traction = make_tap(), np.ones((40, 40), dtype=np.float32), np.zeros((3, 8, 8), dtype=np.float32)
-        for place in (tap, pattern, traction):
+        deviation = 0.1 * pattern
+        for place in (tap, pattern, deviation, traction):
             kept = place.flat[-1]
             place.flat[-1] = bad
             with np.errstate(all="ignore"):
-                assert make_check().judge(0, tap, pattern, traction, 0).trusted is not True
+                assert make_check().judge(0, tap, pattern, deviation, traction, 0).trusted is not True
             place.flat[-1] = kept
 
     def test_readings_that_are_not_finite_are_of_no_contact(self):
         tap = make_tap()
         tap[0, 0, 0] = np.nan
-        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, 0).reason == "unfamiliar"
+        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, None, 0).reason == "unfamiliar"
 
     @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
     def test_readings_of_any_size_give_a_verdict(self, scale):
         verdict = judge(make_check(), make_tap(2 * scale))
-        assert verdict.trusted in (True, None) and (verdict.trusted is None) == (scale < 0.1)
+        assert (verdict.trusted, verdict.reason) == ((None, None) if scale < 0.1 else (False, "beyond"))
         assert verdict.mismatch is None or np.isfinite(verdict.mismatch)
         wrong = judge(make_check(), make_tap(2 * scale), factor=3)
         assert wrong.trusted is (None if scale < 0.1 else False)
@@ -102,7 +133,7 @@ class TestReasons:
         certain.use_pad(np.append(PAD_ROW[:-1], np.float32(1)))
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)
-        shares = [check.judge(0, tap, pattern, traction, 0).mismatch for check in (certain, sure, unsure)]
+        shares = [check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, sure, unsure)]
         assert shares[0] > shares[1] == shares[2]
 
 

@@ -213,7 +213,7 @@ def test_interval_levels_are_kept_and_none_in_earlier_versions():
 def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
     metadata = make_contract(version=1).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 4 to 7: export the model again"):
+    with pytest.raises(ModelError, match=r"'version' is 1, expected 4 to 8: export the model again"):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 

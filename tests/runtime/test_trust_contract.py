@@ -41,19 +41,14 @@ DAMAGE = {
     "a part is missing": lambda value: value.pop("tap"),
     "a part is too many": put("more", 1),
     "no forward model": put("forward", None),
-    "a key of the forward model is missing": lambda value: value["forward"].pop("inverse"),
+    "a key of the forward model is missing": lambda value: value["forward"].pop("noise"),
     "an operator for other constants": put("forward", "operator", packed(np.ones((2 + CONSTANTS, 48, 96)))),
     "an operator of other features": put("forward", "operator", packed(np.ones((1 + CONSTANTS, 48, 95)))),
-    "an inverse of other readings": put("forward", "inverse", packed(np.ones((64, 47)))),
-    "an inverse without a shape": put("forward", "inverse", {"shape": [], "f2": "AAA="}),
-    "an endless shape": put("forward", "spread", "shape", [math.inf]),
+    "an operator without a shape": put("forward", "operator", {"shape": [], "f2": "AAA="}),
+    "an endless shape": put("forward", "noise", "shape", [math.inf]),
     "bytes cut short": put("forward", "noise", "f2", "AAAA"),
-    "no spread": put("forward", "spread", packed(np.zeros(64))),
     "noise below 0": put("forward", "noise", packed(np.array([1.0, 1.0, -1.0]))),
-    "a forward limit of 0": put("forward", "limit", 0.0),
-    "no forward limit": put("forward", "limit", None),
-    "an endless forward limit": put("forward", "limit", math.inf),
-    "unexplained is text": put("forward", "unexplained", "much"),
+    "more in the forward model": put("forward", "more", 1.0),
     "a contact limit that is no number": put("contact", "limit", math.nan),
     "a contact network without layers": put("contact", "layers", []),
     "a contact network of a tap's features": lambda value: value.update(contact=value["tap"]),
@@ -90,7 +85,7 @@ class TestContract:
     def test_a_model_file_keeps_its_checks(self, tmp_path):
         model = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract()))
         trust = model.contract.read_trust()
-        assert trust is not None and trust.forward.limit == pytest.approx(0.2)
+        assert trust is not None and trust.contact.limit == pytest.approx(5.0)
 
     @pytest.mark.parametrize("damage", DAMAGE)
     def test_damage_is_told_in_a_line_that_names_the_key(self, damage):

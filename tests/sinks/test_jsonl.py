@@ -94,7 +94,6 @@ class TestJsonLines:
             "next_tap": None,
             "trusted": None,
             "untrusted_reason": None,
-            "estimate": "network",
             "taps_dropped": None,
             "mismatch": None,
             "tap_mismatch": None,

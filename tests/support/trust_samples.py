@@ -24,30 +24,24 @@ def linear(inputs: int, weights: dict[int, float]) -> SmallNetwork:
     return SmallNetwork([(row, np.zeros(1))])
 
 
-def make_forward(limit: float = 0.2) -> ForwardModel:
+def make_forward() -> ForwardModel:
     """Return the forward model of the tiny model: z is the mean of a taxel's pixels, x and y that of its traction."""
     operator = np.zeros((1 + CONSTANTS, 48, FEATURES), dtype=np.float32)
     cells = np.kron(np.eye(16).reshape(16, 4, 4), np.ones((1, 2, 2))).reshape(16, GRID**2)
     operator[0, 32:, : GRID**2] = cells / 4
     operator[0, :32, GRID**2 :] = KPA * np.eye(32)
-    inverse = np.zeros((GRID**2, 48), dtype=np.float32)
-    inverse[:, 32:] = cells.T
     return ForwardModel(
         operator=operator,
-        inverse=inverse,
-        spread=np.full(GRID**2, 0.125, dtype=np.float32),
         noise=np.full(3, 0.03125, dtype=np.float32),
         model_error=np.full(3, 0.125, dtype=np.float32),
-        unexplained=0.0625,
-        limit=limit,
     )
 
 
-def make_trust(limit: float = 0.2) -> Trust:
+def make_trust() -> Trust:
     """Return checks: x on taxel 0 is unfamiliar, and so is an earlier tap that was less on the newest one's taxel 5."""
     contact = Check(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
     tap = Check(linear(2 * 48 + 4, {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
-    return Trust(make_forward(limit), contact, tap)
+    return Trust(make_forward(), contact, tap)
 
 
 def make_posed_trust(farthest_mm: float) -> Trust:
@@ -58,9 +52,11 @@ def make_posed_trust(farthest_mm: float) -> Trust:
     return Trust(trust.forward, trust.contact, tap)
 
 
-def make_trusted_contract(limit: float = 0.2, **changes) -> Contract:
+def make_trusted_contract(**changes) -> Contract:
     """Return the contract of the fake model with these checks."""
-    return make_pad_contract(**({"trust": make_trust(limit).to_json(), "interval_factor": 1.6} | changes))
+    return make_pad_contract(
+        **({"trust": make_trust().to_json(), "interval_factor": 1.6, "output_full_scale": 10.0} | changes)
+    )
 
 
 class WrongModel(FakeModel):

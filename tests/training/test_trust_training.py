@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from edge_samples import FakeModel, make_contract
+from edge_samples import make_contract
 from press_samples import make_press_set
 
-from edge.inference.familiarity import Check, contact_features
+from edge.inference.familiarity import contact_features
 from edge.inference.small_network import small_network
 from edge.inference.trust import trust_of
 from train import trust
@@ -20,7 +20,7 @@ from train.learning import contact_check, tap_check
 from train.learning.contact_check import drawn_readings, features_of, in_contact, limit_of, moved
 from train.learning.forward_operator import fit_forward_model
 from train.learning.small_classifier import fit_classifier
-from train.learning.trust_limits import FALSE_ALARMS, TrustFit, load_trust
+from train.learning.trust_limits import TrustFit, load_trust
 from train.learning.wrong_readings import SPOILINGS, magnet_field, spoiled
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
@@ -184,11 +184,8 @@ class TestForward:
         )
         counts = (cells.astype(np.float32) @ rng.normal(0, 200, (cells.shape[1], 48))).reshape(600, 1, 3, 4, 4)
         found = fit_forward_model(replace(many, counts=counts.astype(np.float32)))
-        assert found.unexplained < 1e-3 and found.model_error.max() < 0.05
-        assert found.operator.shape == (1 + len(INPUTS), 48, 96) and found.limit == 1
-
-    def test_what_a_linear_world_does_not_explain_is_stated(self, presses):
-        assert fit_forward_model(presses).unexplained > 0.05
+        assert found.model_error.max() < 0.05
+        assert found.operator.shape == (1 + len(INPUTS), 48, 96)
 
 
 class TestFile:
@@ -203,7 +200,7 @@ class TestFile:
 
     @pytest.mark.parametrize(
         "damage",
-        [lambda one: one.pop("tap"), lambda one: one.update(contact=[]), lambda one: one["forward"].update(limit=-1.0)],
+        [lambda one: one.pop("tap"), lambda one: one.update(contact=[]), lambda one: one["forward"].pop("noise")],
     )
     def test_a_damaged_one_is_named(self, path, presses, tmp_path, damage):
         fitted = json.loads(path.read_text())
@@ -253,18 +250,15 @@ class TestLimits:
         scores = np.array(network(np.concatenate(pairs)))
         assert len(scores) and share - 0.03 <= (scores > check.limit).mean() <= share
 
-    def test_a_models_own_mismatch_sets_its_limit(self, path, presses):
+    def test_models_share_all_but_the_checks_of_taps(self, path, presses):
         fit = TrustFit(json.loads(path.read_text()), presses)
-        contract = make_contract(
-            taps=2, pad_inputs=tuple(input_scale()), takes_gains=True, traction_scale=2, output_full_scale=0.5
+        inputs = {"pad_inputs": tuple(input_scale()), "takes_gains": True, "traction_scale": 2}
+        plain, posed = (
+            fit.of(make_contract(**inputs, **more)) for more in ({}, {"takes_poses": True, "reach_mm": 5.0})
         )
-        model = FakeModel(contract)
-        made = fit.of(model)
-        assert 0 < made.forward.limit < np.inf and isinstance(made.contact, Check)
-        assert len(model.windows) and all((window[1] == 0).all() for window in model.windows)  # one tap each
-        assert (fit._mismatches(model, made) > made.forward.limit).mean() <= FALSE_ALARMS / 2
-        twice = trust_of(json.loads(json.dumps(made.to_json())), len(INPUTS))
-        assert twice is not None and twice.forward.limit == made.forward.limit
+        assert plain.forward.to_json() == posed.forward.to_json() and plain.contact.to_json() == posed.contact.to_json()
+        assert plain.tap.network.inputs != posed.tap.network.inputs
+        assert trust_of(json.loads(json.dumps(plain.to_json())), len(INPUTS)) is not None
 
     def test_limits_are_set_by_contacts_alone(self):
         counts = np.zeros((4, 3, 4, 4), dtype=np.float32)

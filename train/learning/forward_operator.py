@@ -7,24 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.familiarity import QUIET_UNITS
-from edge.inference.forward_model import GRID, ForwardModel, condensed, features, forward_model
+from edge.inference.forward_model import ForwardModel, condensed, features, forward_model
 from firmware_bridge.pad_geometry import AXES
 from train.data.batches import COUNTS_PER_UNIT
-from train.data.press_batches import read_presses
 from train.data.presses import PressSet
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
 _RIDGE: Final = 1e-6
-_NO_LIMIT: Final = 1.0
-"""Limit until a model's own patterns set it, at export."""
 _UNIT: Final = np.array(COUNTS_PER_UNIT)
 
 
-def fit_forward_model(presses: PressSet, seed: int = 0) -> ForwardModel:
-    """Fit operator and inverse to the newest press of each sequence by least squares, errors relative to amplitude.
+def fit_forward_model(presses: PressSet) -> ForwardModel:
+    """Fit the operator to the newest press of each sequence, read without nuisances, by least squares.
 
-    The operator is fitted to readings without nuisances, the inverse to those of sensors of which nothing is known.
+    Errors are relative to the amplitude.
     """
     clean = _units(presses.counts[:, 0])
     size = _amplitude(clean)[:, None]
@@ -34,20 +31,10 @@ def fit_forward_model(presses: PressSet, seed: int = 0) -> ForwardModel:
     weights = _least_squares(columns, clean / size)
     operator = weights.reshape(1 + len(INPUTS), inputs.shape[1], -1).transpose(0, 2, 1)
     left = (clean / size - columns @ weights).reshape(len(presses), len(AXES), -1)
-    unknown = clean / size - inputs @ operator[0].T
-    read = _units(read_presses(presses.with_taps(1), Nuisances(), seed)[:, 0])
-    read_size = _amplitude(read)[:, None]
-    cells = inputs[:, : GRID**2] * size
-    inverse = _least_squares(read / read_size, cells / read_size)
-    spread = np.sqrt(np.mean(np.square(cells / read_size - read / read_size @ inverse), axis=0))
     found = ForwardModel(
         operator=operator.astype(np.float32),
-        inverse=inverse.T.astype(np.float32),
-        spread=spread.astype(np.float32),
         noise=_noise().astype(np.float32),
         model_error=np.sqrt(np.mean(left**2, axis=(0, 2))).astype(np.float32),
-        unexplained=float(np.sum(unknown**2) / np.sum((clean / size) ** 2)),
-        limit=_NO_LIMIT,
     )
     return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
 

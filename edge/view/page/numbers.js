@@ -71,7 +71,7 @@ function numberTexts(sensor) {
     interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
     expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
     gains_certainty: known(result.gains_certainty) ? `${number(100 * result.gains_certainty, 0)}${THIN}% certain` : "not known",
-    reused_from: sensor.live() ? `${known(made.reused_from) ? "unchanged" : "new"}${made.estimate === "smooth" ? ", smooth" : ""}` : "\u2013",
+    reused_from: sensor.live() ? (known(made.reused_from) ? "unchanged" : "new") : "\u2013",
     rate_hz: amount(result.rate_hz, 1, "Hz"),
     run_time_us: amount(made.run_time_us, 0, "\u00b5s"),
     latency_us: amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms"),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bench.timing import timed
+from edge.inference.expected_error import doubt
 from edge.inference.familiarity import contact_features
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import PatternCheck
@@ -78,15 +79,15 @@ def _checks(model: ModelSession, windows: NDArray[np.floating]) -> dict[str, Cal
     check.use_pad(pad)
     operator = trust.forward.of_pad(pad[: len(contract.pad_inputs)])
     units = [contract.scale_window(window[: contract.taps].astype(np.float32)) for window in windows]
-    made: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
+    made: list[tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]] = []
     for window in units:
         pattern = model.run(window, pad).copy()
-        made.append((window[0], pattern, np.array(model.traction)))
+        made.append((window[0], pattern, np.array(model.deviation), np.array(model.traction)))
     runs: dict[str, Callable[[int], object]] = {
         "familiar": lambda at: trust.contact.network(contact_features(made[at][0], pad)),
-        "mismatch": lambda at: trust.forward.mismatch(operator, *made[at], 0.075),
-        "both, and the evidence": lambda at: check.judge(at, *made[at], 0),
-        "smooth": lambda at: check.smooth(made[at][0], made[at][1].shape),
+        "mismatch": lambda at: trust.forward.mismatch(operator, made[at][0], made[at][1], made[at][3], 0.075),
+        "doubt": lambda at: doubt(made[at][1], made[at][2]),
+        "all, and the evidence": lambda at: check.judge(at, *made[at], 0),
     }
     if contract.taps > 1:
         runs["earlier taps"] = lambda at: check.belonging(units[at], contract.taps)

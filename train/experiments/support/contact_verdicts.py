@@ -19,7 +19,7 @@ AFTER: Final = (1, 3, 5, 10)
 """Contacts after which the running evidence is looked at."""
 CONTACTS: Final = max(AFTER) + 1
 """Contacts of each sensor; the evidence of one is weighed when the next begins."""
-_OWN: Final = ("stuck", "unfamiliar", "unexplained")
+_OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
 """Reasons that a scan gives by itself."""
 
 
@@ -82,18 +82,6 @@ def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
     pads = sensors.presses.pad
     mine = [np.flatnonzero(firm & (pads == pad)) for pad in np.unique(pads)]
     return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
-
-
-def ever_suspected(model: Model, sensors: Sequence[NDArray[np.floating]], count: int) -> NDArray[np.bool_]:
-    """Return whether each sensor is suspected at any time of `count` contacts, drawn from its own."""
-    found: list[bool] = []
-    for number, contacts in enumerate(sensors):
-        sensor = PushedSensor(model, seed=number)
-        found.append(False)
-        for at in np.random.default_rng([number, 13]).integers(len(contacts), size=count):
-            sensor.touch(contacts[at])
-            found[-1] |= sensor.suspected
-    return np.array(found)
 
 
 def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Verdicts:

@@ -26,7 +26,7 @@ _DROPPED: Final = (
 _PSNR: Final = (
     "PSNR in dB of the same windows, by the model of one tap, and by that of four without and with the guard. "
     f"Wanted: with the guard, never more than {MOST_LOSS_DB:g} dB below one tap. Intervals are by sensor; guard and "
-    "fallback are as shipped, and every tap is used."
+    "options are as shipped, and every tap is used."
 )
 
 Table = tuple[Sequence[Row], str, str]
