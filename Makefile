@@ -49,7 +49,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
 	$(BIN)/edge-sr bench --threads 1 --out reports
 	$(BIN)/edge-sr bench --system --out reports/system
-	$(REPORT) tests/system/cycles.py --out reports/cycles.md
+	$(REPORT) tests/support/wire_faults.py --out reports/wire-faults.md
 	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
 	$(BIN)/python tests/system/hand_soak.py 60 --out reports
 	$(BIN)/python tests/system/zenoh_load.py --out reports

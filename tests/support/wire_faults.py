@@ -1,9 +1,10 @@
 """Lines of an adapter that loses frames or bytes, or whose clock is bad, and what became of their scans. Pure.
 
-    python tests/support/wire_faults.py [--scans 20000] [--seed 1] [WORD ...]
+    python tests/support/wire_faults.py [--scans 20000] [--seed 1] [--out FILE] [WORD ...]
 
 plays every case, or those whose names hold all the words, and prints a line for each: scans, whole and torn ones, whole
 ones of two cycles, and whole cycles without a whole scan where nothing was lost. The exit code is 1 if a scan is mixed.
+With --out it writes them as a report.
 """
 
 import argparse
@@ -12,8 +13,10 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Final, NamedTuple
 
+from edge.bench.provenance import provenance
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -40,6 +43,13 @@ STAMPS: Final[dict[str, Callable[[float, random.Random], float]]] = {
 }
 READERS: Final = ("each ms", "whole scans", "each 16 ms")
 FAULTS: Final = ("nothing", "frames", "bytes")
+_ABOUT: Final = """\
+Every reading is the number of its cycle, so a scan of two is seen at once. `frames`: 16, 32 or 48 in a row are lost, or
+a multiple of that; `bytes`: up to 60 ms of them, within lines too, as of a full terminal. `missed`: whole cycles that
+gave no whole scan; `late`: records that call a new reading old; `lag`: the longest time from bus to `device_time_ns`.
+
+| time stamps | lost | read | sensors | cycles | whole scans | of them mixed | torn | missed | late | lag ms |
+|---|---|---|---|---|---|---|---|---|---|---|"""
 
 
 class Case(NamedTuple):
@@ -192,14 +202,32 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="report to write")
     parser.add_argument("words", nargs="*", metavar="WORD")
     asked = parser.parse_args()
+    rows: list[str] = []
     mixed = 0
     for case in cases():
         if all(word in str(case) for word in asked.words):
             found = play(case, asked.scans // case.sensors, asked.seed)
             mixed += found.mixed
             print(f"{case}: {found}", flush=True)
+            clock = case.stamps or "no stamps"
+            of = f"{case.sensors} at {case.rate_hz:g} Hz"
+            counts = (
+                found.cycles,
+                found.whole,
+                found.mixed,
+                found.torn,
+                found.missed,
+                found.late,
+                f"{found.lag_ms:.0f}",
+            )
+            rows.append("| " + " | ".join(map(str, (clock, case.lost, case.reader, of, *counts))) + " |")
+    if asked.out is not None:
+        command = " ".join(["python tests/support/wire_faults.py", *sys.argv[1:]])
+        head = str(provenance(command, [__file__, "firmware_bridge/scans"], seed=asked.seed))
+        asked.out.write_text("\n".join(["# Scans of a faulty wire", "", head, "", _ABOUT, *rows]) + "\n")
     return int(mixed > 0)
 
 
