@@ -330,7 +330,7 @@ def _recording(folder: Path, play: Play, number: int, name: str) -> Path:
     turn = 2 * np.pi * np.arange(_SCANS) / 100 * play.moving
     row, col = (1.5 + np.array([np.sin(turn), np.cos(turn)]))[:, :, None, None]
     rows, cols = np.indices((4, 4))
-    press = np.rint(PRESS_COUNTS * np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 2)).astype(int)
+    press = np.rint(PRESS_COUNTS * np.exp(-2 * ((rows - row) ** 2 + (cols - col) ** 2))).astype(int)  # local: no drift
     press[: _SCANS - (play.pressed if number in play.touching else 0)] = 0
     counts[:, 2] += press
     path = folder / f"played{number}.npz"

@@ -11,7 +11,7 @@ from dataset_samples import make_sequences
 from press_samples import make_press_set
 
 from edge.inference.bundled import INT8_SUFFIX
-from edge.inference.contract import ANY_BATCH
+from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
 from export.graphs.intervals import IntervalData
@@ -83,7 +83,9 @@ def windows_and_poses(count=3):
 @pytest.mark.parametrize("name", ["fused", "fused" + INT8_SUFFIX])
 def test_the_contract_states_poses_and_reach(folder, name):
     contract = ModelSession(folder / f"{name}.onnx").contract
-    assert (contract.version, contract.taps, contract.takes_poses, contract.reach_mm) == (7, TAPS, True, REACH_MM)
+    assert (contract.version, contract.taps, contract.takes_poses, contract.reach_mm) == (
+        *(CONTRACT_VERSION, TAPS, True, REACH_MM),
+    )
     assert contract.window_shape == (ANY_BATCH, "taps", 3, 4, 4)
     assert set(contract.test_error) == {"1", "2", "3", "4"}, "with one to four taps of the paper's schedule"
 

@@ -27,6 +27,7 @@ from browser_samples import (
     pressed,
     shares,
     word,
+    zeroed,
 )
 from edge_samples import make_pad_contract
 from view_samples import Press, live_page, wait_for
@@ -37,6 +38,7 @@ from edge.view.static_page import page_script
 from firmware_bridge.recording.formats import load_recording
 
 __all__ = ["browser", "demo", "folder", "open_page"]
+FREE_SCANS, HELD_SCANS = 30, 60_000
 RECONNECTS = 200
 FIRST_RECONNECTS = 30
 """Reconnects after which all that is made once exists."""
@@ -56,9 +58,12 @@ WATCH_SOCKETS = """
 
 @pytest.fixture(scope="module")
 def held(demo, folder):
-    """A run whose pad is pressed onto the demo's figure all the time, and its pattern."""
+    """A run whose pad is pressed onto the demo's figure all the time, once it was seen free, and its pattern."""
     counts, pattern = pressed(demo)
-    with emulated(folder, counts + noise(200), options=["--view-record-dir", folder]) as run:
+    free = np.broadcast_to(zeroed(demo, "4").counts.round(), (FREE_SCANS, 3, 4, 4))
+    with emulated(
+        folder, np.concatenate([free, counts + noise(HELD_SCANS)]), options=["--view-record-dir", folder]
+    ) as run:
         run.pattern, run.folder = pattern, folder
         yield run
 
