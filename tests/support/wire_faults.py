@@ -11,6 +11,7 @@ import argparse
 import random
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -205,25 +206,17 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="report to write")
     parser.add_argument("words", nargs="*", metavar="WORD")
     asked = parser.parse_args()
-    rows: list[str] = []
-    mixed = 0
-    for case in cases():
-        if all(word in str(case) for word in asked.words):
-            found = play(case, asked.scans // case.sensors, asked.seed)
+    chosen = [case for case in cases() if all(word in str(case) for word in asked.words)]
+    rows, mixed = list[str](), 0
+    with ProcessPoolExecutor() as pool:
+        played = [pool.submit(play, case, asked.scans // case.sensors, asked.seed) for case in chosen]
+        for case, found in zip(chosen, (one.result() for one in played), strict=True):
             mixed += found.mixed
             print(f"{case}: {found}", flush=True)
-            clock = case.stamps or "no stamps"
             of = f"{case.sensors} at {case.rate_hz:g} Hz"
-            counts = (
-                found.cycles,
-                found.whole,
-                found.mixed,
-                found.torn,
-                found.missed,
-                found.late,
-                f"{found.lag_ms:.0f}",
-            )
-            rows.append("| " + " | ".join(map(str, (clock, case.lost, case.reader, of, *counts))) + " |")
+            counts = (found.cycles, found.whole, found.mixed, found.torn, found.missed, found.late)
+            cells = (case.stamps or "none", case.lost, case.reader, of, *counts, f"{found.lag_ms:.0f}")
+            rows.append(f"| {' | '.join(map(str, cells))} |")
     if asked.out is not None:
         command = " ".join(["python tests/support/wire_faults.py", *sys.argv[1:]])
         head = str(provenance(command, [__file__, "firmware_bridge/scans"], seed=asked.seed))
