@@ -93,8 +93,8 @@ _METHOD: Final = (
     "a sensor unless a row states it. How far a pattern is off is its RMS error over the RMS of the truth. Contacts "
     "less than 30 % off that are not believed are false alarms, wanted at most 2 %; wanted of those more than 50 % off "
     "are 30 % not believed, of those more than 100 % off 80 %. On half of the families, starred, and on pads of their "
-    "own a limit of {limit:.2f} of the expected error gives 2 % for `{model}`; shipped is {shipped}, chosen on all families "
-    "of a third set. Nothing was chosen by the contacts of these tables."
+    "own a limit of {limit:.2f} of the expected error gives 2 % for `{model}`; shipped is {shipped}, chosen on all "
+    "families of a third set. Nothing was chosen by the contacts of these tables."
 )
 _FAMILIES: Final = (
     "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
