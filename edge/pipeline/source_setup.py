@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edge.errors import UsageError
 from edge.inference.bundled import demo_recording
-from firmware_bridge.errors import SensorFileError
+from firmware_bridge.errors import SensorFileError, harmless
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP, open_sources
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
@@ -107,3 +107,17 @@ def references(baselines: Mapping[str, Baseline] | str | Path | None, known: Sen
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, known.orders)
     return known.baselines if baselines is None else baselines
+
+
+def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:
+    """Return a single baseline under the name of the single CSV that is played, which states no sensor.
+
+    Args:
+        baselines: of free pads, by sensor.
+        played: name of the source, such as "replay:left.csv".
+    """
+    file = played.removeprefix("replay:")
+    if len(baselines) != 1 or file == played or "," in file or not file.lower().endswith(".csv"):
+        return baselines
+    sensor = harmless(Path(file).stem, kept="")  # as the reader of the file names it
+    return {sensor: replace(one, sensor=sensor) for one in baselines.values()}

@@ -150,7 +150,7 @@ def world(emulated, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     shutil.copy(demo_recording(), "press.npz")
-    for name in ("left", "right"):
+    for name in ("left", "right", "released", "held"):
         write_recording(tmp_path / f"{name}.csv", healthy_counts(150))
     save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
     save_sensor_file("sensor.toml", SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))

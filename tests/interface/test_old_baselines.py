@@ -63,7 +63,7 @@ def test_a_free_pad_with_the_baseline_of_hours_before_is_never_a_contact(folder)
 def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
     held = write_csv(folder / "monday" / "a held left.csv", *moving(150))
     held = held.rename(folder / "monday" / "left.csv")
-    released = write_csv(folder / "tuesday" / "left.csv", *moving(90), (90, DRIFT))
+    released = write_csv(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
     shown, stderr = played(folder, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
     first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
