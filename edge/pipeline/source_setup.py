@@ -120,4 +120,5 @@ def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str
     if len(baselines) != 1 or file == played or "," in file or not file.lower().endswith(".csv"):
         return baselines
     sensor = harmless(Path(file).stem, kept="")  # as the reader of the file names it
-    return {sensor: replace(one, sensor=sensor) for one in baselines.values()}
+    (baseline,) = baselines.values()
+    return {sensor: replace(baseline, sensor=sensor)}

@@ -71,8 +71,8 @@ def test_the_loop_counts_late_patterns_and_tells_every_latency():
     assert [result.latency_us for result in sink.results] == [1000 * done_ms[n] for n in range(10)]
     assert [counters["late"] for counters in sink.counters] == [0] * 7 + [1, 2, 3]
     noted = "this pattern was ready 0.29 s after its newest reading arrived"
-    assert [result.note for result in sink.results] == [None] * 9 + [noted]
-    assert [note.kind for note in sink.results[9].notes] == ["late"]
+    assert ["late" in [note.kind for note in result.notes] for result in sink.results] == [False] * 9 + [True]
+    assert noted in (sink.results[9].note or "")
     assert statistics.late == 3 and statistics.latency_us.count == 10 and statistics.dropped == 0
 
 

@@ -35,6 +35,7 @@ playwright = import_module("playwright.sync_api")
 TIMEOUT_MS = 60_000
 PERIOD_NS = 10_000_000
 TOKEN = "of-twelve-letters"
+FREE_SCANS, HELD_SCANS = 30, 60_000
 NOISE_COUNTS = 3
 """Noise of a pad that is pressed and held, since a taxel that repeats itself is taken for a stuck one."""
 
@@ -181,6 +182,12 @@ def pressed(demo):
     model = load_model("stsr-int8")
     window = (counts - zeroed(demo, "4").counts)[None].astype(np.float32)
     return counts, model.run(model.contract.scale_window(window)).copy()
+
+
+def then_held(demo, counts):
+    """Return a free pad, since a contact from the first scan is in doubt, and then counts that are held for 600 s."""
+    free = np.broadcast_to(zeroed(demo, "4").counts.round(), (FREE_SCANS, 3, 4, 4))
+    return np.concatenate([free, counts + noise(HELD_SCANS)])
 
 
 # What a person sees of a page.

@@ -19,15 +19,14 @@ from browser_samples import (
     likeness,
     live,
     logged,
-    noise,
     number,
     open_page,
     part,
     playwright,
     pressed,
     shares,
+    then_held,
     word,
-    zeroed,
 )
 from edge_samples import make_pad_contract
 from view_samples import Press, live_page, wait_for
@@ -38,7 +37,6 @@ from edge.view.static_page import page_script
 from firmware_bridge.recording.formats import load_recording
 
 __all__ = ["browser", "demo", "folder", "open_page"]
-FREE_SCANS, HELD_SCANS = 30, 60_000
 RECONNECTS = 200
 FIRST_RECONNECTS = 30
 """Reconnects after which all that is made once exists."""
@@ -60,10 +58,7 @@ WATCH_SOCKETS = """
 def held(demo, folder):
     """A run whose pad is pressed onto the demo's figure all the time, once it was seen free, and its pattern."""
     counts, pattern = pressed(demo)
-    free = np.broadcast_to(zeroed(demo, "4").counts.round(), (FREE_SCANS, 3, 4, 4))
-    with emulated(
-        folder, np.concatenate([free, counts + noise(HELD_SCANS)]), options=["--view-record-dir", folder]
-    ) as run:
+    with emulated(folder, then_held(demo, counts), options=["--view-record-dir", folder]) as run:
         run.pattern, run.folder = pattern, folder
         yield run
 

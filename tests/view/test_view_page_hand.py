@@ -1,7 +1,7 @@
 """A hand on the live page: a grid of pads, of which one at a time is opened."""
 
 import numpy as np
-from browser_samples import browser, demo, emulated, folder, live, noise, open_page, playwright, pressed
+from browser_samples import browser, demo, emulated, folder, live, noise, open_page, playwright, pressed, then_held
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
@@ -24,7 +24,7 @@ def opened(page):
 def test_four_pads_are_small_fields_with_their_states_and_one_is_opened_at_a_time(demo, folder, open_page):
     rest = demo["counts"][:1] + noise(200, seed=2)
     quiet = np.concatenate([rest[:150], np.full_like(rest[:1], -1).repeat(400, axis=0)])
-    with emulated(folder, pressed(demo)[0] + noise(200), rest, rest, quiet) as run:
+    with emulated(folder, then_held(demo, pressed(demo)[0]), rest, rest, quiet) as run:
         page = open_page(run.url)
         playwright.expect(pad(page, "4")).to_have_attribute("data-state", "contact")
         playwright.expect(page.locator("#hand .pad")).to_have_count(4)

@@ -18,6 +18,7 @@ from browser_samples import (
     playwright,
     pressed,
     resize,
+    then_held,
     word,
 )
 
@@ -50,7 +51,7 @@ def test_zero_by_button_and_by_key_with_a_token_that_is_not_left_in_the_address(
 
 
 def test_zero_in_contact_is_refused_and_forced_by_another_button_alone(demo, folder, open_page):
-    with emulated(folder, pressed(demo)[0] + noise(200)) as run:
+    with emulated(folder, then_held(demo, pressed(demo)[0])) as run:
         page = open_page(run.url)
         live(page)
         stored = number(page, "baseline").inner_text()
@@ -74,7 +75,7 @@ def test_zero_in_contact_is_refused_and_forced_by_another_button_alone(demo, fol
 
 
 def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
-    with emulated(folder, pressed(demo)[0] + noise(200), demo["counts"][:1] + noise(200, seed=2)) as run:
+    with emulated(folder, then_held(demo, pressed(demo)[0]), demo["counts"][:1] + noise(200, seed=2)) as run:
         page, other = open_page(run.url), open_page(run.url)
         sent = sent_by(page)
         page.reload()
@@ -107,9 +108,9 @@ def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
 
 def test_two_sensors_a_dead_taxel_and_a_cable_that_is_out(demo, folder, open_page):
     counts = pressed(demo)[0]
-    broken = counts + noise(200, seed=2)
+    broken = then_held(demo, counts)
     broken[:, :, 1, 2] = 65_535
-    with emulated(folder, counts + noise(200), broken) as run:
+    with emulated(folder, then_held(demo, counts), broken) as run:
         page = open_page(run.url)
         live(page)
         live(page, "6")
