@@ -10,7 +10,7 @@ PAGES = (
     ROOT / "README.md",
     *sorted(page for page in (ROOT / "docs").glob("*.md") if page.stem not in ("decisions", "changelog")),
 )
-"""Pages whose commands must work; decisions.md holds commands as they were."""
+"""Pages whose commands must work; the others name commands and options as they were."""
 LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c", "nginx"}
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
