@@ -25,8 +25,9 @@ late is no evidence of a slow clock."""
 LONGEST_STEP_NS: Final = 20_000_000
 MOST_BACK: Final = 8
 """Steps back by over half of BACK_NS in that time from which stamps are no clock."""
-MOST_FAST: Final = 3
-"""Such times in a row in which stamps advance twice as far as arrivals; a backlog makes it so once."""
+MOST_OFF: Final = 3
+"""Such times in a row in which stamps advance twice as far as arrivals, or half as far while reads were late: a backlog
+makes it so once, and so does a machine that stood still."""
 SLOW_NS: Final = 10_000_000_000
 """Time without a difference as small as the smallest, in [ns], after which the clock is slower than it may be."""
 
@@ -71,7 +72,8 @@ class DeviceClock:
         self._arrival_ns = 0
         self._smallest_ns = self._later_ns = 0
         self._heard_ns = self._heard_whole_ns = self._told_ns = 0
-        self._back = self._fast = 0
+        self._back = self._fast = self._slow = 0
+        self._read_late = False
 
     def begin_anew(self) -> None:
         """Forget the offset after the link was opened again: the device may have counted from another origin since."""
@@ -125,14 +127,16 @@ class DeviceClock:
         self._heard_ns += heard_ns
         self._heard_whole_ns += since_ns
         self._told_ns += step_ns if step_ns > -BACK_NS else since_ns  # one set back tells nothing of its rate
+        self._read_late |= since_ns > LONGEST_STEP_NS
         self.follow_order(step_ns)
-        slow = False
         if self._heard_ns >= JUDGED_NS:
             slow = 2 * self._told_ns < self._heard_ns
             fast = self._told_ns > 2 * self._heard_whole_ns + LONGEST_STEP_NS
             self._fast = self._fast + 1 if fast else 0
+            self._slow = 0 if not slow else self._slow + 1 if self._read_late else MOST_OFF
             self._heard_ns = self._heard_whole_ns = self._told_ns = self._back = 0
-        self.dropped |= slow or self._fast >= MOST_FAST or self._later_ns > SLOW_NS
+            self._read_late = False
+        self.dropped |= max(self._slow, self._fast) >= MOST_OFF or self._later_ns > SLOW_NS
 
     def follow_order(self, step_ns: int) -> None:
         """Take note of a step between the stamps of two frames, in [ns]: on the bus one came after the other."""
