@@ -25,8 +25,11 @@ late is no evidence of a slow clock."""
 LONGEST_STEP_NS: Final = 20_000_000
 MOST_BACK: Final = 8
 """Steps back by over half of BACK_NS in that time from which stamps are no clock."""
+SLOWEST: Final = 6
+"""Factor by which stamps that are a clock are slower than arrivals at most: a serial line of 115,200 baud is 4 times
+slower than its bus, and stamps in units of 10 ms are 10 times too slow."""
 MOST_OFF: Final = 3
-"""Such times in a row in which stamps advance twice as far as arrivals, or half as far while reads were late: a backlog
+"""Such times in a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog
 makes it so once, and so does a machine that stood still."""
 SLOW_NS: Final = 10_000_000_000
 """Time without a difference as small as the smallest, in [ns], after which the clock is slower than it may be."""
@@ -130,7 +133,7 @@ class DeviceClock:
         self._read_late |= since_ns > LONGEST_STEP_NS
         self.follow_order(step_ns)
         if self._heard_ns >= JUDGED_NS:
-            slow = 2 * self._told_ns < self._heard_ns
+            slow = SLOWEST * self._told_ns < self._heard_ns
             fast = self._told_ns > 2 * self._heard_whole_ns + LONGEST_STEP_NS
             self._fast = self._fast + 1 if fast else 0
             self._slow = 0 if not slow else self._slow + 1 if self._read_late else MOST_OFF

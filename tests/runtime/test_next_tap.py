@@ -1,7 +1,6 @@
 """Where to touch next: half a pitch from the taps so far, and each proposal is made once."""
 
 import json
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, make_scan
 from pose_samples import PosedModel, make_posed_contract
-from trust_samples import make_forward, make_posed_trust
 
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.next_tap import TapAdvice, next_shift_mm
@@ -125,11 +123,8 @@ def test_nothing_is_proposed_without_what_it_needs(changes):
 class TestRuntime:
     PRESS = 3000
 
-    def make(self, tmp_path, **changes):
-        pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
-        trust = replace(make_posed_trust(100.0), forward=make_forward(1e6)).to_json()  # all is believed
-        settings = {"pad_inputs": pad_inputs, "takes_gains": True, "traction_scale": 2, "trust": trust}
-        contract = make_posed_contract(**settings | {"interval_factor": 1.6} | changes)
+    def make(self):
+        contract = make_posed_contract(interval_factor=1.6)
         self.number = 0
         self.runtime = Runtime(
             PosedModel(contract),
@@ -151,7 +146,7 @@ class TestRuntime:
         return pressed, self.push()
 
     def test_a_robot_that_follows_the_proposals_touches_no_place_twice(self, tmp_path):
-        self.make(tmp_path)
+        self.make()
         pose, places = PadPose(5, -3, 30), set()
         for _ in range(4):
             pressed, released = self.tap(pose)
@@ -164,7 +159,7 @@ class TestRuntime:
         assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
 
     def test_it_stays_until_the_next_tap_or_until_the_taps_are_forgotten(self, tmp_path):
-        self.make(tmp_path)
+        self.make()
         _, released = self.tap(PadPose(0, 0))
         assert self.push().next_tap is released.next_tap is not None
         assert self.push(self.PRESS).next_tap is None
@@ -174,7 +169,7 @@ class TestRuntime:
         assert later[-1].next_tap is None
 
     def test_a_reset_within_a_tap_leaves_nothing_of_the_object_before(self, tmp_path):
-        self.make(tmp_path)
+        self.make()
         self.tap(PadPose(0, 0))
         self.runtime.pose(PadPose(1, 0), (self.number + 1) * PERIOD_NS - 1000, holds=True)
         self.push(self.PRESS)
@@ -188,11 +183,11 @@ class TestRuntime:
         assert proposed.target == expected.target
 
     def test_without_poses_nothing_is_proposed(self, tmp_path):
-        self.make(tmp_path)
+        self.make()
         assert self.tap()[1].next_tap is None
 
     def test_every_output_holds_it(self, tmp_path):
-        self.make(tmp_path)
+        self.make()
         pressed, released = self.tap(PadPose(5, -3, 90))
         proposed = released.next_tap
         assert proposed is not None

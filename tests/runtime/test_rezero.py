@@ -87,7 +87,7 @@ def test_motion_puts_it_off_and_a_touch_meanwhile_starts_it_over():
     assert events(sway) == [] and sway[-1].note.startswith("zeroing started over: taxel (")
     bench.play(90)
     touched = bench.play(3, LOCAL)
-    assert touched[-1].note == "zeroing started over: the pad is in contact: free it"
+    assert touched[-1].note.startswith("zeroing started over: the pad is in contact: free it")
     results = bench.play(110)
     assert [result.event is not None for result in results].index(True) == 100  # the first scan free ends the tap
 

@@ -49,6 +49,12 @@ def test_silence_is_told_and_measured_from_the_last_scan():
 
         name, kind, taken = "fake", "device", 0
 
+        def lend(self):
+            """Has no other stream."""
+
+        def counters(self):
+            return {}
+
         def take(self, timeout_s):
             self.taken += 1
             return [make_scan(self.taken, noise=3)] if self.taken <= 30 else []
@@ -71,6 +77,12 @@ def test_silence_is_told_and_measured_from_the_last_scan():
 def test_a_sensor_that_gives_no_whole_scan_is_told_though_scans_come(heard, skip):
     class Script:
         name, kind, taken = "fake", "device", 0
+
+        def lend(self):
+            """Has no other stream."""
+
+        def counters(self):
+            return {}
 
         def take(self, timeout_s):
             self.taken += 1
