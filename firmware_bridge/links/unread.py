@@ -21,6 +21,7 @@ class Unread:
 
     def __init__(self) -> None:
         self.empty_ns: int | None = None
+        self._stall_ns = 0, 0
 
     def found(self, begun_ns: int, ended_ns: int) -> None:
         """Note that data came during a read from `begun_ns` to `ended_ns`, in [ns] of monotonic time."""
@@ -38,9 +39,15 @@ class Unread:
             clock_begun_ns: `begun_ns` of the `DeviceClock`. A clock that was set by data that may have waited has no
                 reliable times, so they are left out.
         """
-        unread_ns = 0 if self.empty_ns is None else time_ns - self.empty_ns
-        if unread_ns <= LONG_UNREAD_NS:
-            return list(scans)
-        if clock_begun_ns is not None and self.empty_ns is not None and clock_begun_ns >= self.empty_ns:
-            return [replace(scan, unread_ns=unread_ns, device_ns=None) for scan in scans]
-        return [replace(scan, unread_ns=unread_ns) for scan in scans]
+        if self.empty_ns is not None and time_ns - self.empty_ns > LONG_UNREAD_NS:
+            self._stall_ns = self.empty_ns, time_ns
+        begun_ns, ended_ns = self._stall_ns
+        marked: list[Scan] = []
+        for scan in scans:  # one that was read then may come only now
+            if begun_ns + LONG_UNREAD_NS < scan.time_ns <= ended_ns:
+                no_clock = clock_begun_ns is not None and clock_begun_ns >= begun_ns
+                device_ns = None if no_clock else scan.device_ns
+                marked.append(replace(scan, unread_ns=scan.time_ns - begun_ns, device_ns=device_ns))
+            else:
+                marked.append(scan)
+        return marked

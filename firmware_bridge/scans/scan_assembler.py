@@ -238,12 +238,13 @@ class _Sensor:
         else:  # by the device's times, a late read splits no scan
             gap_ns = device.own_ns - self._device.own_ns
         paused = gap_ns > wire.pause_ns
-        if wire.gaps_ns is not None:
+        # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
+        if wire.gaps_ns is not None and (device is not None or not wire.order):
             wire.follow_gap(gap_ns)
         closed: list[Scan] = []
         place = wire.places[taxel]
         if (paused or place != self._place + 1) and self._taxels:
-            paced = device is None and wire.period_ns is not None and gap_ns <= LONGEST_PAUSE_NS
+            paced = device is None and wire.has_pace and gap_ns <= LONGEST_PAUSE_NS
             if not wire.goes_on(self._place, place, came=taxel in self._taxels, paused=paused, paced=paced):
                 closed = self._close(by_pause=paused)
                 place = wire.places[taxel]

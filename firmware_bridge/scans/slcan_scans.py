@@ -52,7 +52,9 @@ class SlcanScans:
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
         scans: list[Scan] = []
-        head_ns = self._fed_ns if self.decoder.pending_bytes else time_ns
+        pending = self.decoder.pending_bytes
+        in_two = pending and pending + data.find(b"\r") + 1 == self.decoder.usual_line_bytes
+        head_ns = self._fed_ns if in_two else time_ns
         self._fed_ns = time_ns
         for piece in self.decoder.cut(data):
             if head_ns < time_ns:

@@ -28,7 +28,7 @@ SHORTEST_PAUSE_NS: Final = 1_500_000
 MOST_INTERVALS: Final = 128
 """Intervals between cycles that give the period."""
 LEAST_INTERVALS: Final = 8
-"""Intervals from which it is known."""
+"""Intervals from which it shows lost cycles; pauses are judged by the first one."""
 RENEWED_EVERY: Final = 32
 """Cycles after which the period is computed again, once there are so many intervals."""
 LATER: Final = 64
@@ -67,7 +67,7 @@ class WireCycle:
         self._newest_order: tuple[int, ...] = ()
         self.period_ns: int | None = None
         self._intervals: deque[int] = deque(maxlen=MOST_INTERVALS)
-        self._until_renewed = 0
+        self._until_renewed = self._paused_at = 0
         self._ended_ns: int | None = None
         self._due_ns = 0
         self._later_ns = self._late = self._late_due_ns = 0
@@ -96,7 +96,9 @@ class WireCycle:
         if place != newest + 1:
             return False
         self.doubt()
-        return paced
+        # The bus pauses at the same place each time where the cycle begins elsewhere; a late read may do so anywhere.
+        before, self._paused_at = self._paused_at, place
+        return paced and place != before
 
     def follow_gap(self, gap_ns: int) -> None:
         """Derive the limit of pauses from the gaps between readings, until cycles show the period."""
@@ -121,7 +123,12 @@ class WireCycle:
 
     def late(self, time_ns: int) -> bool:
         """Return True if a cycle that ends at `time_ns` [ns] may hold readings of two, by the pace of those before."""
-        return self.period_ns is not None and self._ended_ns is not None and time_ns - self._due_ns > self._later_ns
+        return self.has_pace and self._ended_ns is not None and time_ns - self._due_ns > self._later_ns
+
+    @property
+    def has_pace(self) -> bool:
+        """True once the period is known so well that it shows lost cycles."""
+        return self.period_ns is not None and len(self._intervals) >= LEAST_INTERVALS
 
     def count(self, time_ns: int, *, ended: bool = True) -> bool | None:
         """Count a cycle of at least half of the taxels that ended at `time_ns` [ns], by the clock of the pauses.
@@ -131,7 +138,7 @@ class WireCycle:
         """
         late = self.late(time_ns)
         ended_ns, self._ended_ns = self._ended_ns, time_ns
-        if ended_ns is None or self.period_ns is None:
+        if ended_ns is None or not self.has_pace:
             self._due_ns = time_ns
         if ended_ns is not None:
             self._intervals.append(time_ns - ended_ns)
@@ -168,7 +175,7 @@ class WireCycle:
         if not self.in_pieces:
             usual = usual[count // 4 : count - count // 4]
         period_ns = sum(usual) // len(usual)
-        if count >= LEAST_INTERVALS and period_ns > 0:  # if all was read in one piece, the period is not visible
+        if period_ns > 0:  # if all was read in one piece, the period is not visible
             # A lost cycle makes the next ones late by a period, which is less exact where many are read in one piece.
             self._later_ns = max(period_ns // 2 if self.in_pieces else period_ns * 3 // 4, SHORTEST_PAUSE_NS)
             pause_ns = max(period_ns // 2, SHORTEST_PAUSE_NS)

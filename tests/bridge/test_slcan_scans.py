@@ -56,3 +56,6 @@ def test_the_head_of_a_line_with_the_tail_of_a_later_one_is_no_reading():
         scans.feed(text(3)[:23], 31 * ms)
         (scan,) = scans.feed(text(7 if lost else 3)[23:], 71 * ms)
         assert scan.complete == complete and scans.counters()["foreign"] == lost
+    scans.feed(text(8)[:20], 81 * ms)
+    (scan,) = scans.feed(text(12)[24:] + text(13), 131 * ms)[-1:]
+    assert scan.complete and scans.counters()["foreign"] == 1, "a damaged line is none, and the next is whole"
