@@ -23,6 +23,8 @@ JUDGED_NS: Final = 50_000_000
 """Time in which stamps are compared with arrivals, in [ns], and LONGEST_STEP_NS at most between two: a read that was
 late is no evidence of a slow clock."""
 LONGEST_STEP_NS: Final = 20_000_000
+STOOD_NS: Final = 1_000_000_000
+"""Time between two arrivals, in [ns], up to which this machine may have stood still, which makes no clock slow."""
 MOST_BACK: Final = 8
 """Steps back by over half of BACK_NS in that time from which stamps are no clock."""
 SLOWEST: Final = 6
@@ -117,7 +119,7 @@ class DeviceClock:
         difference_ns = arrival_ns - self._device_ns
         self._later_ns += min(since_ns, LONGEST_STEP_NS)
         if self._later_ns > HOLDS_NS or since_ns > SLOW_NS:
-            self._smallest_ns += since_ns // SLOWER
+            self._smallest_ns += (since_ns if since_ns > STOOD_NS else min(since_ns, LONGEST_STEP_NS)) // SLOWER
         if self.begun_ns is None or difference_ns <= self._smallest_ns:
             self._smallest_ns, self._later_ns = difference_ns, 0
         if self.begun_ns is None:
