@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from edge_samples import make_scan
@@ -64,6 +65,31 @@ def test_a_device_that_is_slower_or_faster_than_the_host_is_followed(rate) -> No
         arrival_ns = HOST_NS + i * 10 * MS
         assert arrival_ns - clock.at(round(i * 10_000 * rate), arrival_ns).host_ns <= 4 * MS
     assert not clock.dropped
+
+
+def test_a_stall_of_this_machine_leaves_distances_as_they_are() -> None:
+    """Reads come 6 ms late, once by 0.5 s, and then catch up: a stall makes no clock slow."""
+    clock, mapped, late_ms = DeviceClock(MS, 60_000), list[int](), 0
+    for number in range(200):
+        late_ms = 496 if number == 55 else max(late_ms - 10, 6 * (number > 0))
+        at = clock.at(number * 10, HOST_NS + (number * 10 + late_ms) * MS)
+        assert at is not None
+        mapped.append(at.host_ns)
+    steps_ns = [after - before for before, after in pairwise(mapped)]
+    assert min(steps_ns) > 7 * MS and max(steps_ns) < 13 * MS
+
+
+def test_two_late_reads_of_frames_drop_no_stamps() -> None:
+    clock, arrival_ms = DeviceClock(MS, 60_000), 0.0
+    for frame in range(100):
+        arrival_ms += {23: 20.3, 24: 488.0}.get(frame, 1.0)
+        stamp_ms = frame + 6 * (frame > 22)
+        assert clock.at(stamp_ms, HOST_NS + round(arrival_ms * MS)) is not None, frame
+
+
+def test_a_line_that_is_slower_than_its_bus_keeps_its_stamps() -> None:
+    clock = DeviceClock(MS, 60_000)
+    assert all(clock.at(10 * frame // 16, HOST_NS + frame * 36 * MS // 16) is not None for frame in range(640))
 
 
 def times(stamps_us, arrivals_ms):
