@@ -157,10 +157,11 @@ def test_the_wrong_line_speed_gives_no_scan():
         assert [scan for _ in range(5) for scan in link.read(0.1)] == []
         assert link.counters()["frames"] == 0 < link.counters()["received_bytes"]
     with (
-        Emulator([recording], ignores_line_speed=True) as emulator,
+        Emulator([recording], ignores_line_speed=True, loop=True) as emulator,
         SlcanSerialLink(emulator.port, 115_200) as link,
     ):
-        assert len(read_until_lost(link)) == 20
+        # So slow a line has no stamps: the pause of a busy machine within a cycle costs that scan, rightly.
+        assert all(scan.complete for scan in read_scans(link, 20))
 
 
 def test_what_lies_there_at_the_end_or_at_an_opening_is_dropped_and_counted():

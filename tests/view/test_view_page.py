@@ -276,6 +276,7 @@ class TestHeld:
         playwright.expect(page.locator("#manual")).to_be_visible()
         page.keyboard.press("Escape")
         playwright.expect(page.locator("#manual")).to_be_hidden()
+        playwright.expect(page.locator("#history")).to_be_visible()  # there is a past to look back on
         reached = []
         for _ in range(24):
             page.keyboard.press("Tab")
