@@ -7,12 +7,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.can_id_monitor import check_id_map
 from edge.doctor.findings import Finding
-from edge.doctor.link_checks import LineFacts, check_baud, check_latency, check_link
-from edge.doctor.scan_statistics import FEWEST_SCANS, Samples
-from edge.doctor.taxel_checks import check_drift, check_noise, check_rest, check_silent, check_stuck
-from edge.doctor.timing_checks import check_lost, check_rate, check_torn
+from edge.doctor.link_checks import (
+    LineFacts,
+    check_baud,
+    check_id_map,
+    check_latency,
+    check_link,
+    check_lost,
+    check_rate,
+    check_torn,
+)
+from edge.doctor.taxel_checks import (
+    FEWEST_SCANS,
+    Samples,
+    check_drift,
+    check_noise,
+    check_rest,
+    check_silent,
+    check_stuck,
+)
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting

@@ -1,14 +1,66 @@
-"""Checks of the way from the adapter to here: counters, line speed, latency. Pure but for one timer that it reads."""
+"""Checks of the way from the sensor to here: CAN ids, counters, line speed, latency, rate, torn and lost scans."""
 
+from collections import Counter
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from edge.doctor.findings import Finding, Verdict
+from edge.doctor.taxel_checks import Samples
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
+from firmware_bridge.silence import LATEST_SCAN_S
+
+_SHOWN = 8
+
+
+def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
+    """Return whether the chosen id map fits the sensors on the bus; None where no CAN ids are seen at all.
+
+    Args:
+        ids: the CAN ids that came.
+        model: the id map that the user chose.
+        half_silent: half of the taxels or more of some sensor are silent.
+    """
+    if not ids:
+        return None
+    norm = "every taxel of a sensor by its id"
+    whole = _whole_sensors(ids, model)
+    others = {
+        name: sensors
+        for name, other in ID_MAPS.items()
+        if name != model.name and (sensors := _whole_sensors(ids, other))
+    }
+    # The ids of a smaller pad may be among those of a larger one: then the larger one is on the bus.
+    largest = max((ID_MAPS[name].geometry.taxel_count for name in others), default=0)
+    others = {name: sensors for name, sensors in others.items() if ID_MAPS[name].geometry.taxel_count == largest}
+    if whole and not half_silent and largest <= model.geometry.taxel_count:
+        return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} received", norm)
+    if others:
+        owners = " or ".join(f"{name} (sensor {', '.join(sensors)})" for name, sensors in others.items())
+        tries = " or ".join(f"--id-map {name}" for name in others)
+        measured = f"the ids received are not {model.name}'s but those of {owners}"
+        return Finding("id map", "wrong", measured, norm, tries)
+    known = [can_id for can_id in ids if can_id in model.taxels]
+    shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:_SHOWN]) + ", ..." * (len(ids) > _SHOWN)
+    measured = f"{len(ids)} ids received, {len(known)} of them {model.name}'s: {shown}"
+    if half_silent or not known:
+        remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
+        return Finding("id map", "wrong", measured, norm, remedy)
+    return Finding("id map", "ok", measured, norm)
+
+
+def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
+    """Return the sensors of a model whose ids all came."""
+    taxels: Counter[str] = Counter(sensor for can_id, (sensor, _) in model.taxels.items() if can_id in ids)
+    return [sensor for sensor, count in taxels.items() if count == model.geometry.taxel_count]
+
 
 LATENCY_LIMIT_MS: Final = 2
 HELD_BACK_LIMIT_MS: Final = 5.0
@@ -155,3 +207,85 @@ def _trouble(counters: Mapping[str, int]) -> Finding | None:
         return None
     remedy = "the adapter loses frames: check the termination of the bus, and end what else loads this machine"
     return Finding("link", "look", ", ".join(found), "none", remedy)
+
+
+USUAL_HZ: Final = (70.0, 120.0)
+"""Range of the rates measured on sensors of sixteen taxels, 74 to 113 scans a second, with a margin."""
+RATE_TOLERANCE: Final = 0.1
+_LOSS_LIMITS: Final = (0.001, 0.01)
+_OLD_LIMITS: Final = (0.1, 0.3)
+_LOSS_REMEDY: Final = (
+    "frames are lost on the way: check the plugs and the termination of the bus, end what else loads this machine, "
+    "and try another USB port without a hub"
+)
+
+
+def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Finding:
+    """Check the scans and the new readings a second.
+
+    Args:
+        samples: of the sensor.
+        wanted_hz: the rate that a user expects, in [Hz].
+        line_full: the serial line carries no more, so that the sensor's own rate cannot be seen.
+    """
+    rate_hz = 1 / samples.period_s()
+    new_hz = samples.renewed[:, samples.living & ~samples.stuck()].mean(axis=0) * rate_hz
+    taxels = f", taxels renewed {new_hz.min():.1f} to {new_hz.max():.1f} Hz" if new_hz.size else ""
+    measured = f"{rate_hz:.1f} scans a second{taxels}"
+    low, high = USUAL_HZ if wanted_hz is None else (wanted_hz * (1 - RATE_TOLERANCE), wanted_hz * (1 + RATE_TOLERANCE))
+    norm = f"{low:.0f} to {high:.0f} Hz"
+    if line_full:
+        return Finding("rate", "not known", measured, norm, "the line is full: see baud rate")
+    if low <= rate_hz <= high:
+        return Finding("rate", "ok", measured, norm)
+    remedy = (
+        "set the sensor's rate in its controller, or state the expected one with --rate-hz"
+        if rate_hz < low
+        else "harmless, if the processor keeps up: state the expected rate with --rate-hz"
+    )
+    return Finding("rate", "look", measured, norm, remedy)
+
+
+def check_torn(samples: Samples) -> Finding:
+    """Check the share of scans that lack a taxel, or in which part of the taxels are old readings."""
+    torn, old = float(samples.torn().mean()), float(samples.half_old().mean())
+    measured = f"{100 * torn:.2f} % lack a taxel, {100 * old:.2f} % hold old readings"
+    norm = f"under {100 * _LOSS_LIMITS[0]:.1f} % and {100 * _OLD_LIMITS[0]:.0f} %"
+    verdict = _graded(torn, _LOSS_LIMITS)
+    if verdict != "ok":
+        missing = np.where(samples.living, (~samples.fresh).mean(axis=0), 0)
+        most = int(missing.argmax())
+        only = missing[most] > 0.8 * missing.sum()
+        remedy = f"taxel {most} comes and goes: its connection may be broken" if only else _LOSS_REMEDY
+        return Finding("torn scans", verdict, measured, norm, remedy)
+    remedy = "the sender of these scans repeats itself: lower its rate to that of the sensor"
+    verdict = _graded(old, _OLD_LIMITS)
+    return Finding("torn scans", verdict, measured, norm, "" if verdict == "ok" else remedy)
+
+
+def check_lost(samples: Samples, silent_s: float) -> Finding:
+    """Check the share of scans that never came, by the gaps they left.
+
+    Args:
+        samples: of the sensor.
+        silent_s: time without a scan at the end, in [s].
+    """
+    if silent_s > LATEST_SCAN_S:
+        remedy = "the sensor fell silent: check its power and its plug"
+        return Finding("lost scans", "wrong", f"all of the last {silent_s:.0f} s", "", remedy)
+    lost = samples.lost()
+    share = lost / (lost + samples.scans)
+    gap_ms = 1000 * float(np.diff(samples.time_s).max())
+    measured = f"{lost} of {lost + samples.scans}, longest gap {gap_ms:.0f} ms"
+    verdict = _graded(share, _LOSS_LIMITS)
+    return Finding(
+        "lost scans",
+        verdict,
+        measured,
+        f"under {100 * _LOSS_LIMITS[0]:.1f} %",
+        "" if verdict == "ok" else _LOSS_REMEDY,
+    )
+
+
+def _graded(value: float, limits: tuple[float, float]) -> Verdict:
+    return "ok" if value <= limits[0] else "look" if value <= limits[1] else "wrong"

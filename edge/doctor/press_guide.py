@@ -1,18 +1,22 @@
-"""Guided press: takes readings, and gives the next request or the answer. No I/O, no clock.
+"""Guided press: takes readings, and gives the next request or the answer; and the line that shows what is felt.
 
 Written as a dialogue: each step makes a request, then waits for readings that fulfil it. Time is that of the scans.
 """
 
+import os
+import select
+import sys
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TextIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.pad_orientation import CORNERS, Press, corner_taxel
+from edge.doctor.pad_orientation import CORNERS, Answer, Press, corner_taxel
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
+from edge.terminal.text_wrap import columns, drawn, rewritable
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
 HOLD_SCANS: Final = 20
@@ -44,14 +48,6 @@ class Reading(NamedTuple):
     def shear_counts(self) -> NDArray[np.float32]:
         """Sums of x and of y."""
         return self.zeroed[:2].sum(axis=(1, 2))
-
-
-@dataclass
-class Answer:
-    """Answer of the presses: those that were felt, and counts per newton where a weight was laid on."""
-
-    presses: list[Press] = field(default_factory=list)
-    counts_per_newton: float | None = None
 
 
 class SkippedError(Exception):
@@ -216,3 +212,56 @@ def _touched(reading: Reading) -> bool:
 def free(reading: Reading) -> bool:
     """Return whether nothing presses the pad."""
     return reading.load_counts < OFF_COUNTS
+
+
+REFRESH_S: Final = 0.1
+BAR: Final = 10
+
+
+class FeltLine:
+    """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
+
+    def __init__(self, stream: TextIO, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._stream = drawn(stream)
+        self._clock_s = clock_s
+        self._shown = 0
+        self._shown_s = self._asked_s = clock_s()
+
+    def asked(self) -> None:
+        """Begin the time of a request."""
+        self._asked_s = self._clock_s()
+
+    def show(self, guide: Guide) -> None:
+        """Show the load on the pad, at most ten times a second."""
+        now_s = self._clock_s()
+        if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
+            return
+        self._shown_s = now_s
+        full = min(int(BAR * guide.felt_counts / guide.enough_counts), BAR)
+        left_s = max(PATIENCE_S - (now_s - self._asked_s), 0)
+        skip = ", Enter skips" if _stdin_is_terminal() else ""
+        self._write(f"felt [{'#' * full:{BAR}}] {left_s:.0f} s left{skip}")
+
+    def clear(self) -> None:
+        """Clear the line, for text that stays."""
+        if self._shown:
+            self._write("")
+            self._stream.write("\r")
+
+    def _write(self, text: str) -> None:
+        text = text[: columns() - 1]
+        self._stream.write("\r" + text.ljust(self._shown))
+        self._stream.flush()
+        self._shown = len(text)
+
+
+def enter_pressed() -> bool:
+    """Return whether Enter was pressed on the terminal since the last call; never waits."""
+    if not _stdin_is_terminal() or not select.select([sys.stdin.fileno()], [], [], 0)[0]:
+        return False
+    return b"\n" in os.read(sys.stdin.fileno(), 1024)
+
+
+def _stdin_is_terminal() -> bool:
+    # Only on POSIX can a terminal be polled for input.
+    return os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()

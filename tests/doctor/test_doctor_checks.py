@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
 
-from edge.doctor.can_id_monitor import check_id_map
 from edge.doctor.examine import Watched, examine
 from edge.doctor.findings import Finding, page, worst
 from edge.doctor.link_checks import (
     LineFacts,
     capacity_hz,
     check_baud,
+    check_id_map,
     check_latency,
     check_link,
 )
-from edge.doctor.scan_statistics import Samples
+from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.links.serial_ports import latency_timer_ms
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame

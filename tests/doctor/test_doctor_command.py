@@ -18,7 +18,6 @@ from edge_samples import ROOT, FakeLink
 
 from edge.cli import main as cli
 from edge.doctor import command, watch
-from edge.doctor import session as visit
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNERS, orders
@@ -180,7 +179,7 @@ def test_the_wrong_id_map_names_the_right_one(monkeypatch):
 
 def test_another_line_speed_than_the_adapters(monkeypatch):
     with Emulator([recording(healthy_counts(200))], loop=True, left_open=True) as emulator:
-        monkeypatch.setattr(visit, "GIVEN_UP_S", 0.5)
+        monkeypatch.setattr(command, "GIVEN_UP_S", 0.5)
         done = doctor(monkeypatch, f"{emulator.port}@115200", "--json")
     found = verdicts(done)
     assert found["link"] == "wrong" and found["scans"] == "wrong" and len(found) == 2 and done.code == 1
@@ -249,7 +248,7 @@ def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wr
 
 
 def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
-    monkeypatch.setattr(visit, "GIVEN_UP_S", 0.3)
+    monkeypatch.setattr(command, "GIVEN_UP_S", 0.3)
     options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
     monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])

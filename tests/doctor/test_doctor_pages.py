@@ -5,9 +5,8 @@ import ast
 import pytest
 from edge_samples import ROOT
 
-from edge.doctor.link_checks import LATENCY_LIMIT_MS
-from edge.doctor.press_findings import USUAL_COUNTS_PER_NEWTON
-from edge.doctor.timing_checks import USUAL_HZ
+from edge.doctor.link_checks import LATENCY_LIMIT_MS, USUAL_HZ
+from edge.doctor.pad_orientation import USUAL_COUNTS_PER_NEWTON
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.silence import GIVEN_UP_S
 from firmware_bridge.zeroing.baseline import CREEP_LIMIT_COUNTS, FEWEST_SCANS

@@ -9,9 +9,8 @@ from bridge_samples import read_until_lost
 from doctor_samples import finger, healthy_counts, visit
 
 from edge.doctor.examine import check_baseline
-from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders, z_sign
-from edge.doctor.press_findings import judge_press
-from edge.doctor.press_guide import PATIENCE_S, Answer, GuidedPress
+from edge.doctor.pad_orientation import Answer, Press, corner_taxel, find_axes, find_order, judge_press, orders, z_sign
+from edge.doctor.press_guide import PATIENCE_S, GuidedPress
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.pad_geometry import USPA44

@@ -8,7 +8,7 @@ import pytest
 from edge_samples import make_contract, write_model
 
 from edge import api
-from edge.doctor.can_id_monitor import check_id_map
+from edge.doctor.link_checks import check_id_map
 from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders
 from edge.errors import ModelError, UsageError
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, widening
