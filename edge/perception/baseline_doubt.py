@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.contact_options import RuntimeOptions
+from edge.perception.event import Note, Report
 from edge.perception.result import age_text
+from edge.perception.step import Step
 from firmware_bridge.zeroing.baseline import Origin
 
 Doubt = Literal["unseen", "outage", "held", "below", "slow", "alike", "left"]
@@ -63,18 +65,24 @@ def doubt_text(doubt: Doubt, counts: tuple[float, float, float], age_s: float | 
 
 
 class BaselineDoubt:
-    """Watch over one sensor's readings.
+    """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends.
 
     Args:
         options: thresholds of taps.
         taxels: number of the sensor's taxels.
+        report: takes the events.
 
     Attributes:
         doubt: why the newest readings are in doubt; None if they are not.
         counts: medians of all taxels on x, y, z when that began.
+        reported: the doubt of the newest step that was judged; None without.
+        notes: the same for the user.
     """
 
-    def __init__(self, options: RuntimeOptions, taxels: int) -> None:
+    def __init__(self, options: RuntimeOptions, taxels: int, report: Report) -> None:
+        self._report = report
+        self.reported: Doubt | None = None
+        self.notes: tuple[Note, ...] = ()
         self._on, self._off = options.contact_on_counts, options.contact_off_counts
         self._drift_per_ns = DRIFT_PER_S * taxels / 1e9
         self._left = LEFT_COUNTS * taxels
@@ -100,6 +108,21 @@ class BaselineDoubt:
             self._before, self._newest = self._newest, None
             self._seen, self._unseen = False, "outage"
         self._touched = self._seen
+
+    def __call__(self, step: Step) -> None:
+        """Mark the step where its readings are in doubt."""
+        if step.readings is None or step.force_counts is None:
+            return
+        doubt = self.weigh(step.readings, step.force_counts, step.scan.time_ns)
+        if doubt is not self.reported:
+            self.reported = doubt
+            if doubt is None:
+                self._report("baseline_cleared", "")
+            else:
+                text = doubt_text(doubt, self.counts, step.baseline_age_s)
+                self.notes = (Note("baseline_in_doubt", text),)
+                self._report("baseline_doubted", text)
+        step.doubted = doubt is not None
 
     def weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
         """Return why a scan's readings are in doubt, or None.

@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.step import Estimate
+
 NOISE_COUNTS: Final = 2.0
 """Standard deviation of a reading at rest: 1.7 to 2.6 in recordings."""
 CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
@@ -22,9 +24,14 @@ MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 
 
 class LastReading:
-    """Readings that a sensor's last pattern was made from; allocates nothing after construction."""
+    """Readings that a sensor's last pattern was made from; allocates nothing after construction.
+
+    Attributes:
+        estimate: what was made of them; None before the first, and where it must not be used again.
+    """
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
+        self.estimate: Estimate | None = None
         self._counts = np.zeros(scan_shape, dtype=np.float32)
         self._change = np.zeros(scan_shape, dtype=np.float32)
         self._made_by: Hashable = None

@@ -5,7 +5,7 @@ An event happens once; a note holds for as long as results carry it.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple, Protocol, get_args
 
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
@@ -118,6 +118,12 @@ class Untimed(NamedTuple):
     def at(self, time_ns: int) -> Event:
         """Return the event at a time in [ns]."""
         return Event(time_ns, *self)
+
+
+class Report(Protocol):
+    """Takes an event of a sensor: its kind, and what that leaves open."""
+
+    def __call__(self, kind: EventKind, detail: str = "") -> object: ...  # noqa: D102 - above
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.event import Report
 from edge.perception.gain_learning import ContactModel, GainLearner
-from edge.perception.result import Result
+from edge.perception.pattern_check import PatternCheck
+from edge.perception.sensor_pad import SensorPad
 from firmware_bridge.scans.pad_constants import Pad
 
 HELD_SCANS: Final = 200
@@ -71,16 +73,15 @@ class GainFollower:
         """Pad by the contacts alone."""
         return self._learner.pad()
 
-    def see(self, result: Result, counts: NDArray[np.float32]) -> bool:
-        """Take note of a contact's result and its readings (3, rows, cols); return whether it is time to learn.
+    def see(self, trusted: bool | None, force_counts: float, counts: NDArray[np.float32]) -> bool:
+        """Take note of a contact's pattern and its readings (3, rows, cols); return whether it is time to learn.
 
-        A result that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
+        A pattern that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
         """
-        if result.trusted is False:
+        if trusted is False:
             self.waiting, self._force_counts = False, 0.0
             return False
         self._seen += 1
-        force_counts = result.force_counts or 0.0
         if force_counts > self._force_counts:
             self._strongest, self._force_counts = counts, force_counts
             self.waiting = True
@@ -100,3 +101,54 @@ class GainFollower:
             return None
         self._used = new.behind(self._by_hand)
         return self._used
+
+
+class Learn:
+    """Stage: brings what contacts teach of a sensor into use, and reports it.
+
+    Args:
+        follower: of the sensor's gains.
+        pad: of the sensor.
+        check: of its patterns; None without checks.
+        report: takes the events.
+
+    Attributes:
+        waiting: a contact is there to be learned from, once the pad is free.
+    """
+
+    def __init__(self, follower: GainFollower, pad: SensorPad, check: PatternCheck | None, report: Report) -> None:
+        self._follower, self._pad, self._check, self._report = follower, pad, check, report
+        self._learned: Pad | None = None
+
+    @property
+    def waiting(self) -> bool:  # noqa: D102 - above
+        return self._follower.waiting
+
+    def __call__(
+        self, trusted: bool | None, force_counts: float, counts: NDArray[np.float32], dead: NDArray[np.bool_]
+    ) -> bool:
+        """Take a contact's pattern; return whether another pad is in use since, as `learn` does."""
+        return self._follower.see(trusted, force_counts, counts) and self.learn(dead)
+
+    def learn(self, dead: NDArray[np.bool_]) -> bool:
+        """Learn from the contact that waits; return whether another pad is in use since."""
+        follower, check = self._follower, self._check
+        pad = follower.learn(dead)
+        if check is not None and follower.contradicts_file:
+            if not check.suspected:
+                why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
+                self._report("suspected", why)
+            check.suspect_file()
+            return False
+        if pad is None:
+            return False
+        self._learned = follower.learned
+        self._pad.use(pad)
+        percent = 100 * float(np.sqrt(np.square(pad.gain_half_widths or ()).mean()))
+        self._report("gains_learned", f"gains learned from {follower.contacts} contacts, each within {percent:.0f} %")
+        return True
+
+    def take_learned(self) -> Pad | None:
+        """Return the pad by contacts alone if it was learned since the last call."""
+        learned, self._learned = self._learned, None
+        return learned

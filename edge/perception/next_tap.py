@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.result import NextTap, Result
+from edge.perception.result import NextTap
+from edge.perception.step import Step
 from edge.perception.tap_tracker import TapState
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
@@ -29,12 +30,12 @@ class TapAdvice:
 
     def __init__(self, reach_mm: float, taps: int) -> None:
         self._reach_mm, self._taps = reach_mm, taps
-        self._strongest: Result | None = None
+        self._strongest: Step | None = None
         self._tap = -1
         self._proposed: NextTap | None = None
 
-    def see(self, made: Result, tap: int) -> None:
-        """Take a result with a pattern: the strongest one of a tap, by its number, counts."""
+    def see(self, made: Step, tap: int) -> None:
+        """Take a step with a pattern: the strongest one of a tap, by its number, counts."""
         before = self._strongest
         if tap != self._tap:  # also after a reset within a tap, which goes on with another number
             self._tap, before = tap, None
@@ -53,11 +54,14 @@ class TapAdvice:
             self._proposed = self._propose(made)
         return self._proposed
 
-    def _propose(self, made: Result) -> NextTap | None:
+    def _propose(self, made: Step) -> NextTap | None:
+        estimate = made.estimate
         # Without a pose the next tap could not be placed.
-        if made.pose is None or made.poses is None or made.trusted is False or made.taps_used >= self._taps:
+        if made.pose is None or estimate is None or estimate.poses is None:
             return None
-        shift_mm = next_shift_mm(made.poses[:, :2], self._reach_mm)
+        if estimate.trusted is False or estimate.taps >= self._taps:
+            return None
+        shift_mm = next_shift_mm(estimate.poses[:, :2], self._reach_mm)
         return None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(made.pose, *shift_mm))
 
 

@@ -1,10 +1,9 @@
 """Result of the runtime for one scan."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import lru_cache
-from operator import attrgetter
-from typing import Any, Final, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,6 @@ from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 from firmware_bridge.zeroing.drift_tracker import Drift
-
-MADE: Final = (
-    *("state", "pattern", "deviation", "area_mm2", "centroid_mm", "interval_mm"),
-    *("expected_rmse_mm", "another_tap", "traction", "wrench", "wrench_origin"),
-    *("mismatch", "tap_mismatch", "taps_dropped", "trusted", "untrusted_reason"),
-)
-"""Fields of a result that are made from a pattern."""
 
 State = Literal["zeroing", "incomplete", "baseline_in_doubt", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
@@ -144,22 +136,6 @@ class Result:
         if self.baseline_age_s is None:
             return f"baseline {self.baseline.id} of unknown age"
         return f"baseline {self.baseline.id} {age_text(self.baseline_age_s)} old"
-
-
-def replace(result: Result, **changes: object) -> Result:
-    """Return a copy of a result with other values, as `dataclasses.replace` does in three times the time."""
-    values: dict[str, Any] = dict(zip(_NAMES, _values(result), strict=True))
-    values.update(changes)
-    return Result(**values)
-
-
-def overtaken(result: Result) -> Result:
-    """Return a result whose pattern was due as it is without one, since a newer scan has come."""
-    return result if result.state == "baseline_in_doubt" else replace(result, state="dropped")
-
-
-_NAMES: Final = tuple(one.name for one in fields(Result))
-_values: Final = attrgetter(*_NAMES)
 
 
 def age_text(age_s: float) -> str:

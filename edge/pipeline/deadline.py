@@ -56,11 +56,6 @@ class Deadline:
         if not self._known and len(self._sorted) >= FEWEST_INTERVALS:
             self.period_ns = self._sorted[len(self._sorted) // 2]
 
-    def check(self, scan_time_ns: int, done_ns: int) -> bool:
-        """Return whether a pattern missed its deadline; without a period it never does.
-
-        Args:
-            scan_time_ns: arrival of its scan's last reading, in [ns].
-            done_ns: when the pattern was ready, on the same clock.
-        """
-        return self.period_ns is not None and done_ns - scan_time_ns > self.period_ns
+    def check(self, latency_us: float) -> bool:
+        """Return whether a pattern missed its deadline, so long after its scan in [us]; never without a period."""
+        return self.period_ns is not None and latency_us * 1e3 > self.period_ns

@@ -7,9 +7,8 @@ from operator import attrgetter
 from typing import Final
 
 from edge.perception.event import Event
-from edge.perception.result import Result, replace
+from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.perception.scan_notes import OLD_NS, waited_note
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
 from edge.pipeline.gain_keeper import GainKeeper
@@ -93,6 +92,7 @@ class Rounds:
         self._waited_s = self._refused_s = -math.inf
         self._clock_s = clock_s
         self._clock_ns = clock_ns
+        self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
         self._received: dict[str, int] | None = None
         self._pace: Pace | None = None
         self._patience_s = patience_s
@@ -145,7 +145,7 @@ class Rounds:
                     self._take_poses(taken)
                 for one in taken:
                     if isinstance(one, Scan):
-                        for result in self._runtime.take(one):
+                        for result in self._runtime.take(one, self._latency_clock):
                             yield self._follow(result)
                     elif isinstance(one, Notice):
                         yield from self._patterns()
@@ -249,13 +249,13 @@ class Rounds:
 
     def _infer(self) -> Iterator[Result]:
         """Yield the results of the sensors that have waited longest, as many as one call has time for."""
-        results = self._runtime.infer(self._longest_call_us()) if self._runtime.waiting else []
-        done_ns = self._clock_ns() if results else 0
+        waiting = self._runtime.waiting
+        results = self._runtime.infer(self._longest_call_us(), self._latency_clock) if waiting else []
         for name, pad in self._runtime.take_learned().items():
             if self._keeper is not None:
                 self._keeper.keep(name, pad)
         for result in results:
-            yield self._follow(result, done_ns)
+            yield self._follow(result)
 
     def _longest_call_us(self) -> float | None:
         """Return the time that one inference may take, in [us]: scans that come meanwhile wait for its end."""
@@ -290,8 +290,8 @@ class Rounds:
             self._pace = pace
             self._source.set_pace(pace)
 
-    def _follow(self, result: Result, done_ns: int = 0) -> Result:
-        """Count a result; its pattern, if it has one, was ready at `done_ns`, 0 for now."""
+    def _follow(self, result: Result) -> Result:
+        """Count a result, and give it to the sinks."""
         scan, statistics = result.scan, self.statistics
         deadline = self._deadlines.get(scan.sensor)
         if deadline is None:
@@ -299,12 +299,8 @@ class Rounds:
         if not scan.unread_ns:  # scans that waited unread came at no pace
             deadline.follow(scan.time_ns)
         back = self._silence.follow(scan, deadline.period_ns)
-        if result.pattern is not None and not self._source.patient:  # its scans have another clock
-            done_ns = done_ns or self._clock_ns()
-            statistics.late += deadline.check(scan.time_ns, done_ns)
-            waited_ns = done_ns - scan.time_ns
-            notes = result.notes if waited_ns <= OLD_NS else (*result.notes, waited_note(waited_ns))
-            result = replace(result, latency_us=waited_ns / 1e3, notes=notes)
+        if result.latency_us is not None:
+            statistics.late += deadline.check(result.latency_us)
         if self._patience_s:
             self._watch_rest(result)
         statistics.add(result)

@@ -49,9 +49,9 @@ def test_a_given_rate_is_the_period_from_the_start():
 
 def test_a_pattern_is_late_after_one_period_and_not_before():
     deadline = followed([10] * 9)
-    assert not deadline.check(90 * MS, 100 * MS)
-    assert deadline.check(90 * MS, 100 * MS + 1)
-    assert not Deadline().check(0, 10**12)
+    assert not deadline.check(10_000)
+    assert deadline.check(10_000.001)
+    assert not Deadline().check(1e9)
 
 
 def test_the_loop_counts_late_patterns_and_tells_every_latency():

@@ -12,12 +12,10 @@ from edge.cli import main as cli
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower
+from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower, Learn
 from edge.perception.gain_learning import BOUND, REMEMBERED, SOLVE_EVERY, ContactModel, GainLearner, load_contact_model
 from edge.perception.pattern_check import PatternCheck
-from edge.perception.result import Result
-from edge.perception.sensor_state import Sensor
-from edge.perception.tap_tracker import TapTracker
+from edge.perception.sensor_pad import SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
@@ -29,7 +27,7 @@ from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sens
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 Z = slice(32, 48)
-SCAN = ScanSeries("4", USPA44).close(np.rint(BASELINE.counts).astype(np.int32), 1)
+ALL_ALIVE = np.zeros((4, 4), dtype=bool)
 
 
 def make_model(seed=0, kinds=3):
@@ -82,32 +80,28 @@ class TestFileOfAnotherSensor:
     def follow(self, gains_in_file, count=120):
         true = draw_gains()
         file = Pad(gains=tuple(gains_in_file), gain_half_widths=self.WIDTHS)
-        sensor = Sensor("4", USPA44, TapTracker(1), None)
-        contract = make_pad_contract()
-        sensor.check = PatternCheck(make_trust(), contract)
-        sensor.pad, sensor.follower = file, GainFollower(MODEL, file)
+        contract, events = make_pad_contract(), []
+        check = PatternCheck(make_trust(), contract)
+        pad = SensorPad(contract, file, None, check)
+        learn = Learn(GainFollower(MODEL, file), pad, check, lambda kind, detail="": events.append((kind, detail)))
         for contact in draw_contacts(count, true):
-            result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
-            while not sensor.follower.see(result, contact):
-                pass
-            sensor.learn(contract)
-        return sensor
+            learn(None, 5000.0, contact, ALL_ALIVE)
+            learn.learn(ALL_ALIVE)
+        return check, events
 
     def test_gains_of_another_sensor_are_contradicted_once_and_nothing_is_believed(self):
-        sensor = self.follow(draw_gains(seed=9))
-        assert sensor.check is not None and sensor.check.suspected
-        suspicions = [event for event in sensor.events if event.kind == "suspected"]
-        assert len(suspicions) == 1 and "another sensor's file" in suspicions[0].at(0).text
-        assert sensor.events[-1] == suspicions[0], "nothing is learned after it"
+        check, events = self.follow(draw_gains(seed=9))
+        assert check.suspected
+        ((place, text),) = [(place, text) for place, (kind, text) in enumerate(events) if kind == "suspected"]
+        assert "another sensor's file" in text and place == len(events) - 1, "nothing is learned after it"
 
     def test_its_own_gains_are_not(self):
-        sensor = self.follow(draw_gains())
-        assert sensor.check is not None and not sensor.check.suspected
-        assert not [event for event in sensor.events if event.kind == "suspected"]
+        check, events = self.follow(draw_gains())
+        assert not check.suspected and "suspected" not in dict(events)
 
     def test_it_takes_some_contacts(self):
-        sensor = self.follow(draw_gains(seed=9), CONTRADICTED_CONTACTS - 1)
-        assert sensor.check is not None and not sensor.check.suspected
+        check, _ = self.follow(draw_gains(seed=9), CONTRADICTED_CONTACTS - 1)
+        assert not check.suspected
 
 
 class TestRestart:
@@ -116,12 +110,10 @@ class TestRestart:
         learned = taught(draw_contacts(200, true)).pad()
         follower = GainFollower(MODEL, None, learned)
         assert np.array_equal(follower._learner.gains, np.ones(GAINS)) and not follower.contradicts_file
-        result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
         pads = []
         for contact in draw_contacts(100, true, seed=5):
-            while not follower.see(result, contact):
-                pass
-            pads.append(follower.learn(np.zeros((4, 4), dtype=bool)))
+            follower.see(None, 5000.0, contact)
+            pads.append(follower.learn(ALL_ALIVE))
         taken = [pad for pad in pads if pad is not None]
         assert all(pad.gains_certainty >= learned.gains_certainty for pad in taken)
 
@@ -132,10 +124,9 @@ class TestRestart:
 
     def test_an_untrusted_scan_takes_back_what_its_contact_would_teach(self):
         follower = GainFollower(MODEL, None)
-        result = Result(SCAN, "device", "m", "contact", force_counts=5000.0)
-        follower.see(result, draw_contacts(1)[0])
+        follower.see(None, 5000.0, draw_contacts(1)[0])
         assert follower.waiting
-        follower.see(replace(result, trusted=False), draw_contacts(1)[0])
+        follower.see(False, 5000.0, draw_contacts(1)[0])
         assert not follower.waiting
 
 
@@ -234,9 +225,11 @@ class TestModel:
 class Run:
     """Runtime that taps contacts one after the other; keeps the results."""
 
-    def __init__(self, *, pad=None, learn=True, contract=None):
+    def __init__(self, *, pad=None, learn=True, contract=None, every_scan=False):
         self.model = FakeModel(contract or make_pad_contract(taps=1))
-        self.runtime = make_runtime(self.model, contacts=MODEL, pad=pad, options=RuntimeOptions(learn=learn))
+        self.runtime = make_runtime(
+            self.model, contacts=MODEL, pad=pad, options=RuntimeOptions(learn=learn, every_scan=every_scan)
+        )
         self.results = []
         self._series = ScanSeries("4", USPA44)
         self._rng = np.random.default_rng(3)
@@ -281,20 +274,20 @@ class TestRuntime:
 
     def test_results_that_are_not_trusted_teach_nothing(self):
         contact = draw_contacts(1)[0]
-        scan = ScanSeries("4", USPA44).close(np.rint(BASELINE.counts).astype(np.int32), 1)
         follower = GainFollower(MODEL, None)
-        doubted = Result(scan, "device", "m", "contact", force_counts=5000.0, trusted=False)
         for _ in range(2 * HELD_SCANS):
-            assert not follower.see(doubted, contact)
+            assert not follower.see(False, 5000.0, contact)
         assert not follower.waiting
-        assert not follower.see(Result(scan, "device", "m", "contact", force_counts=5000.0), contact)
+        assert not follower.see(None, 5000.0, contact)
         assert follower.waiting
 
-    def test_a_long_hold_is_learned_from_while_it_lasts(self):
-        run = Run()
-        run.runtime._every_scan = True
+    def test_a_long_hold_is_learned_from_while_it_lasts(self, monkeypatch):
+        run = Run(every_scan=True)
+        learn = GainFollower.learn
+        learned = []
+        monkeypatch.setattr(GainFollower, "learn", lambda self, dead: learned.append(1) or learn(self, dead))
         run.tap(draw_contacts(1)[0], scans=HELD_SCANS + 5)
-        assert run.runtime._sensors["4"].follower.contacts == 1
+        assert len(learned) == 2, "after the hold's first part, and after the rest of it"
 
     def test_gains_by_hand_are_not_replaced_by_less_certain_ones(self):
         sure = Pad(gains=(1.0,) * GAINS, gain_half_widths=(0.01,) * GAINS)

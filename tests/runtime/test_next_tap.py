@@ -53,9 +53,12 @@ def test_no_tap_is_proposed_from_which_an_earlier_one_is_out_of_reach():
     assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
 
 
-def made(force_counts=100.0, **changes) -> Any:
-    values = {"pose": PadPose(10, 20, 90), "poses": taps((0, 0)), "trusted": True, "taps_used": 1}
-    return SimpleNamespace(**values | {"force_counts": force_counts} | changes)
+POSE = PadPose(10, 20, 90)
+
+
+def made(force_counts: float | None = 100.0, pose: PadPose | None = POSE, **changes) -> Any:
+    estimate = SimpleNamespace(**{"poses": taps((0, 0)), "trusted": True, "taps": 1} | changes)
+    return SimpleNamespace(force_counts=force_counts, pose=pose, estimate=estimate)
 
 
 PEAKS = (TapPeak(0, 0),)
@@ -113,7 +116,7 @@ def test_the_target_is_the_proposal_in_the_objects_plane():
     assert (target.x_mm, target.y_mm) == pytest.approx((10 - proposed.dy_mm, 20 + proposed.dx_mm))
 
 
-@pytest.mark.parametrize("changes", [{"pose": None}, {"poses": None}, {"trusted": False}, {"taps_used": 7}])
+@pytest.mark.parametrize("changes", [{"pose": None}, {"poses": None}, {"trusted": False}, {"taps": 7}])
 def test_nothing_is_proposed_without_what_it_needs(changes):
     advice = TapAdvice(REACH_MM, taps=7)
     advice.see(made(**changes), 0)
@@ -177,7 +180,8 @@ class TestRuntime:
         self.runtime.pose(PadPose(3, 0), (self.number + 1) * PERIOD_NS - 1000, holds=True)
         later = [self.push(press) for press in (0.8 * self.PRESS, 0.7 * self.PRESS)]
         proposed, alone = self.push().next_tap, TapAdvice(REACH_MM, 7)
-        alone.see(later[0], 0)
+        first = later[0]
+        alone.see(made(first.force_counts, first.pose, poses=first.poses, trusted=first.trusted), 0)
         expected = alone.proposal(FREE)
         assert later[0].taps_used == 1 and proposed is not None and expected is not None
         assert proposed.target == expected.target

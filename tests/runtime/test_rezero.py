@@ -8,7 +8,7 @@ import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
 
 from edge.perception.runtime import Runtime
-from edge.perception.zero_on_demand import GIVE_UP_NS
+from edge.perception.zeroing import GIVE_UP_NS
 from edge.sinks.event_printer import MessageSink
 from edge.sinks.jsonl import record_line
 from edge.sinks.npz import NpzSink

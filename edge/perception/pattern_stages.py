@@ -1,0 +1,115 @@
+"""Stages of a pattern: which taps it is made from, whether it is believed, and what follows from it."""
+
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.contract import Contract
+from edge.inference.expected_error import expect
+from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.dead_taxel_fill import widening
+from edge.perception.event import Report
+from edge.perception.pattern_check import SAME_STRENGTH, PatternCheck, strangers
+from edge.perception.sensor_pad import SensorPad
+from edge.perception.step import Estimate, Step, Window
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taxel_health import TaxelWatch
+from edge.perception.wrench import wrench_of
+from firmware_bridge.pad_geometry import SensorGeometry
+
+
+class Check:
+    """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from.
+
+    Args:
+        check: decides, and remembers what contacts have shown; None where the model has no checks.
+        taps: of the sensor; a tap that belongs to another contact is forgotten there.
+        watch: over its taxels.
+        report: takes the events.
+    """
+
+    def __init__(self, check: PatternCheck | None, taps: TapTracker, watch: TaxelWatch, report: Report) -> None:
+        self._check, self._taps, self._watch, self._report = check, taps, watch, report
+
+    def belonging(
+        self, step: Step, window: Window, scaled: NDArray[np.float32]
+    ) -> tuple[list[int], tuple[float, ...] | None]:
+        """Return the numbers of the taps that belong to the contact, and the mismatch of each earlier one.
+
+        A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
+        Which taps go with it is stated by edge.perception.pattern_check.strangers.
+
+        Args:
+            step: that the window is of.
+            window: the taps.
+            scaled: (K, 3, rows, cols), the same in network units.
+        """
+        every = list(range(window.taps))
+        if self._check is None or window.taps < 2 or step.doubted:
+            return every, None
+        belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
+        posed = step.pose is not None and window.poses is not None
+        dropped = strangers(belonging, posed=posed)
+        if not dropped:
+            return every, belonging
+        settled = [
+            number
+            for number in (dropped if posed else dropped[:1])
+            if scaled[0, 2].sum() >= SAME_STRENGTH * scaled[number, 2].sum()
+        ]
+        for number in settled:
+            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+        if settled:
+            slots = window.slots
+            self._taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
+        return [number for number in every if number not in dropped], belonging
+
+    def __call__(self, step: Step, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
+        """Give the verdict on an estimate.
+
+        Args:
+            step: that it is of.
+            made: with the model's pattern.
+            tap: number of the contact.
+            newest: (3, rows, cols) in network units, the readings that the pattern was made from.
+        """
+        if made.deviation is not None and step.dead:
+            made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
+        check = self._check
+        if check is None:
+            return
+        suspected = check.suspected
+        verdict = check.judge(tap, newest, made.pattern, made.deviation, made.traction, self._watch.most_repeats)
+        if check.suspected != suspected:
+            self._report("cleared" if suspected else "suspected")
+        made.mismatch, made.trusted, made.untrusted_reason = verdict.mismatch, verdict.trusted, verdict.reason
+
+
+def _which(number: int, *, alone: bool) -> str:
+    if number == 1:
+        return "the tap before does"
+    return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
+
+
+class Describe:
+    """Stage: everything that follows from a pattern: area, interval, expected error, wrench."""
+
+    def __init__(self, contract: Contract, geometry: SensorGeometry, pad: SensorPad) -> None:
+        self._contract, self._geometry, self._pad = contract, geometry, pad
+        self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
+
+    def __call__(self, made: Estimate) -> None:
+        """Add to an estimate what follows from its pattern."""
+        contract, pattern, deviation = self._contract, made.pattern, made.deviation
+        touching = touched(pattern, contract.contact_level)
+        made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
+        if deviation is not None:
+            expected = expect(contract.confidence, made.taps, pattern, deviation)
+            if expected is not None:
+                made.expected_rmse_mm, made.another_tap = expected.rmse, expected.another_tap
+            if contract.interval_factor is not None and touching.any():
+                made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
+        if (traction := made.traction) is not None:
+            made.wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
+            made.wrench_origin = self._pad.wrench_origin

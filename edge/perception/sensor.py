@@ -1,0 +1,250 @@
+"""One sensor between its scans: the stages that every scan passes, made complete once."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.inference.contract import Contract
+from edge.inference.trust import Trust
+from edge.perception.baseline_doubt import BaselineDoubt
+from edge.perception.change_gate import LastReading
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
+from edge.perception.dead_taxel_fill import TaxelEstimator
+from edge.perception.event import EventKind, Note, Untimed
+from edge.perception.gain_following import GainFollower, Learn
+from edge.perception.gain_learning import ContactModel
+from edge.perception.health import Health
+from edge.perception.pattern_check import PatternCheck
+from edge.perception.pattern_stages import Check, Describe
+from edge.perception.scan_notes import OLD_NS, UNCHECKED, age_notes
+from edge.perception.sensor_pad import SensorPad
+from edge.perception.step import Estimate, Step, Window
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taps import Taps
+from edge.perception.taxel_health import TaxelWatch
+from edge.perception.zeroing import Zeroing
+from firmware_bridge.pad_geometry import SensorGeometry
+from firmware_bridge.poses.pose_track import PoseTrack
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.silence import TAPS_FORGOTTEN_NS
+from firmware_bridge.zeroing.baseline import Baseline
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all sensors of a runtime share.
+
+    Attributes:
+        contract: of the model.
+        trust: checks of the model; None without.
+        geometry: of the sensors.
+        options: of the run.
+        estimator: of dead taxels; None where there is no pattern while one is dead.
+        contacts: distribution of contacts by which gains are learned; None where they are not.
+        unix_time_s: dates baselines.
+    """
+
+    contract: Contract
+    trust: Trust | None
+    geometry: SensorGeometry
+    options: RuntimeOptions = DEFAULTS
+    estimator: TaxelEstimator | None = None
+    contacts: ContactModel | None = None
+    unix_time_s: Callable[[], float] = time.time
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is stored for one sensor.
+
+    Attributes:
+        mounting: directions of its axes and its gains; None as wired.
+        baseline: of the free pad; None where it is zeroed from its first scans.
+        counts_per_newton: summed z per [N].
+        pad: its constants.
+        measured: the same without what was learned.
+        notes: on what is stored for other sensors alone.
+    """
+
+    mounting: Mounting | None = None
+    baseline: Baseline | None = None
+    counts_per_newton: float | None = None
+    pad: Pad | None = None
+    measured: Pad | None = None
+    notes: tuple[Note, ...] = ()
+
+
+class Input(NamedTuple):
+    """Input of the model for one step, and the taps of the step's window that it holds."""
+
+    window: NDArray[np.float32]
+    poses: NDArray[np.float32] | None
+    taps: list[int]
+    belonging: tuple[float, ...] | None
+
+
+class Sensor:
+    """Stages of one sensor, in their order: `follow` before the model, `finish` after it.
+
+    Attributes:
+        pad: what the model is told of it.
+        events: what has happened since the last scan; the next one takes them.
+    """
+
+    def __init__(self, name: str, common: Common, settings: Settings, time_ns: int) -> None:
+        """Begin with the sensor's first scan, at a time in [ns]."""
+        geometry, contract = common.geometry, common.contract
+        grid_shape = (geometry.rows, geometry.cols)
+        self.events: list[Untimed] = []
+        self._name = name
+        self._received_ns: int | None = None
+        self._follows_drift = common.options.follow_drift
+        self._every_scan = common.options.every_scan
+        self._watch = TaxelWatch(grid_shape, settings.mounting)
+        self._tracker = TapTracker(contract.taps, common.options, grid_shape)
+        check = None if common.trust is None else PatternCheck(common.trust, contract)
+        self._checked = check is not None
+        self.pad = SensorPad(contract, settings.pad, settings.counts_per_newton, check)
+        self._health = Health(self._watch, common.estimator)
+        self._zeroing = Zeroing(
+            self._tracker, self._watch, settings.mounting, self.report, common.unix_time_s, settings.notes
+        )
+        self._doubt = BaselineDoubt(common.options, geometry.taxel_count, self.report)
+        self._taps = Taps(self._tracker, self._watch, contract, common.options, self.report)
+        self._check = Check(check, self._tracker, self._watch, self.report)
+        self._describe = Describe(contract, geometry, self.pad)
+        self._last = LastReading(geometry.scan_shape)
+        self._learn: Learn | None = None
+        if common.contacts is not None:
+            follower = GainFollower(common.contacts, settings.measured, settings.pad)
+            self._learn = Learn(follower, self.pad, check, self.report)
+        if settings.baseline is not None:
+            age_s = settings.baseline.age_s(common.unix_time_s())
+            # A baseline from the future means that one of the two clocks was wrong.
+            self._zeroing.use(settings.baseline, age_s if age_s >= 0 else None, time_ns)
+            self._doubt.begin(settings.baseline.origin)
+
+    def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
+        """Pass a step through the stages before the model; where a pattern is due it has a window then.
+
+        Args:
+            step: of this sensor's next scan.
+            track: poses of its pad; None where there are none.
+            events: of all sensors, which the step takes with those of its own.
+        """
+        scan = step.scan
+        if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
+            self.lose_touch()
+        self._received_ns = scan.time_ns
+        if self._health(step, self._zeroing.baseline):
+            # Earlier taps hold what a taxel read before it was found dead, or estimates that no note would report.
+            self._tracker.reset()
+        if (zeroed := self._zeroing(step)) is not None:
+            self._doubt.begin(zeroed.origin)
+        self._health.fill(step)
+        step.notes = (*step.notes, *self._zeroing.notes)
+        if scan.time_ns - scan.not_before_ns > OLD_NS:
+            step.notes = (*step.notes, *age_notes(scan))
+        if events or self.events:
+            step.events = tuple(event.at(scan.time_ns) for event in (*events, *self.events))
+            events.clear()
+            self.events.clear()
+        if step.zeroed is None:
+            return
+        if track is not None:
+            step.pose = track.at(scan.on_bus_ns)
+        if step.readings is None:
+            step.state = "incomplete"
+            return
+        self._doubt(step)
+        self._taps(step, track)
+        if self._follows_drift:
+            self._zeroing.follow_drift(step)
+        if not step.contact and self._learn is not None and self._learn.waiting and self._learn.learn(self._watch.dead):
+            self._last.estimate = None
+        if step.doubted:
+            step.notes = (*step.notes, *self._doubt.notes)
+        elif step.contact and not self._checked:
+            step.notes = (*step.notes, UNCHECKED)
+        step.gains_certainty = self.pad.gains_certainty
+        per_newton = self.pad.counts_per_newton
+        if per_newton is not None and step.force_counts is not None:
+            step.force_n = step.force_counts / per_newton
+        elif scan.vendor_force_n is not None:
+            step.force_n = scan.vendor_force_n[2]
+
+    def reuse(self, step: Step) -> bool:
+        """Give a step the sensor's last pattern if nothing has changed since; return whether it has it."""
+        last, window = self._last.estimate, step.window
+        if self._every_scan or last is None or window is None:
+            return False
+        if not self._last.holds(window.counts[0], window.made_by, window.poses):
+            return False
+        step.reuse(last)
+        return True
+
+    def input(self, step: Step, window: Window, contract: Contract) -> Input:
+        """Return the model's input for a step's window, without the taps that do not belong to it."""
+        scaled = contract.scale_window(window.counts, self.pad.gains)
+        taps, belonging = self._check.belonging(step, window, scaled)
+        if window.poses is not None:
+            return Input(scaled[taps], window.poses[taps], taps, belonging)
+        scaled[len(taps) :] = 0
+        return Input(scaled, None, taps, belonging)
+
+    def finish(self, step: Step, window: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
+        """Pass a step with its pattern through the stages after the model.
+
+        Args:
+            step: of this sensor.
+            window: taps that its pattern was due of.
+            made: the pattern, and what the model gives with it.
+            newest: (3, rows, cols) in network units, the readings that it was made from.
+        """
+        step.estimate = made
+        if not step.doubted:
+            self._check(step, made, window.tap, newest)
+            self._describe(made)
+        self._last.keep(window.counts[0], window.made_by, window.poses)
+        self._last.estimate = made
+        if step.doubted:
+            return  # nothing follows from it, and nothing is learned
+        if self._taps.advice is not None:
+            self._taps.advice.see(step, window.tap)
+        if self._learn is not None and self._learn(
+            made.trusted, step.force_counts or 0.0, window.counts[0], self._watch.dead
+        ):
+            self._last.estimate = None  # it was made with other gains
+
+    def zero_again(self, *, force: bool) -> None:
+        """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
+        self._zeroing.zero_again(force=force, doubted=self._doubt.reported is not None)
+
+    def reset_taps(self) -> None:
+        """Forget the taps, as for a new object."""
+        self._tracker.reset()
+
+    def lose_touch(self, *, same_pad: bool = False) -> None:
+        """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
+
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
+        a contact is believed again once the pad was seen at rest, unless it is the `same_pad` for sure.
+        """
+        self._tracker.reset()
+        self._last.estimate = None
+        self._watch.forget()
+        self._doubt.lose_touch(same_pad=same_pad)
+        self._zeroing.lose_touch()
+
+    def take_learned(self) -> Pad | None:
+        """Return the pad if its gains were learned since the last call."""
+        return None if self._learn is None else self._learn.take_learned()
+
+    def report(self, kind: EventKind, detail: str = "") -> None:
+        """Report an event with the sensor's next scan."""
+        self.events.append(Untimed(kind, self._name, detail))
