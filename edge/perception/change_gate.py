@@ -28,10 +28,12 @@ class LastReading:
 
     Attributes:
         estimate: what was made of them; None before the first, and where it must not be used again.
+        scan_number: of their scan.
     """
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
         self.estimate: Estimate | None = None
+        self.scan_number = -1
         self._counts = np.zeros(scan_shape, dtype=np.float32)
         self._change = np.zeros(scan_shape, dtype=np.float32)
         self._made_by: Hashable = None

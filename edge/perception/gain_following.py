@@ -14,6 +14,7 @@ from edge.perception.event import Report
 from edge.perception.gain_learning import ContactModel, GainLearner
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.sensor_pad import SensorPad
+from edge.perception.step import Estimate, Step
 from firmware_bridge.scans.pad_constants import Pad
 
 HELD_SCANS: Final = 200
@@ -124,11 +125,9 @@ class Learn:
     def waiting(self) -> bool:  # noqa: D102 - above
         return self._follower.waiting
 
-    def __call__(
-        self, trusted: bool | None, force_counts: float, counts: NDArray[np.float32], dead: NDArray[np.bool_]
-    ) -> bool:
-        """Take a contact's pattern; return whether another pad is in use since, as `learn` does."""
-        return self._follower.see(trusted, force_counts, counts) and self.learn(dead)
+    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32], dead: NDArray[np.bool_]) -> bool:
+        """Take a contact's pattern and readings; return whether another pad is in use since, as `learn` does."""
+        return self._follower.see(made.trusted, step.force_counts or 0.0, counts) and self.learn(dead)
 
     def learn(self, dead: NDArray[np.bool_]) -> bool:
         """Learn from the contact that waits; return whether another pad is in use since."""

@@ -59,7 +59,7 @@ class TapAdvice:
         # Without a pose the next tap could not be placed.
         if made.pose is None or estimate is None or estimate.poses is None:
             return None
-        if estimate.trusted is False or estimate.taps >= self._taps:
+        if estimate.trusted is False or estimate.taps_used >= self._taps:
             return None
         shift_mm = next_shift_mm(estimate.poses[:, :2], self._reach_mm)
         return None if shift_mm is None else NextTap(*shift_mm, 0.0, _reached(made.pose, *shift_mm))

@@ -77,7 +77,7 @@ class Check:
         if made.deviation is not None and step.dead:
             made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
         check = self._check
-        if check is None:
+        if check is None or made.pattern is None:
             return
         suspected = check.suspected
         verdict = check.judge(tap, newest, made.pattern, made.deviation, made.traction, self._watch.most_repeats)
@@ -102,10 +102,12 @@ class Describe:
     def __call__(self, made: Estimate) -> None:
         """Add to an estimate what follows from its pattern."""
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
+        if pattern is None:
+            raise ValueError("the estimate has no pattern")
         touching = touched(pattern, contract.contact_level)
         made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
         if deviation is not None:
-            expected = expect(contract.confidence, made.taps, pattern, deviation)
+            expected = expect(contract.confidence, made.taps_used, pattern, deviation)
             if expected is not None:
                 made.expected_rmse_mm, made.another_tap = expected.rmse, expected.another_tap
             if contract.interval_factor is not None and touching.any():

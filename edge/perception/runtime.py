@@ -14,7 +14,7 @@ from edge.perception.gain_learning import ContactModel
 from edge.perception.result import Result
 from edge.perception.scan_notes import notes_on_missing
 from edge.perception.sensor import Common, Sensor, Settings
-from edge.perception.step import Estimate, Origin, Step
+from edge.perception.step import Origin, Step
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
@@ -89,15 +89,9 @@ class Runtime:
         self._events: list[Untimed] = []
         self._origin = Origin(source, model.name, contract.output_unit)
         self._scan_shape = geometry.scan_shape
-        self._common = Common(
-            contract,
-            contract.read_trust(),
-            geometry,
-            options,
-            estimator,
-            contacts if options.learn else None,
-            unix_time_s,
-        )
+        learned_by = contacts if options.learn else None
+        trust = contract.read_trust()
+        self._common = Common(contract, trust, geometry, options, estimator, learned_by, unix_time_s)
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad, self._measured = pad, measured
@@ -181,10 +175,10 @@ class Runtime:
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""
         sensor, step = self._follow(scan)
-        if step.window is not None:
+        if step.due is not None:
             if not infer:
                 step.overtake()
-            elif not sensor.reuse(step):
+            elif not sensor.reuse(step, step.due):
                 self._infer([(sensor, step)])
         return step.freeze()
 
@@ -202,9 +196,10 @@ class Runtime:
             WindowError: the scan is not of this sensor geometry.
         """
         sensor, step = self._follow(scan)
-        if step.window is not None and not sensor.reuse(step):
+        if step.due is not None and not sensor.reuse(step, step.due):
             return [overtaken.freeze() for overtaken in self._queue.join(sensor, step)]
-        step.ready(clock_ns)
+        if step.estimate is not None and clock_ns is not None:
+            step.ready(clock_ns())
         return [*(overtaken.freeze() for overtaken in self._queue.leave(scan.sensor)), step.freeze()]
 
     @property
@@ -227,9 +222,10 @@ class Runtime:
         if not due:
             return []
         self._infer(due)
-        done_ns = 0 if clock_ns is None else clock_ns()
-        for _, step in due:
-            step.ready(None if clock_ns is None else lambda: done_ns)
+        if clock_ns is not None:
+            done_ns = clock_ns()
+            for _, step in due:
+                step.ready(done_ns)
         return [step.freeze() for _, step in due]
 
     def _follow(self, scan: Scan) -> tuple[Sensor, Step]:
@@ -245,33 +241,20 @@ class Runtime:
 
     def _infer(self, waiting: Sequence[tuple[Sensor, Step]]) -> None:
         """Give steps the patterns that are due, inferred in one call."""
-        contract = self._model.contract
-        start_ns = self._clock_ns()
-        due = [(sensor, step, step.window) for sensor, step in waiting if step.window is not None]
-        inputs = [sensor.input(step, window, contract) for sensor, step, window in due]
-        poses = [one.poses for one in inputs if one.poses is not None]
-        patterns = self._model.run_together(
-            [one.window for one in inputs],
-            [sensor.pad.row for sensor, _, _ in due],
-            *([poses] if contract.takes_poses else []),
-        )
+        model, start_ns = self._model, self._clock_ns()
+        due = [(sensor, step, step.due) for sensor, step in waiting if step.due is not None]
+        begun = [sensor.begin(step, window) for sensor, step, window in due]
+        poses = [made.poses for made, _ in begun if made.poses is not None]
+        pads = [sensor.pad.row for sensor, _, _ in due]
+        patterns = model.run_together([given for _, given in begun], pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         self._queue.took(run_time_us / len(due))
-        deviations, tractions = self._model.deviation, self._model.traction
-        for row, (one, (sensor, step, window)) in enumerate(zip(inputs, due, strict=True)):
-            made = Estimate(
-                step.scan.number,
-                len(one.taps),
-                window.counts[one.taps],
-                one.poses,
-                patterns[row].copy(),
-                None if deviations is None else deviations[row].copy(),
-                None if step.doubted or tractions is None else tractions[row].copy(),
-                one.belonging,
-                None if one.belonging is None else window.taps - len(one.taps),
-            )
-            step.run_time_us = run_time_us
-            sensor.finish(step, window, made, one.window[0])
+        deviations, tractions = model.deviation, model.traction
+        for row, ((sensor, step, window), (made, given)) in enumerate(zip(due, begun, strict=True)):
+            made.pattern, step.run_time_us = patterns[row].copy(), run_time_us
+            made.deviation = None if deviations is None else deviations[row].copy()
+            made.traction = None if tractions is None else tractions[row].copy()
+            sensor.finish(step, window, made, given[0])
 
     def _meet(self, scan: Scan) -> Sensor:
         name = scan.sensor

@@ -1,9 +1,7 @@
 """One sensor between its scans: the stages that every scan passes, made complete once."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from edge.inference.contract import Contract
 from edge.inference.trust import Trust
 from edge.perception.baseline_doubt import BaselineDoubt
 from edge.perception.change_gate import LastReading
-from edge.perception.contact_options import DEFAULTS, RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import EventKind, Note, Untimed
 from edge.perception.gain_following import GainFollower, Learn
@@ -37,55 +35,27 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 @dataclass(frozen=True)
 class Common:
-    """What all sensors of a runtime share.
-
-    Attributes:
-        contract: of the model.
-        trust: checks of the model; None without.
-        geometry: of the sensors.
-        options: of the run.
-        estimator: of dead taxels; None where there is no pattern while one is dead.
-        contacts: distribution of contacts by which gains are learned; None where they are not.
-        unix_time_s: dates baselines.
-    """
+    """What all sensors of a runtime share."""
 
     contract: Contract
     trust: Trust | None
     geometry: SensorGeometry
-    options: RuntimeOptions = DEFAULTS
-    estimator: TaxelEstimator | None = None
-    contacts: ContactModel | None = None
-    unix_time_s: Callable[[], float] = time.time
+    options: RuntimeOptions
+    estimator: TaxelEstimator | None
+    contacts: ContactModel | None
+    unix_time_s: Callable[[], float]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is stored for one sensor.
+    """What is known of one sensor before its first scan; `measured` is its pad without what was learned."""
 
-    Attributes:
-        mounting: directions of its axes and its gains; None as wired.
-        baseline: of the free pad; None where it is zeroed from its first scans.
-        counts_per_newton: summed z per [N].
-        pad: its constants.
-        measured: the same without what was learned.
-        notes: on what is stored for other sensors alone.
-    """
-
-    mounting: Mounting | None = None
-    baseline: Baseline | None = None
-    counts_per_newton: float | None = None
-    pad: Pad | None = None
-    measured: Pad | None = None
-    notes: tuple[Note, ...] = ()
-
-
-class Input(NamedTuple):
-    """Input of the model for one step, and the taps of the step's window that it holds."""
-
-    window: NDArray[np.float32]
-    poses: NDArray[np.float32] | None
-    taps: list[int]
-    belonging: tuple[float, ...] | None
+    mounting: Mounting | None
+    baseline: Baseline | None
+    counts_per_newton: float | None
+    pad: Pad | None
+    measured: Pad | None
+    notes: tuple[Note, ...]
 
 
 class Sensor:
@@ -101,7 +71,7 @@ class Sensor:
         geometry, contract = common.geometry, common.contract
         grid_shape = (geometry.rows, geometry.cols)
         self.events: list[Untimed] = []
-        self._name = name
+        self._name, self._contract = name, contract
         self._received_ns: int | None = None
         self._follows_drift = common.options.follow_drift
         self._every_scan = common.options.every_scan
@@ -178,47 +148,47 @@ class Sensor:
         elif scan.vendor_force_n is not None:
             step.force_n = scan.vendor_force_n[2]
 
-    def reuse(self, step: Step) -> bool:
+    def reuse(self, step: Step, due: Window) -> bool:
         """Give a step the sensor's last pattern if nothing has changed since; return whether it has it."""
-        last, window = self._last.estimate, step.window
-        if self._every_scan or last is None or window is None:
+        if self._every_scan or self._last.estimate is None:
             return False
-        if not self._last.holds(window.counts[0], window.made_by, window.poses):
+        if not self._last.holds(due.counts[0], due.made_by, due.poses):
             return False
-        step.reuse(last)
+        step.estimate, step.reused_from = self._last.estimate, self._last.scan_number
         return True
 
-    def input(self, step: Step, window: Window, contract: Contract) -> Input:
-        """Return the model's input for a step's window, without the taps that do not belong to it."""
-        scaled = contract.scale_window(window.counts, self.pad.gains)
-        taps, belonging = self._check.belonging(step, window, scaled)
-        if window.poses is not None:
-            return Input(scaled[taps], window.poses[taps], taps, belonging)
+    def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
+        """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
+        scaled = self._contract.scale_window(due.counts, self.pad.gains)
+        taps, belonging = self._check.belonging(step, due, scaled)
+        poses = None if due.poses is None else due.poses[taps]
+        dropped = None if belonging is None else due.taps - len(taps)
+        made = Estimate(len(taps), due.counts[taps], poses, belonging, dropped)
+        if poses is not None:
+            return made, scaled[taps]
         scaled[len(taps) :] = 0
-        return Input(scaled, None, taps, belonging)
+        return made, scaled
 
-    def finish(self, step: Step, window: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
-        """Pass a step with its pattern through the stages after the model.
+    def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
+        """Pass a step through the stages after the model.
 
         Args:
             step: of this sensor.
-            window: taps that its pattern was due of.
+            due: taps that its pattern was due of.
             made: the pattern, and what the model gives with it.
             newest: (3, rows, cols) in network units, the readings that it was made from.
         """
         step.estimate = made
-        if not step.doubted:
-            self._check(step, made, window.tap, newest)
-            self._describe(made)
-        self._last.keep(window.counts[0], window.made_by, window.poses)
-        self._last.estimate = made
-        if step.doubted:
-            return  # nothing follows from it, and nothing is learned
+        self._last.keep(due.counts[0], due.made_by, due.poses)
+        self._last.estimate, self._last.scan_number = made, step.scan.number
+        if step.doubted:  # nothing follows from it, and nothing is learned
+            made.traction = None
+            return
+        self._check(step, made, due.tap, newest)
+        self._describe(made)
         if self._taps.advice is not None:
-            self._taps.advice.see(step, window.tap)
-        if self._learn is not None and self._learn(
-            made.trusted, step.force_counts or 0.0, window.counts[0], self._watch.dead
-        ):
+            self._taps.advice.see(step, due.tap)
+        if self._learn is not None and self._learn(step, made, due.counts[0], self._watch.dead):
             self._last.estimate = None  # it was made with other gains
 
     def zero_again(self, *, force: bool) -> None:

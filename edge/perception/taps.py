@@ -52,14 +52,14 @@ class Taps:
             self._poses.follow(tap, track)
         step.state, step.contact = "idle", tap.contact
         if tap.contact:
-            step.state, step.window = "contact", self._window(step, tap, scheduled=track is None)
+            step.state, step.due = "contact", self._window(step, tap, scheduled=track is None)
         elif step.doubted:
             step.state, step.contact = "baseline_in_doubt", None
             if z_counts >= self._on_counts:  # to be looked at, and made from this scan alone
                 counts = np.zeros_like(tap.window)
                 counts[0] = readings
                 rows = None if self._poses is None else scheduled_rows(1, 0.0)
-                step.window = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
+                step.due = Window(counts, 1, (0,), rows, NO_TAP, (NO_TAP, step.filled))
         if self.advice is not None and not step.doubted:
             step.next_tap = self.advice.proposal(tap)
 

@@ -172,12 +172,6 @@ def test_taxels_are_judged_by_the_axes_of_the_pad(press_counts):
     assert bool(plain.reasons) == (press_counts > 2800)
 
 
-def test_a_sensor_as_it_is_wired_is_not_corrected_at_all():
-    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, mountings={"4": Mounting()})
-    runtime.push(make_scan())
-    assert runtime._sensors["4"].watch._mounting is None
-
-
 def test_forces_are_those_of_each_sensor():
     runtime = Runtime(
         FakeModel(),

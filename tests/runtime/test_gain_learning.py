@@ -1,6 +1,7 @@
 """Gains that a running sensor learns from its contacts: bounded, robust, kept, and forgotten on demand."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,8 +85,9 @@ class TestFileOfAnotherSensor:
         check = PatternCheck(make_trust(), contract)
         pad = SensorPad(contract, file, None, check)
         learn = Learn(GainFollower(MODEL, file), pad, check, lambda kind, detail="": events.append((kind, detail)))
+        step, made = SimpleNamespace(force_counts=5000.0), SimpleNamespace(trusted=None)
         for contact in draw_contacts(count, true):
-            learn(None, 5000.0, contact, ALL_ALIVE)
+            learn(step, made, contact, ALL_ALIVE)
             learn.learn(ALL_ALIVE)
         return check, events
 

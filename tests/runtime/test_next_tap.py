@@ -57,7 +57,7 @@ POSE = PadPose(10, 20, 90)
 
 
 def made(force_counts: float | None = 100.0, pose: PadPose | None = POSE, **changes) -> Any:
-    estimate = SimpleNamespace(**{"poses": taps((0, 0)), "trusted": True, "taps": 1} | changes)
+    estimate = SimpleNamespace(**{"poses": taps((0, 0)), "trusted": True, "taps_used": 1} | changes)
     return SimpleNamespace(force_counts=force_counts, pose=pose, estimate=estimate)
 
 
@@ -116,7 +116,7 @@ def test_the_target_is_the_proposal_in_the_objects_plane():
     assert (target.x_mm, target.y_mm) == pytest.approx((10 - proposed.dy_mm, 20 + proposed.dx_mm))
 
 
-@pytest.mark.parametrize("changes", [{"pose": None}, {"poses": None}, {"trusted": False}, {"taps": 7}])
+@pytest.mark.parametrize("changes", [{"pose": None}, {"poses": None}, {"trusted": False}, {"taps_used": 7}])
 def test_nothing_is_proposed_without_what_it_needs(changes):
     advice = TapAdvice(REACH_MM, taps=7)
     advice.see(made(**changes), 0)
