@@ -35,7 +35,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 @dataclass(frozen=True)
 class Common:
-    """What all sensors of a runtime share."""
+    """Settings that all sensors of a runtime share."""
 
     contract: Contract
     trust: Trust | None
@@ -48,7 +48,7 @@ class Common:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is known of one sensor before its first scan; `measured` is its pad without what was learned."""
+    """Settings of one sensor; `measured` is its pad without what was learned."""
 
     mounting: Mounting | None
     baseline: Baseline | None

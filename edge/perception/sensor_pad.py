@@ -1,4 +1,4 @@
-"""What is known of the pad of one sensor, as the model takes it."""
+"""Pad of one sensor: its constants and gains, as the model takes them."""
 
 from dataclasses import replace
 

@@ -22,7 +22,7 @@ _NONE_DEAD: Final[Mapping[int, str]] = {}
 
 
 class Origin(NamedTuple):
-    """What all results of a run have in common: the kind of their source, the name of the model, the pattern's unit."""
+    """Fields that all results of a run have in common."""
 
     source: SourceKind
     model: str
@@ -51,7 +51,7 @@ class Window(NamedTuple):
 
 @dataclass
 class Estimate:
-    """What the model makes of a window, and what follows from that: fields of a result, under their names there."""
+    """Pattern of a window, and everything that follows from it: fields of a result, under their names there."""
 
     taps_used: int
     window: NDArray[np.float32]
