@@ -165,7 +165,7 @@ def over_slcan(folder: Path, mangle: Any = None, *, stamped: bool = True) -> Out
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
     scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
     if not stamped:  # how many cycles wait for their pace to show depends on when they were read
-        return {"exit": ran.returncode, "fresh": sorted({one["fresh"] for one in scans}), "enough": len(scans) > 150}
+        return {"exit": ran.returncode, "fresh": sorted({one["fresh"] for one in scans}), "enough": len(scans) > 20}
     kept = [{"scan": one["scan"], "counts": brief(one["counts"])} for one in scans if one["scan"] % 15 == 0]
     return {"exit": ran.returncode, "fresh": [one["fresh"] for one in scans], "records": kept}
 
