@@ -17,7 +17,7 @@ from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_messages import POSE, decode_pose, encode_pose
+from firmware_bridge.recording.scan_messages import POSE, decode_pose, encode_pose
 
 __all__ = ["files"]
 STEP_NS = 10_000_000

@@ -147,7 +147,7 @@ class TestEnds:
         scans = [record for record in got if record["state"] != "event"]
         assert [record["scan"] for record in scans] == list(range(len(scans)))
         assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
-        assert scans[-1]["counters"]["missed"] > 0
+        assert [record["counters"] for record in scans if "counters" in record][-1]["missed"] > 0
 
     def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
         leader, follower = pty.openpty()

@@ -43,7 +43,7 @@ def read_slowly(path: Path, ran: Ran) -> None:
         turn_s = time.monotonic()
         for line in stream:
             try:
-                ran.unwritten = orjson.loads(line)["counters"]["unwritten"]
+                ran.unwritten = orjson.loads(line).get("counters", {"unwritten": ran.unwritten})["unwritten"]
             except orjson.JSONDecodeError:
                 ran.broken.append(f"slow.fifo: record {ran.slow + 1} is not whole")
             ran.slow += 1
