@@ -4,18 +4,19 @@ import json
 from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS, MAPS
 from edge.sinks.ros2.cdr_messages import RESULT
-from edge.sinks.ros2.map_messages import UNITS, image_map
+from edge.sinks.ros2.map_messages import UNITS
 from edge.sinks.ros2.ros_types import IMAGE
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -47,12 +48,21 @@ def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator
         yield from _Rows(file, geometry, origin, baselines).rows()
 
 
+class _Topic(NamedTuple):
+    """Topic: the part of its name that stands for a sensor, the rest, its type, and a map's factor to its unit."""
+
+    sensor: str
+    name: str
+    kind: MessageType
+    factor: float
+
+
 class _Rows:
     def __init__(self, path: Path, geometry: SensorGeometry, origin: str, baselines: dict[str, Baseline]) -> None:
         self._path, self._geometry, self._origin, self._baselines = path, geometry, origin, baselines
         self._types: dict[int, MessageType | None] = {}
         self._names: dict[int, str] = {}
-        self._topics: dict[int, tuple[str, str, MessageType]] = {}
+        self._topics: dict[int, _Topic] = {}
         self._taps = 1
         self._of = ""
         self._row: dict[str, Any] | None = None
@@ -66,12 +76,12 @@ class _Rows:
                         self._take(opcode, ReadDataStream(BytesIO(data)))
                         continue
                     channel, _, log_ns, _ = MESSAGE.unpack_from(data)
-                    sensor, name, kind = self._topics.get(channel, ("", "", None))
-                    if kind is None:
+                    topic = self._topics.get(channel)
+                    if topic is None:
                         continue
-                    if kind.name == SCAN_NAME and self._row is not None:
+                    if topic.kind.name == SCAN_NAME and self._row is not None:
                         yield self._row
-                    self._read(sensor, name, kind, log_ns, data[MESSAGE.size :])
+                    self._read(topic, log_ns, data[MESSAGE.size :])
         except DamageError:
             pass  # a note of `load_recording` states it
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -89,25 +99,26 @@ class _Rows:
             sensor, _, name = channel.topic.rpartition("/")
             kind = self._types.get(channel.schema_id)
             if kind is not None:
-                self._topics[channel.id] = sensor, name, kind
+                # Earlier releases wrote maps in their own units, and stated none.
+                factor = UNITS[name].factor if name in UNITS and channel.metadata.get("unit") else 1.0
+                self._topics[channel.id] = _Topic(sensor, name, kind, factor)
         elif opcode == Opcode.METADATA:
             metadata = Metadata.read(stream)
             if metadata.name == "contract":
                 self._taps = int(metadata.metadata.get("taps", "1"))
 
-    def _read(self, sensor: str, name: str, kind: MessageType, log_ns: int, data: memoryview) -> None:
-        if kind.name == SCAN_NAME:
-            self._of, self._row = sensor, self._begun(data, log_ns)
-        elif kind.name == BASELINE_NAME:
+    def _read(self, topic: "_Topic", log_ns: int, data: memoryview) -> None:
+        if topic.kind.name == SCAN_NAME:
+            self._of, self._row = topic.sensor, self._begun(data, log_ns)
+        elif topic.kind.name == BASELINE_NAME:
             baseline = decode_baseline(data, self._geometry)
             self._baselines[baseline.sensor] = baseline
-        elif sensor != self._of or self._row is None:
+        elif topic.sensor != self._of or self._row is None:
             return
-        elif kind.name == RESULT.name:
-            self._row |= self._made(json.loads(kind.decode(data)["record"]))
-        elif name in _MAP_NAMES:
-            values = image_map(bytes(data)) / np.float32(UNITS[name].factor)
-            self._row[name] = values.reshape(3, -1, values.shape[1]) if name == "traction" else values
+        elif topic.kind.name == RESULT.name:
+            self._row |= self._made(json.loads(topic.kind.decode(data)["record"]))
+        elif topic.name in _MAP_NAMES:
+            self._row[topic.name] = _map(topic, data)
             self._row["has_pattern"] = True
 
     def _begun(self, data: memoryview, log_ns: int) -> dict[str, Any]:
@@ -129,7 +140,10 @@ class _Rows:
         return row
 
     def _made(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        return {field.name: self._value(field, record) for field in _OF_RECORDS if field.name not in _OF_SCANS}
+        made = {field.name: self._value(field, record) for field in _OF_RECORDS if field.name not in _OF_SCANS}
+        if record.get("poses") is None:  # as of all scans of a model that takes none
+            del made["poses"]
+        return made
 
     def _value(self, field: Field, record: Mapping[str, Any]) -> Any:
         value: Any = record
@@ -137,7 +151,7 @@ class _Rows:
             value = None if value is None else value.get(key)
         if field.name == "poses":
             poses = np.full((self._taps, 5), np.nan, np.float32)
-            if value:
+            if value is not None:
                 poses[: len(value)] = value[: self._taps]
             return poses
         if field.parts:
@@ -146,6 +160,14 @@ class _Rows:
         if value is None:
             return field.kind.unknown
         return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
+
+
+def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:
+    image = IMAGE.decode(data)
+    values = image["data"].view("<f4") / np.float32(topic.factor)
+    if image["encoding"] == "32FC3":  # a traction of an earlier release
+        return values.reshape(image["height"], image["width"], 3).transpose(2, 0, 1)
+    return values.reshape((3, -1, image["width"]) if topic.name == "traction" else (-1, image["width"]))
 
 
 def _flat(value: Any) -> list[float | None]:

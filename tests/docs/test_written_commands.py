@@ -60,7 +60,6 @@ PARSED = {
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_hot_path",
-    r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
 }
 LEFT_OUT = {

@@ -35,7 +35,9 @@ class TestJsonLines:
             sink.write(result, RUN)
         sink.close()
         counters = RUN | {"unwritten": 0}
-        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, counters) for result in results)
+        turns = [counters, counters, *[None] * 6]  # of each sensor, in the first record of these eight
+        expected = b"".join(map(record_line, results, turns))
+        assert (tmp_path / "out.jsonl").read_bytes() == expected
 
     @pytest.mark.parametrize(
         ("chosen", "more"),
