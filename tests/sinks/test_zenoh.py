@@ -57,7 +57,7 @@ class TestMessages:
         for number, result in enumerate(results):
             counters = {"scans": number}
             sink.write(result, counters)
-            said = plain(record(result, counters))
+            said = plain(record(result, None if number else counters))  # all within a second
             expected.append(("grip/4/scan", "application/json", said, {}))
             if result.pattern is not None and result.reused_from is None:
                 maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
@@ -122,7 +122,8 @@ class TestMessages:
             assert header["source"] == "replay"
             np.testing.assert_allclose(maps["pattern"], one["pattern"], atol=1e-7)
         for scan, one in zip(scans, records, strict=True):
-            assert scan == {name: one[name] for name in scan} | {"counters": scan["counters"]}
+            assert scan.pop("counters", {}).keys() | {"unwritten"} >= one.get("counters", {}).keys()
+            assert scan == {name: one[name] for name in scan}
 
     def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
