@@ -62,7 +62,10 @@ def convert(options: argparse.Namespace) -> None:
     sensors = [track.sensor for track in replay.recordings[0].tracks]
     files: dict[Path, str | None] = {target: None}
     if ending == ".csv" and len(sensors) > 1:
-        files = {target.with_stem(f"{target.stem}-{name.replace('/', '-')}"): name for name in sensors}
+        parts = [name.replace("/", "-") for name in sensors]
+        if len(set(parts)) < len(parts):
+            parts = [str(number) for number in range(1, len(parts) + 1)]
+        files = {target.with_stem(f"{target.stem}-{part}"): name for part, name in zip(parts, sensors, strict=True)}
     for path in files:
         _check_new(path)
     for path, sensor in files.items():
