@@ -35,7 +35,7 @@ _WITHOUT: Final = {
     (".csv", ".mcap"): "the time of day, which the file does not state",
     (".csv", ".npz"): "the vendor's newtons",
 }
-"""What is not in the new file, by the endings of both."""
+"""Parts of a recording that are not in the new file, by the endings of both."""
 
 
 def convert(options: argparse.Namespace) -> None:
@@ -96,7 +96,7 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
     size_mb = path.stat().st_size / 1e6
     _tell(f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}")
     if scans < expected:
-        _tell(f"{expected - scans} scans are left out: a taxel gave no reading, which a CSV cannot say")
+        _tell(f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell")
 
 
 def _tell(text: str) -> None:

@@ -26,7 +26,7 @@ def write_csv(
     *,
     emulated: bool,
 ) -> None:
-    """Write the scans of a sensor that have all readings: a CSV cannot say that one is absent.
+    """Write the scans of a sensor that have all readings: a CSV has no cell for an absent one.
 
     Args:
         path: of the file.

@@ -1,4 +1,4 @@
-"""`edge-sr convert`: what a recording holds is in the new file, and nothing is replaced, lost or left behind."""
+"""`edge-sr convert`: all that a recording holds is in the new file, and nothing is replaced, lost or left behind."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""What every sink promises: each kind of result and event comes back, it fails alone, and ends cleanly."""
+"""Contract of every sink: each kind of result and event comes back, it fails alone, and ends cleanly."""
 
 import json
 import os
@@ -40,7 +40,7 @@ EVENTS = (
 
 
 class Back(NamedTuple):
-    """What a reader of any sink can tell of a result; None of what this one does not hold."""
+    """Values of a result that a reader finds; None for those that its sink does not hold."""
 
     sensor: str
     scan: int | None
@@ -179,7 +179,7 @@ class Shm(Opened):
 
 
 class Zenoh(Opened):
-    """What a process of its own hears."""
+    """Messages that a process of its own receives."""
 
     def __init__(self, folder: Path) -> None:
         pytest.importorskip("zenoh")

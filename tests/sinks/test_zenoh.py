@@ -30,7 +30,7 @@ from zenoh_samples import (
 )
 
 from edge import api
-from edge.errors import SinkError, UsageError
+from edge.errors import SinkError
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
@@ -271,21 +271,6 @@ class TestWhoComesAndGoes:
 
 
 class TestOpening:
-    @pytest.mark.parametrize(
-        ("target", "told"),
-        [
-            ("a//b", r"'a//b' for a key"),
-            ("a/*", r"'a/\*' for a key"),
-            ("@/a", r"'@/a' for a key"),
-            ("a?listen=x", r"'listen=x' after its key: expected zenoh:KEY, zenoh:KEY\?connect="),
-            ("a?connect=here", r"'connect=here' after its key"),
-            ("a?", r"'' after its key"),
-        ],
-    )
-    def test_what_cannot_be_understood_is_refused(self, target, told):
-        with pytest.raises(UsageError, match=told):
-            open_sink(f"zenoh:{target}", CONTRACT)
-
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
         with pytest.raises(SinkError, match=r"none.json5 is not a zenoh configuration: No such file"):
             open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT)
