@@ -43,7 +43,7 @@ class TestEndOfTheProgram:
             while consumer.next()[0] != "got":
                 pass
             consumer.process.send_signal(signal.SIGSTOP)
-            time.sleep(3)
+            time.sleep(1)
             begin_s = time.monotonic()
             program.send_signal(signal.SIGTERM)
             words = program.communicate()[1].decode()
