@@ -233,7 +233,7 @@ def open_sink(
     """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
 
     Args:
-        text: "jsonl:FILE", "npz:FILE.npz", "mcap:FILE.mcap", ...
+        text: "jsonl:FILE", "mcap:FILE.mcap", ...
         contract: contract of the model that makes the results.
         source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
         stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.

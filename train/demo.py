@@ -16,7 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
-from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from train.data.dataset import between_frames
 from train.data.generation_config import SEED
 from train.physics.magnets import Magnet, dipole_mt

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edge.bench.errors import BenchError
 from edge.pipeline.pump import uncollected
-from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 SEED: Final = 0
@@ -207,8 +207,12 @@ class Program:
 
 
 def parsed(heads: Iterable[tuple[int, bytes]]) -> list[Line]:
-    """Return records of `Program.heads`."""
-    return [Line(time_ns, json.loads(head)) for time_ns, head in heads]
+    """Return records of `Program.heads`, each with the counters up to it, which only some have."""
+    lines = [Line(time_ns, json.loads(head)) for time_ns, head in heads]
+    counters = next((line.record["counters"] for line in lines if "counters" in line.record), {})
+    for line in lines:
+        counters = line.record.setdefault("counters", counters)
+    return lines
 
 
 @contextmanager

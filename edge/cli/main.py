@@ -30,6 +30,7 @@ from edge.api import (
 )
 from edge.cli.run_options import (
     baseline_parser,
+    convert_parser,
     demo_parser,
     devices_parser,
     map_parser,
@@ -159,6 +160,14 @@ def _replay(arguments: Sequence[str]) -> int:
     return 0
 
 
+def _convert(arguments: Sequence[str]) -> int:
+    options = convert_parser().parse_args(arguments)
+    from edge.cli.convert_command import convert
+
+    convert(options)
+    return 0
+
+
 def _models(arguments: Sequence[str]) -> int:
     options = models_parser().parse_args(arguments)
     from edge.cli.models_command import run
@@ -227,6 +236,7 @@ COMMANDS: Final = {
     "demo": _demo,
     "record": _record,
     "replay": _replay,
+    "convert": _convert,
     "map": _map,
     "models": _models,
     "baseline": _baseline,

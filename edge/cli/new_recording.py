@@ -11,9 +11,8 @@ from edge.errors import SinkError, UsageError
 from edge.pipeline.run_statistics import Statistics
 from edge.sinks.registry import check_apart
 
-_NOT_WRITTEN: Final = (".csv", ".json", ".jsonl")
+_NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
 """Suffixes of other formats, which a recording must not be named after."""
-_RECORDS: Final = "for records in JSON use edge-sr --sink jsonl:FILE"
 
 
 @contextmanager
@@ -31,12 +30,16 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
     if path.suffix.lower() in _NOT_WRITTEN:
-        raise UsageError(f"{path.suffix} cannot be recorded: expected {path.stem}.mcap or {path.stem}.npz; {_RECORDS}")
-    if path.suffix not in (".mcap", ".npz"):
+        made = path.with_suffix(".mcap")
+        then = "for records in JSON use edge-sr --sink jsonl:FILE"
+        if path.suffix.lower() in (".csv", ".npz"):
+            then = f"afterwards edge-sr convert {made} {path}"
+        raise UsageError(f"{path.suffix} cannot be recorded: edge-sr record {made}; {then}")
+    if path.suffix != ".mcap":
         path = path.with_name(path.name + ".mcap")
     if path.exists():  # checked before anything is begun
         raise SinkError(f"{path} exists: give another name, or delete it first")
-    options.sink = [*options.sink, f"{path.suffix[1:]}:{path}"]
+    options.sink = [*options.sink, f"mcap:{path}"]
     check_apart(options.sink)
     statistics = Statistics()
     try:

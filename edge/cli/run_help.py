@@ -14,6 +14,7 @@ devices\tlist what is plugged in, and what to type to read it
 doctor\tfind faults of sensor and adapter, and how the pad is mounted
 record FILE\trun, and record into a file
 replay FILE\tcompute the patterns of a recording
+convert FILE NEW\twrite a recording in another format
 map\tfuse the patterns into a map of an object larger than the pad
 baseline\tmeasure the free pad once, and store it
 models\tlist the bundled models
@@ -35,8 +36,7 @@ demo[:loop]\temulated sensor
 outputs, S:
 status\tone live line (default on a terminal)
 jsonl:FILE\tone JSON record a line; jsonl:- is stdout
-npz:FILE.npz\trecording, for replay and numpy
-mcap:FILE.mcap\trecording, for replay, Foxglove and ROS 2
+mcap:FILE.mcap\trecording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it
 shm:NAME\tlatest values in shared memory
 zenoh:KEY\tmessages over zenoh; to a router with ?connect=tcp/HOST:7447
 ros2:TOPIC\tROS 2 messages
@@ -107,6 +107,16 @@ examples:
   edge-sr replay press.mcap \\
           --model mtsr4-int8 \\
           --sink mcap:again.mcap
+"""
+
+CONVERT_HELP: Final = """\
+Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
+several a file each). What the new file cannot hold is printed. Nothing is computed, and no file is replaced.
+
+examples:
+  edge-sr convert press.mcap press.npz
+  edge-sr convert press.mcap press.csv
+  edge-sr convert old.npz old.mcap
 """
 
 MAP_HELP: Final = """\

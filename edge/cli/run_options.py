@@ -11,6 +11,7 @@ from typing import Final
 
 from edge.cli.run_help import (
     BASELINE_HELP,
+    CONVERT_HELP,
     DEMO_ABOUT,
     DEMO_HELP,
     MAP_HELP,
@@ -75,7 +76,7 @@ def record_parser() -> argparse.ArgumentParser:
         description="Runs like edge-sr, and records scans, patterns and events.",
         epilog=RECORD_HELP,
     )
-    parser.add_argument_group("file").add_argument("file", metavar="FILE", help="new file, .npz or .mcap")
+    parser.add_argument_group("file").add_argument("file", metavar="FILE", help="new file, .mcap")
     _add_run(parser)
     return parser
 
@@ -154,6 +155,21 @@ def replay_parser() -> argparse.ArgumentParser:
     _add_view(parser)
     _add_results(parser)
     parser.set_defaults(source=[], id_map=None, give_up_s=None, realtime=False, poses=[])
+    return parser
+
+
+def convert_parser() -> argparse.ArgumentParser:
+    """Return the parser of `edge-sr convert`."""
+    parser = Parser(
+        prog="edge-sr convert",
+        usage="edge-sr convert FILE NEW",
+        description="Writes a recording in another format: that of the ending of the new name.",
+        epilog=CONVERT_HELP,
+    )
+    add = parser.add_argument_group("recording").add_argument
+    add("recording", metavar="FILE", help="recording, .mcap, .npz, .csv or a rosbag2 folder")
+    add("new", metavar="NEW", help="new file, .mcap, .npz or .csv")
+    add("--rate-hz", metavar="R", type=positive, help="scans a second of a .csv that does not state it")
     return parser
 
 

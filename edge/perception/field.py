@@ -22,7 +22,7 @@ class Out(Flag):
 
     Attributes:
         RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
-        NPZ: arrays of a recording.
+        NPZ: arrays that `edge-sr convert` makes of a recording.
         ROS: members of tactile_edge_sr/msg/Result.
         MAP: maps next to the record: in lines of JSON, in packed messages and as images of MCAP.
         ALL: all but maps.
@@ -49,7 +49,6 @@ class Kind:
             none of them, and the order is part of the format.
         shape: name of an array's shape: "scan", "pattern", "deviation", "traction" or "poses", which has a row for each
             tap.
-        cut: npz cuts a text that is too long, rather than refuse it.
     """
 
     label: str
@@ -59,7 +58,6 @@ class Kind:
     unknown: Any = None
     words: tuple[str, ...] = ()
     shape: str = ""
-    cut: bool = False
 
 
 class Column(NamedTuple):
@@ -154,14 +152,6 @@ class Field:
         if self.kind.shape and self.decimals is not None:
             return Column(self.attribute, partial(np.round, decimals=self.decimals), None)
         return Column(self.attribute, self.make, None, self.decimals)
-
-    def in_array(self) -> Column:
-        """Return the column of the npz; a vector is a tuple."""
-        column = self.in_message()
-        if not self.kind.cut:
-            return column
-        characters = int(self.kind.array.removeprefix("<U"))
-        return column._replace(make=_then(self.make, lambda text: text[:characters]))
 
     def in_message(self) -> Column:
         """Return the column of ROS messages; a vector is a tuple."""

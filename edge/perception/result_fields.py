@@ -25,8 +25,8 @@ from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 
-def _text(characters: int, packed_bytes: int, *, cut: bool = False) -> Kind:
-    return Kind("text", f"<U{characters}", f"{packed_bytes}s", "string", cut=cut)
+def _text(characters: int, packed_bytes: int) -> Kind:
+    return Kind("text", f"<U{characters}", f"{packed_bytes}s", "string")
 
 
 def _one_of(*words: str, unknown: str | None = None) -> Kind:
@@ -148,7 +148,7 @@ FIELDS: Final = (
           "`incomplete`: a taxel has not arrived yet, or more are dead than can be estimated; "
           "`baseline_in_doubt`: an old baseline or drift explains the readings as well as a touch; "
           "`dropped`: a newer scan was already waiting", byte=52),
-    Field("model", _text(32, 64, cut=True), "model", "name of the model; npz and shared memory cut a long one",
+    Field("model", _text(32, 64), "model", "name of the model; npz and shared memory cut a long one",
           byte=440),
     Field("fresh", _BITS, "scan.fresh", "bit i: taxel i (row-major from the top left) arrived in this scan",
           make=mask_bits, out=Out.RECORD, byte=88),

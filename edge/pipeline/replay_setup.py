@@ -16,7 +16,6 @@ from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.replay_player import PlayedReplay, Player
 from firmware_bridge.pad_geometry import PADS, SensorGeometry
-from firmware_bridge.recording.formats import npz_baselines
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.mounting import Mounting
@@ -198,8 +197,6 @@ class _FollowedReplay(ReplayLink):
 def _in_its_time(recording: Recording, *, paced: bool) -> dict[str, Baseline]:
     """Return a recording's baselines; if it is paced and undated, dated so that they keep their ages at its scans."""
     baselines = dict(recording.baselines)
-    if recording.path.suffix.lower() == ".npz":
-        baselines = npz_baselines(recording)
     if not paced or recording.unix_offset_ns:  # 0: the time of recording was unknown even then
         return baselines
     firsts_ns = {track.sensor: track.time_ns[0] for track in recording.tracks if track.time_ns is not None}

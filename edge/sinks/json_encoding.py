@@ -11,6 +11,12 @@ from edge.perception.result_fields import FIELDS, MAPS
 
 ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "note", "pattern_unit")
 """Fields of every record: which scan it is of, and whether a robot may act on it; `note` names old readings."""
+PROGRESS: Final = frozenset(
+    ("received_bytes", "transfers", "frames", "readings", "messages", "scans", "replies", "status_answers", "poses")
+)
+"""Counters that grow while all is well; every other one counts something that was lost, odd, or refused."""
+COUNTED_NS: Final = 1_000_000_000
+"""Time from which on a sensor's record has the counters again, in [ns]."""
 _HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
 _ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
 
@@ -33,16 +39,37 @@ class RecordForm:
         self._left_out = tuple(field.name for field in heads if field.left_out)
         self._columns = Columns(field.in_record() for field in (*heads, *appended))
 
-    def of(self, result: Result, counters: Mapping[str, int]) -> dict[str, Any]:
-        """Return a result; absent is None, masks have bit i for taxel i. Counts and maps may be arrays."""
+    def of(self, result: Result, counters: Mapping[str, int] | None = None) -> dict[str, Any]:
+        """Return a result; absent is None, masks have bit i for taxel i. Counts and maps may be arrays.
+
+        Without counters there is no such key.
+        """
         values = self._columns.of(result)
         fields: dict[str, Any] = dict(zip(self._names, values, strict=False))
         for name in self._left_out:
             if fields[name] is None:
                 del fields[name]
-        fields["counters"] = dict(counters)
+        if counters is not None:
+            fields["counters"] = dict(counters)
         fields.update(zip(self._maps, values[len(self._names) :], strict=True))
         return fields
+
+
+class CountersInTurn:
+    """Turns of a sensor's records to have the counters: one a second, and each in which one but PROGRESS changes."""
+
+    def __init__(self) -> None:
+        self._shown: dict[str, tuple[int, dict[str, int]]] = {}
+
+    def of(self, result: Result, counters: Mapping[str, int]) -> Mapping[str, int] | None:
+        """Return the counters where it is this record's turn to have them, else None."""
+        scan = result.scan
+        troubles = {name: count for name, count in counters.items() if name not in PROGRESS}
+        before_ns, before = self._shown.get(scan.sensor, (None, None))
+        if before_ns is not None and 0 <= scan.time_ns - before_ns < COUNTED_NS and before == troubles:
+            return None
+        self._shown[scan.sensor] = scan.time_ns, troubles
+        return counters
 
 
 def chosen_fields(text: str) -> frozenset[str]:

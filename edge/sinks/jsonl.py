@@ -17,7 +17,7 @@ from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import RecordForm, event_record
+from edge.sinks.json_encoding import CountersInTurn, RecordForm, event_record
 from edge.sinks.pipe_capacity import has_room, widen
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
@@ -30,7 +30,7 @@ class JsonLinesSink(Sink):
     """Writer of records into a file, or with "-" to stdout.
 
     In a robot's run a slow reader must delay nothing: records that do not fit into its pipe are left out and counted,
-    and its next record carries the count. A run that ends waits for no reader.
+    and its next record carries the count, as of any other counter that changes. A run that ends waits for no reader.
     """
 
     def __init__(
@@ -60,6 +60,7 @@ class JsonLinesSink(Sink):
         self._form = _ALL if fields is None else RecordForm(fields, maps=True)
         self._source = source
         self.unwritten = 0
+        self._turns = CountersInTurn()
         try:
             self._file = _open(target)
         except OSError as error:
@@ -71,7 +72,8 @@ class JsonLinesSink(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; its counter `unwritten` counts what was left out for this reader only."""
-        self._write(record_line(result, {**counters, "unwritten": self.unwritten}, self._form))
+        counters = {**counters, "unwritten": self.unwritten}
+        self._write(record_line(result, self._turns.of(result, counters), self._form))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
@@ -100,7 +102,7 @@ class JsonLinesSink(Sink):
             self._file.close()
 
 
-def record_line(result: Result, counters: Mapping[str, int], form: RecordForm = _ALL) -> bytes:
+def record_line(result: Result, counters: Mapping[str, int] | None, form: RecordForm = _ALL) -> bytes:
     """Return a result as one line of JSON, its maps last."""
     return orjson.dumps(form.of(result, counters), option=_OPTIONS)
 

@@ -7,7 +7,6 @@ from typing import Final
 
 from edge.errors import UsageError
 from edge.inference.contract import Contract
-from edge.inference.pose_input import POSE_WIDTH
 from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.topic_names import base_topic
@@ -18,10 +17,10 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 FORMS: Final = (
-    *("status", "jsonl:FILE", "jsonl:- (stdout)", "npz:FILE.npz", "mcap:FILE.mcap"),
+    *("status", "jsonl:FILE", "jsonl:- (stdout)", "mcap:FILE.mcap"),
     *("shm:NAME", "zenoh:KEY", "ros2:TOPIC", "ros2:TOPIC?commands"),
 )
-_TARGETED: Final = ("jsonl", "npz", "mcap", "shm", "zenoh", "ros2")
+_TARGETED: Final = ("jsonl", "mcap", "shm", "zenoh", "ros2")
 
 
 def check_sink(text: str) -> tuple[str, str]:
@@ -31,11 +30,13 @@ def check_sink(text: str) -> tuple[str, str]:
         UsageError: no such form (the forms are listed), or no target of this form.
     """
     form, _, target = text.partition(":")
-    ending = f".{form}" if form in ("npz", "mcap") else ""
+    if form == "npz" and target:
+        made = Path(target).with_suffix(".mcap")
+        raise UsageError(f"no sink {text!r}: record by --sink mcap:{made}, then edge-sr convert {made} {target}")
     if text != "status" and (form not in _TARGETED or not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
-    if not target.endswith(ending):
-        raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in {ending}")
+    if form == "mcap" and not target.endswith(".mcap"):
+        raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in .mcap")
     if form == "ros2":
         _ros2_topic(target)
     if form == "zenoh":
@@ -104,19 +105,6 @@ def open_sink(
 
         chosen = None if fields is None else chosen_fields(fields)
         return JsonLinesSink(target, lossless=lossless, source=source, stop=stop, fields=chosen)
-    if form == "npz":
-        from edge.sinks.npz import NpzSink
-
-        return NpzSink(
-            Path(target),
-            (3, contract.rows, contract.cols),
-            contract.pattern_shape,
-            deviations=contract.interval_factor is not None,
-            traction_shape=contract.traction_shape,
-            poses_shape=(contract.taps, POSE_WIDTH) if contract.takes_poses else None,
-            mountings=mountings,
-            origin=origin,
-        )
     if form == "mcap":
         _check_unit(text, contract)
         from edge.sinks.mcap import McapSink

@@ -21,7 +21,7 @@ from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.binary_message import pack
-from edge.sinks.json_encoding import event_record, record
+from edge.sinks.json_encoding import CountersInTurn, event_record, record
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:
@@ -71,6 +71,7 @@ class ZenohSink(Sink):
         self._zenoh = zenoh
         self._key = key
         self._source = source
+        self._turns = CountersInTurn()
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         try:
             self._session = zenoh.open(configured(configuration))
@@ -94,7 +95,7 @@ class ZenohSink(Sink):
             SinkError: the session is broken.
         """
         publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
-        text = record(result, counters)
+        text = record(result, self._turns.of(result, counters))
         self._read = any(map(_matched, (*publishers, self._events)))
         self._put(publishers[0], orjson.dumps(text, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:

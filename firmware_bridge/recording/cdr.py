@@ -77,6 +77,20 @@ class MessageType:
         lines = (line.partition("#")[0].strip() for line in text.splitlines())
         self.fields = tuple(_field(line, known) for line in lines if line)
 
+    @classmethod
+    def of(cls, name: str, definition: str) -> "MessageType":
+        """Return the type of a message by its whole definition, as `definition` gives it.
+
+        Raises:
+            ValueError: a line of it is no such field.
+        """
+        text, *sections = definition.split(f"\n{_RULE}\nMSG: ")
+        parts: list[MessageType] = []
+        for section in reversed(sections):  # each comes before its own parts
+            part, _, body = section.partition("\n")
+            parts.append(cls(part, body, *parts))
+        return cls(name, text, *parts)
+
     @property
     def definition(self) -> str:  # noqa: D102 - above
         parts = (f"\n{_RULE}\nMSG: {part.name.replace('/msg/', '/')}\n{part._text}" for part in self._parts)

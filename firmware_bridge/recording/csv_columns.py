@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
-from firmware_bridge.recording.csv_poses import CSV_POSES
 from firmware_bridge.schedule import NS_PER_S
 
+CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
+EMULATED: Final = "emulated"
+"""Column of a recording of an emulated sensor, whatever its cells are."""
 _TAXEL: Final = re.compile(r"(?P<force>force[ _])?(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
 _TIMES: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "datetime", "clock", "epoch", "elapsed"}
 _UNITS: Final = {
@@ -35,6 +37,7 @@ class CsvColumns:
         newtons: columns of the vendor's newtons, in the same order; empty without all of them.
         poses: columns of the poses, as CSV_POSES; empty without.
         times: names of the columns of times, by column.
+        emulated: whether there is the column of an emulated sensor.
         left_out: names of all others.
     """
 
@@ -74,7 +77,8 @@ class CsvColumns:
         self.newtons = [newtons[key] for key in wanted] if newtons.keys() == wanted.keys() else []
         poses = [names.index(name) for name in CSV_POSES if name in others.values()]
         self.poses = poses if [names[column] for column in poses] in (list(CSV_POSES[:2]), list(CSV_POSES)) else []
-        self.left_out = [name for column, name in others.items() if column not in self.poses]
+        self.emulated = EMULATED in others.values()
+        self.left_out = [name for column, name in others.items() if column not in self.poses and name != EMULATED]
         posed = [name for name in self.left_out if name.lower().startswith("pose")]
         if posed:
             raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.csv_columns import CsvColumns, rate_of
-from firmware_bridge.recording.csv_poses import CsvPoses
+from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
@@ -97,7 +99,7 @@ class _Scans:
         self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
         self._counts = array("i")
         self._newtons = array("f")
-        self._poses = CsvPoses()
+        self._poses = PoseRows()
         self._times = {column: array("d") for column in self._columns.times}
         self._before: list[str] = []
         self.count = 0
@@ -112,20 +114,30 @@ class _Scans:
         cells, columns = row.cells, self._columns
         _check_whole(row, self._width, self._before)
         self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
-        wrong = self._poses.add(self.count, [cells[column] for column in columns.poses])
-        if wrong is not None:
-            _refuse(self._path, row.line, f"'{wrong[:20]}'", "a number for each value of a pose, or for none")
+        self._add_pose(row.line, [cells[column] for column in columns.poses])
         self._newtons.extend(_number(cells[column]) for column in columns.newtons)
         for column, times in self._times.items():
             times.append(_time_s(cells[column]))
         self._before = cells
         self.count += 1
 
+    def _add_pose(self, line: int, cells: list[str]) -> None:
+        if not any(cells):
+            return
+        values = [_number(cell) for cell in cells]
+        wrong = [cell for cell, value in zip(cells, values, strict=True) if not math.isfinite(value)]
+        if wrong:
+            _refuse(self._path, line, f"'{wrong[0][:20]}'", "a number for each value of a pose, or for none")
+        try:
+            self._poses.add(TimedPose(PadPose(*values), self.count, used_from_ns=self.count))
+        except ValueError as error:
+            raise RecordingError(f"{self._path}, line {line}: its pose: {error}") from error
+
     def recording(self, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others.
 
         Raises:
-            RecordingError: a pose is out of range, or the file with the rate cannot be used.
+            RecordingError: the file with the rate cannot be used.
         """
         path, columns = self._path, self._columns
         rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
@@ -146,10 +158,9 @@ class _Scans:
             vendor=_vendor(self._newtons, geometry) if self._newtons else None,
         )
         rate_hz = rate_hz or _meta_rate_hz(path.with_name(_META_NAME))
-        try:
-            return Recording(path, (track,), rate_hz, notes=tuple(notes), poses=self._poses.poses())
-        except ValueError as error:
-            raise RecordingError(f"{path}: its poses: {error}") from error
+        poses = self._poses.columns(by_row=True)
+        origin = "emulated" if columns.emulated else None
+        return Recording(path, (track,), rate_hz, notes=tuple(notes), origin=origin, poses=poses)
 
 
 def _rows(path: Path) -> Iterator[_Row]:

@@ -25,17 +25,18 @@ from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
-from firmware_bridge.recording.mcap_records import BROKEN, CutOffError, DamageError, records, short
-from firmware_bridge.recording.mounting_text import read_mounting
+from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
 from firmware_bridge.recording.pose_columns import PoseRows
-from firmware_bridge.recording.pose_messages import POSE, decode_pose
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
+    POSE,
     SCAN_NAME,
     SENSOR,
     baseline_type,
     decode_baseline,
+    decode_pose,
     decode_scan,
+    read_mounting,
     scan_type,
 )
 from firmware_bridge.recording.tracks import (
@@ -61,7 +62,6 @@ MOST_BAG_BYTES: Final = 1 << 20
 """Most bytes of a bag's metadata.yaml."""
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
-_MESSAGE: Final = struct.Struct("<HIQQ")
 
 
 class _Topic(NamedTuple):
@@ -89,7 +89,11 @@ def load_mcap(path: Path) -> Recording:
         OSError: the file cannot be read.
     """
     reading = _Reading(path)
-    for one in _bag_files(path, reading) if path.is_dir() else [path]:
+    files, missing = mcap_files(path)
+    if missing:
+        names = ", ".join(map(ascii, missing))
+        reading.note(f"{path}: its metadata.yaml names {names[:100]}, which is not there")
+    for one in files:
         with one.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
@@ -104,22 +108,26 @@ def load_mcap(path: Path) -> Recording:
     return reading.recording()
 
 
-def _bag_files(folder: Path, reading: "_Reading") -> list[Path]:
-    """Return the MCAP files of a folder, in the order of its metadata.yaml, else by the numbers in their names."""
-    there = sorted(folder.glob("*.mcap"), key=lambda path: [int(one) for one in re.findall("[0-9]+", path.stem)])
+def mcap_files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return the files of a recording, and the names of those that are missing.
+
+    Those of a folder are in the order of its metadata.yaml, else by the numbers in their names.
+
+    Raises:
+        RecordingError: there is none in the folder.
+    """
+    if not path.is_dir():
+        return [path], []
+    there = sorted(path.glob("*.mcap"), key=lambda path: [int(one) for one in re.findall("[0-9]+", path.stem)])
     if not there:
-        names = ", ".join(ascii(path.name) for path in sorted(folder.iterdir())[:MOST_SHOWN_TOPICS])
+        names = ", ".join(ascii(path.name) for path in sorted(path.iterdir())[:MOST_SHOWN_TOPICS])
         remedy = "name a file, or convert a bag of another storage with `ros2 bag convert` to mcap"
-        raise RecordingError(f"{folder}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
-    about = folder / "metadata.yaml"
-    if not about.is_file():
-        return there
-    text = read_bounded(about, MOST_BAG_BYTES).decode(errors="replace")
-    named = [folder / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
-    order = [path for path in dict.fromkeys(named) if path in there]
-    if missing := [path.name for path in named if path not in there]:
-        reading.note(f"{folder}: its metadata.yaml names {', '.join(map(ascii, missing))[:100]}, which is not there")
-    return order or there
+        raise RecordingError(f"{path}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
+    about = path / "metadata.yaml"
+    text = read_bounded(about, MOST_BAG_BYTES).decode(errors="replace") if about.is_file() else ""
+    named = [path / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
+    order = [one for one in dict.fromkeys(named) if one in there]
+    return order or there, [one.name for one in named if one not in there]
 
 
 class _Reading:
@@ -234,7 +242,7 @@ class _Reading:
 
     def _take_message(self, data: memoryview) -> None:
         try:
-            channel, _, log_ns, _ = _MESSAGE.unpack_from(data)
+            channel, _, log_ns, _ = MESSAGE.unpack_from(data)
         except struct.error as error:
             raise DamageError("a message that is cut off") from error
         topic = self._topics.get(channel)
@@ -242,13 +250,13 @@ class _Reading:
             return
         try:
             if topic.kind.name == SCAN_NAME:
-                self._take_scan(data[_MESSAGE.size :], log_ns)
+                self._take_scan(data[MESSAGE.size :], log_ns)
             elif topic.kind is SENSOR:
-                self._take_facts(data[_MESSAGE.size :])
+                self._take_facts(data[MESSAGE.size :])
             elif topic.kind is POSE:
-                self._take_pose(decode_pose(data[_MESSAGE.size :]))
+                self._take_pose(decode_pose(data[MESSAGE.size :]))
             else:
-                self._take_baseline(decode_baseline(data[_MESSAGE.size :], self._geometry))
+                self._take_baseline(decode_baseline(data[MESSAGE.size :], self._geometry))
         except CdrError as error:
             raise RecordingError(f"{self._path}, topic {topic.name!r}: {error}") from error
 

@@ -21,6 +21,8 @@ MOST_RECORD_BYTES: Final = 1 << 25
 MOST_WINDOW_BYTES: Final = 1 << 25
 """Largest window of zstd, in bytes."""
 _RECORD: Final = struct.Struct("<BQ")
+MESSAGE: Final = struct.Struct("<HIQQ")
+"""Head of a message: channel, sequence, and times at which it was logged and published."""
 BROKEN: Final = (
     *(struct.error, McapError, zstandard.ZstdError, ValueError, OverflowError, MemoryError),
     *(EOFError, RuntimeError),  # of lz4

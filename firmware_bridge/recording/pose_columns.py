@@ -93,8 +93,8 @@ class PoseRows:
         self._sensor.append(self._sensors.setdefault(timed.sensor or "", len(self._sensors)))
         self._holds.append(timed.holds)
 
-    def columns(self) -> PoseColumns | None:
-        """Return the poses; None without any."""
+    def columns(self, *, by_row: bool = False) -> PoseColumns | None:
+        """Return the poses, whose times are rows of scans if `by_row`; None without any."""
         if not self._times_ns:
             return None
         return PoseColumns(
@@ -104,4 +104,5 @@ class PoseRows:
             np.frombuffer(self._sensor, np.int32),
             np.frombuffer(self._holds, np.bool_),
             np.frombuffer(self._used_from_ns, np.int64),
+            by_row,
         )

@@ -1,5 +1,7 @@
-"""Messages of scans, baselines and sensors: all the data needed to play a recording again, bit for bit. No I/O."""
+"""Messages of scans, baselines, poses and sensors: all that is needed to play a recording again, bit for bit."""
 
+import json
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, get_args
 
@@ -8,8 +10,12 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
+from firmware_bridge.recording.pose_columns import POSE_FIELDS
 from firmware_bridge.recording.tracks import HIGHEST_COUNT
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS, HIGHEST_UPS_HZ, KELVIN
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
@@ -51,6 +57,20 @@ string sensor
 string facts                    # JSON: by name, what the file's metadata records hold as well, and units
 """
 
+_POSE_TEXT: Final = """\
+# Pose of a pad in the plane of the object that it touches: x to the right, y down, a turn from x to y.
+std_msgs/Header header          # wall clock time of time_ns
+string sensor                   # empty for every sensor without poses of its own
+int64 time_ns                   # monotonic
+int64 used_from_ns              # monotonic time of the first scan that was made with it at hand
+float64 x_mm
+float64 y_mm
+float64 turn_deg
+float64 error_mm                # standard deviation of the place, along x and along y
+float64 error_deg               # standard deviation of the turn
+uint8 holds                     # 1: the pad rests there until the next pose
+"""
+
 
 @lru_cache
 def scan_type(taxel_count: int) -> MessageType:
@@ -67,6 +87,7 @@ def baseline_type(taxel_count: int) -> MessageType:
 SCAN: Final = scan_type(USPA44.taxel_count)
 BASELINE: Final = baseline_type(USPA44.taxel_count)
 SENSOR: Final = MessageType(SENSOR_NAME, _SENSOR_TEXT, STD_HEADER)
+POSE: Final = MessageType("tactile_edge_sr/msg/PadPose", _POSE_TEXT, STD_HEADER)
 
 
 class RecordedScan(NamedTuple):
@@ -185,6 +206,64 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
 def encode_sensor(sensor: str, frame: str, facts: str, unix_ns: int) -> bytes:
     """Encode what the scans of a sensor mean, as JSON, at `unix_ns` [ns] since 1970."""
     return SENSOR.encode({"header": {"stamp": stamp(unix_ns), "frame_id": frame}, "sensor": sensor, "facts": facts})
+
+
+def encode_pose(timed: TimedPose, unix_ns: int) -> bytes:
+    """Encode a pose whose time is `unix_ns` [ns] since 1970."""
+    return POSE.encode(
+        {
+            "header": {"stamp": stamp(unix_ns), "frame_id": timed.sensor or ""},
+            "sensor": timed.sensor or "",
+            "time_ns": timed.time_ns,
+            "used_from_ns": -1 if timed.used_from_ns is None else timed.used_from_ns,
+            **{name: getattr(timed.pose, name) for name in POSE_FIELDS},
+            "holds": int(timed.holds),
+        }
+    )
+
+
+def decode_pose(data: bytes | memoryview) -> TimedPose:
+    """Decode the pose in a message.
+
+    Raises:
+        CdrError: it is no pose, or a value is impossible.
+    """
+    fields = POSE.decode(data)
+    sensor, used_from_ns = fields["sensor"], fields["used_from_ns"]
+    _check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
+    for name, least in (("time_ns", 0), ("used_from_ns", -1)):
+        _check(least <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{least}..{LAST_TIME_NS}")
+    _check(fields["holds"] <= 1, "holds", fields["holds"], "0 or 1")
+    try:
+        pose = PadPose(*(fields[name] for name in POSE_FIELDS))
+    except ValueError as error:
+        raise CdrError(str(error)) from error
+    return TimedPose(
+        pose, fields["time_ns"], sensor or None, bool(fields["holds"]), None if used_from_ns < 0 else used_from_ns
+    )
+
+
+def mounting_text(mounting: Mounting) -> str:
+    """Return a mounting as JSON, without its number of taxels, which the scans show."""
+    fields = asdict(mounting)
+    del fields["taxel_count"]
+    return json.dumps(fields)
+
+
+def read_mounting(text: str, taxel_count: int) -> Mounting:
+    """Return the mounting in a text of `mounting_text`.
+
+    Raises:
+        ValueError: it is none, or none of so many taxels.
+    """
+    try:
+        fields = json.loads(text)
+        order, signs, gains = (tuple(fields[key]) for key in ("order", "signs", "gains"))
+        if not all(type(value) is int for value in (*order, *signs)) or type(fields["swap_xy"]) is not bool:
+            raise ValueError("not whole numbers")
+        return Mounting(order, fields["swap_xy"], signs, tuple(map(float, gains)), taxel_count)
+    except (TypeError, KeyError, RecursionError, OverflowError) as error:
+        raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
 
 
 def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:

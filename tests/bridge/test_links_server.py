@@ -147,4 +147,4 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     idle = [line for line in lines if line["state"] == "idle"]
     assert idle and all(line["force_n"] == line["vendor_force_n"][2] for line in idle)
     assert {line["temperature_k"] for line in idle} == {302.5}
-    assert "missed_messages" in idle[-1]["counters"]
+    assert any("missed_messages" in line.get("counters", ()) for line in idle)

@@ -19,7 +19,7 @@ from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from mcap_samples import SURE, TURNED, make_results, messages_of, odd_scans, record_into
+from mcap_samples import SURE, TURNED, arrays_of, make_results, messages_of, odd_scans, record_into
 
 from edge.cli import main as cli
 from edge.doctor.watch import Watch
@@ -117,12 +117,15 @@ class TestOffline:
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
     def test_it_begins_with_the_baseline_of_its_first_scan_unless_told_otherwise(self, made, tmp_path, suffix):
         """The recording begins in contact: zeroed again, the press would be gone."""
-        path = tmp_path / f"press.{suffix}"
+        path = tmp_path / "press.mcap"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
-        sink = open_sink(f"{suffix}:{path}", SURE, unix_offset_ns=1_012_400_000_000)
+        sink = open_sink(f"mcap:{path}", SURE, unix_offset_ns=1_012_400_000_000)
         for result in make_results(scans, unix_time_s=lambda: 1012.4):
             sink.write(result, {})
         sink.close()
+        if suffix == "npz":
+            arrays_of(path)
+            path = path.with_suffix(".npz")
         for options, age_s in (((), 12.4), (("--paced", "--rate-hz", 2000), 12.4 if suffix == "npz" else None)):
             got = replayed(made, tmp_path / "a.jsonl", *options, file=path)
             assert {one["baseline"] for one in got} == {BASELINE.id}
@@ -136,11 +139,11 @@ class TestOffline:
     @pytest.mark.parametrize("age_s", [3000.0, None])
     def test_a_baseline_older_than_the_machine_is_so_in_every_generation(self, made, tmp_path, age_s):
         """An npz holds its age, and its times are those since the machine was started."""
+        results = make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)])
+        aged = [replace(result, baseline_age_s=age_s) for result in results]
+        arrays = arrays_of(record_into(tmp_path / "press.mcap", aged))
         path = tmp_path / "press.npz"
-        sink = open_sink(f"npz:{path}", SURE)
-        for result in make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)]):
-            sink.write(replace(result, baseline_age_s=age_s), {})
-        sink.close()
+        np.savez(path, **(arrays | {"baseline_age_s": np.full(5, np.nan if age_s is None else age_s)}))
         assert age_s is None or load_recording(path).tracks[0].time_ns[-1] < age_s * 1e9
         for generation in range(3):
             again = tmp_path / f"{generation}.mcap"
@@ -169,11 +172,11 @@ class TestOffline:
 class TestRecord:
     def test_a_file_that_exists_is_left_alone_and_one_without_an_ending_is_an_mcap(self, made, tmp_path, capsys):
         source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        (tmp_path / "old.npz").write_text("old")
-        assert cli.main(["record", f"{tmp_path}/old.npz", *source]) == 5
+        (tmp_path / "old.mcap").write_text("old")
+        assert cli.main(["record", f"{tmp_path}/old.mcap", *source]) == 5
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and "exists: give another name" in error
-        assert (tmp_path / "old.npz").read_text() == "old"
+        assert (tmp_path / "old.mcap").read_text() == "old"
         assert cli.main(["record", f"{tmp_path}/run.1", *source]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
         capsys.readouterr()
@@ -185,7 +188,8 @@ class TestRecord:
         (tmp_path / "taken").mkdir()
         for name, code, words in (
             ("taken", 5, "cannot record into taken: it is a directory"),
-            ("x.csv", 2, ".csv cannot be recorded: expected x.mcap or x.npz"),
+            ("x.csv", 2, ".csv cannot be recorded: edge-sr record x.mcap; afterwards edge-sr convert x.mcap x.csv"),
+            ("x.npz", 2, ".npz cannot be recorded: edge-sr record x.mcap; afterwards edge-sr convert x.mcap x.npz"),
             ("x.JSONL", 2, ".JSONL cannot be recorded"),
         ):
             assert cli.main(["record", name, "--source", "slcan:/dev/none"]) == code

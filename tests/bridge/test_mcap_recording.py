@@ -12,11 +12,20 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, FakeModel, make_scan
 from mcap.reader import make_reader
-from mcap_samples import OFFSET_NS, SURE, TURNED, make_results, messages_of, odd_scans, record_into, same_scan
+from mcap_samples import (
+    OFFSET_NS,
+    SURE,
+    TURNED,
+    arrays_of,
+    make_results,
+    messages_of,
+    odd_scans,
+    record_into,
+    same_scan,
+)
 
 from edge import api
 from edge.api import open_recording, open_runtime, open_source
-from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
@@ -63,7 +72,7 @@ class TestSink:
                 assert maps == made != []
             said = [json.loads(ros_messages.RESULT.decode(data)["record"]) for _, data in by_topic[f"{topic}/result"]]
             assert [one["scan"] for one in said] == [one.scan.number for one in own]
-            assert {one["counters"]["dropped"] for one in said} == {2}
+            assert [one["counters"]["dropped"] for one in said if "counters" in one] == [2]
             assert any(one.force_n is not None for one in own) and f"{topic}/wrench" not in by_topic, "x, y unknown"
         with path.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
@@ -182,17 +191,6 @@ class TestSink:
             ]
         assert list(tmp_path.iterdir()) == [tmp_path / "out.mcap"]
 
-    def test_what_cannot_be_is_said_in_one_line_and_nothing_is_lost(self, tmp_path):
-        path = record_into(tmp_path / "out.mcap", make_results([make_scan()]))
-        before = path.read_bytes()
-        with pytest.raises(SinkError, match=r"out\.mcap exists: give another name"):
-            McapSink(path, SURE)
-        assert path.read_bytes() == before
-        with pytest.raises(SinkError, match=r"cannot record into .*none/out\.mcap: No such file"):
-            McapSink(tmp_path / "none" / "out.mcap", SURE)
-        empty = record_into(tmp_path / "empty.mcap", [])
-        assert not empty.exists()
-
 
 class TestReplay:
     def test_scans_come_back_bit_for_bit_at_their_times(self, tmp_path):
@@ -255,14 +253,13 @@ class TestReplay:
         for topic, kind in kinds.items():
             assert kind.decode(said[topic])["header"]["frame_id"] == "emulated/4", topic
 
-    @pytest.mark.parametrize("form", ["mcap", "npz"])
     @pytest.mark.parametrize("kind", ["emulated", "device"])
-    def test_and_so_does_one_of_that_recording_in_any_generation(self, tmp_path, form, kind):
+    def test_and_so_does_one_of_that_recording_in_any_generation(self, tmp_path, kind):
         path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source=kind))
         for generation in range(3):
             with open_recording(path) as source:
-                path = tmp_path / f"{generation}.{form}"
-                sink = api.open_sink(f"{form}:{path}", SURE, source)
+                path = tmp_path / f"{generation}.mcap"
+                sink = api.open_sink(f"mcap:{path}", SURE, source)
                 for result in Stream(source, Runtime(FakeModel(SURE), source=source.kind)):
                     assert result.source == "replay"
                     sink.write(result, {})
@@ -276,11 +273,10 @@ class TestReplay:
     def test_it_sits_as_it_sat_however_it_is_played(self, tmp_path, named, form):
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(3)]
         results = make_results(scans, mountings={"4": TURNED})
-        path = tmp_path / f"turned.{form}"
-        sink = open_sink(f"{form}:{path}", SURE, mountings={"4": TURNED})
-        for result in results:
-            sink.write(result, {})
-        sink.close()
+        path = record_into(tmp_path / "turned.mcap", results, mountings={"4": TURNED})
+        if form == "npz":
+            arrays_of(path)
+            path = path.with_suffix(".npz")
         sensor = f"{named.replace('=', '/')}4"
         with open_source(f"{named}replay:{path}", rate_hz=1000) as source:
             baselines = {sensor: replace(BASELINE, sensor=sensor)}

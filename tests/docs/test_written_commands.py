@@ -60,7 +60,6 @@ PARSED = {
     r"python tests/system/fuzz\.py .*": "takes hours; test_fuzz runs it, shortened",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_hot_path",
-    r"python -m edge\.sinks\.npz .*": "mends what a killed run left; test_sinks runs it",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
 }
 LEFT_OUT = {
@@ -163,7 +162,7 @@ def world(emulated, tmp_path, monkeypatch):
             ports.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
         monkeypatch.setattr(source, "serial_ports", lambda: ports)
         monkeypatch.setattr(devices, "serial_ports", lambda: ports)
-        if "press.mcap" in command and " record " not in command:
+        if "press.mcap" in command and " record " not in command and "mcap:press.mcap" not in command:
             cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
         if command.endswith(" bag"):
             cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:bag.mcap"])
@@ -171,8 +170,8 @@ def world(emulated, tmp_path, monkeypatch):
             Path("bag.mcap").rename("bag/bag_0.mcap")
         if "--forget-gains" in command:
             keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
-        if "npz:press.npz" in command:
-            Path("press.npz").unlink()
+        if " convert " in command:
+            Path("press.npz").rename("old.npz")
         for written, real in (
             ("/dev/ttyUSB0", left.port),
             ("/tmp/skin", left.port),
@@ -193,7 +192,7 @@ def shortened(words: list[str]) -> list[str]:
         words = [*words[:at], "0", *words[at + (words[at : at + 1] != [] and words[at].isdigit()) :]]
     if words[1] == "doctor":
         return [*words, "--drift-s", "0.5"]
-    if words[1] in ("baseline", "models", "devices", "bench"):
+    if words[1] in ("baseline", "models", "devices", "bench", "convert"):
         return words
     if words[1] == "demo" or "demo" in words or any(word.startswith("replay:") for word in words):
         return [*words, "--rate-hz", str(RATE_HZ)]

@@ -54,11 +54,12 @@ def test_tables_of_fields_are_those_of_the_code(page):
 def test_keys_of_a_record(tmp_path):
     path = tmp_path / "records.jsonl"
     arguments = ["--source", f"replay:{demo_recording()}", "--rate-hz", "2000", "--sink", f"jsonl:{path}"]
-    assert cli.main([*arguments, "--sink", f"npz:{tmp_path / 'records.npz'}"]) == 0
+    assert cli.main([*arguments, "--sink", f"mcap:{tmp_path / 'records.mcap'}"]) == 0
+    assert cli.main(["convert", str(tmp_path / "records.mcap"), str(tmp_path / "records.npz")]) == 0
     keys = {key for line in path.read_text().splitlines() for key in json.loads(line)}
     assert keys | {"vendor_force_n", "temperature_k"} == told("Records")
     with np.load(tmp_path / "records.npz") as arrays:
-        assert set(arrays.files) | {"traction", "poses"} == told("Recordings")  # which not every model has
+        assert set(arrays.files) | {"traction", "poses"} == told("npz")  # which not every model has
     assert load_recording(tmp_path / "records.npz").tracks
 
 

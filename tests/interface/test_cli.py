@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from cli_samples import TIMEOUT_S, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
+from mcap_samples import arrays_of
 
 from edge import __version__
 from edge.cli import main as cli
@@ -60,7 +61,7 @@ class TestHelp:
         text = run("--help").stdout
         options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
         words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps")]
-        for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "npz:FILE", "models", "reset"):
+        for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "mcap:FILE", "models", "reset"):
             assert word in text
 
     def test_help_loads_no_onnxruntime(self):
@@ -93,20 +94,20 @@ class TestReplay:
 
     def test_what_was_recorded_replays_as_the_same_scans(self, files, tmp_path):
         options = [*base_options(files), "--rate-hz", "400"]
-        first = run(*options, "--source", f"replay:{files}/taps.npz", "--sink", f"npz:{tmp_path}/a.npz")
-        second = run(*options, "--source", f"replay:{tmp_path}/a.npz", "--sink", f"npz:{tmp_path}/b.npz")
+        first = run(*options, "--source", f"replay:{files}/taps.npz", "--sink", f"mcap:{tmp_path}/a.mcap")
+        second = run(*options, "--source", f"replay:{tmp_path}/a.mcap", "--sink", f"mcap:{tmp_path}/b.mcap")
         assert first.returncode == second.returncode == 0
         original = load_recording(files / "taps.npz").tracks[0].counts
         for name in ("a", "b"):
-            np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.npz").tracks[0].counts, original)
+            np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.mcap").tracks[0].counts, original)
 
     def test_a_model_that_says_how_sure_it_is_is_recorded(self, files, tmp_path):
         done = run(
             "--model", files / "sure.onnx", "--baseline", files / "zero.json", "--source", f"replay:{files}/taps.npz",
-            "--sink", "jsonl:-", "--sink", f"npz:{tmp_path}/out.npz",
+            "--sink", "jsonl:-", "--sink", f"mcap:{tmp_path}/out.mcap",
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-        stored = np.load(tmp_path / "out.npz")
+        stored = arrays_of(tmp_path / "out.mcap")
         for row, record in enumerate(records(done.stdout)):
             if record["pattern"] is None:
                 assert record["deviation"] is record["interval_mm"] is None
@@ -140,11 +141,11 @@ class TestReplay:
         np.savez(other, **data)
         done = run(
             *base_options(files), "--source", f"replay:{files}/taps.npz,{other}",
-            "--sink", "jsonl:-", "--sink", f"jsonl:{tmp_path}/copy.jsonl", "--sink", f"npz:{tmp_path}/out.npz",
+            "--sink", "jsonl:-", "--sink", f"jsonl:{tmp_path}/copy.jsonl", "--sink", f"mcap:{tmp_path}/out.mcap",
         )  # fmt: skip
         assert done.returncode == 0
         assert (tmp_path / "copy.jsonl").read_text() == done.stdout
-        assert [len(track.counts) for track in load_recording(tmp_path / "out.npz").tracks] == [40, 10]
+        assert [len(track.counts) for track in load_recording(tmp_path / "out.mcap").tracks] == [40, 10]
 
     def test_two_sources_are_named_in_the_records(self, files, tmp_path):
         sources = ["--source", f"left=replay:{files / 'taps.npz'}", "--source", f"replay:{files / 'rest.npz'}"]

@@ -47,7 +47,7 @@ class TestEnds:
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
     def test_signals_end_it_cleanly_with_the_summary(self, emulator, files, tmp_path, number):
-        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz")
+        process, first = self.follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap")
         process.send_signal(number)
         rest, errors = self.rest(process)
         assert process.returncode == 0
@@ -55,7 +55,7 @@ class TestEnds:
         assert [record["scan"] for record in got] == list(range(len(got)))
         assert {record["source"] for record in got} == {"emulated"}
         assert f"\nEMULATED slcan:{emulator.port}: {len(got)} scans" in errors and "Traceback" not in errors
-        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got)
+        assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got)
 
     @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1])
     def test_a_signal_that_the_parent_wants_ignored_is_ignored(self, emulator, files, number):
@@ -82,12 +82,12 @@ class TestEnds:
         assert "\nEMULATED " in errors and "Traceback" not in errors and "Exception" not in errors
 
     def test_the_cable_out_keeps_the_records_and_is_3(self, emulator, files, tmp_path):
-        process, first = self.follow(emulator, files, "--sink", f"npz:{tmp_path}/out.npz", "--give-up-s", "0")
+        process, first = self.follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap", "--give-up-s", "0")
         emulator.hang_up()
         rest, errors = self.rest(process)
         assert process.returncode == 3
         got = records("".join(first) + rest)
-        assert len(load_recording(tmp_path / "out.npz").tracks[0].counts) == len(got) >= 10
+        assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got) >= 10
         _, *summary, last = errors.splitlines()
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
@@ -147,7 +147,7 @@ class TestEnds:
         scans = [record for record in got if record["state"] != "event"]
         assert [record["scan"] for record in scans] == list(range(len(scans)))
         assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
-        assert scans[-1]["counters"]["missed"] > 0
+        assert [record["counters"] for record in scans if "counters" in record][-1]["missed"] > 0
 
     def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
         leader, follower = pty.openpty()

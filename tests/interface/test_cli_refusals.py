@@ -57,7 +57,8 @@ class TestRefusals:
         ("wrong", "words"),
         [
             (["--contact-on-counts", "10"], ["on 10", "off 750"]),
-            (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "npz:FILE"]),
+            (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "mcap:FILE"]),
+            (["--sink", "npz:x.npz"], ["record by --sink mcap:x.mcap, then edge-sr convert x.mcap x.npz"]),
             (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
             (["--sink", "jsonl:-", "--fields", "x"], ["no field 'x'", "expected time_ns, sensor, "]),
             (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),

@@ -49,7 +49,7 @@ def test_contract_and_cli_load_no_onnxruntime():
 
 UNUSED_IN_A_REPLAY = {
     "edge.sinks.jsonl",
-    "edge.sinks.npz",
+    "edge.sinks.npz_file",
     "edge.sinks.ros2.sink",
     "cyclonedds",
     "tqdm",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, make_scan
+from mcap_samples import arrays_of
 from pose_samples import PosedModel, make_posed_contract
 
 from edge.perception.contact_options import RuntimeOptions
@@ -200,13 +201,13 @@ class TestRuntime:
         assert in_record["target"]["x_mm"] == pytest.approx(5 - proposed.dy_mm, abs=1e-3)
         assert record(pressed[1], {})["next_tap"] is None
         contract = self.runtime._model.contract
-        sink = open_sink(f"npz:{tmp_path / 'out.npz'}", contract=contract)
+        sink = open_sink(f"mcap:{tmp_path / 'out.mcap'}", contract=contract)
         for result in (pressed[1], released):
             sink.write(result, {})
         sink.close()
-        held = np.load(tmp_path / "out.npz")["next_tap"]
+        held = arrays_of(tmp_path / "out.mcap")["next_tap"]
         assert np.isnan(held[0]).all()
-        assert held[1] == pytest.approx(proposed[:3], abs=1e-6)
+        assert held[1] == pytest.approx(proposed[:3], abs=1e-3)
         sink = open_sink(f"jsonl:{tmp_path / 'out.jsonl'}", contract=contract)
         sink.write(released, {})
         sink.close()

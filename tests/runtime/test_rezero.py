@@ -6,12 +6,13 @@ import json
 import numpy as np
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
+from mcap_samples import arrays_of
 
 from edge.perception.runtime import Runtime
 from edge.perception.zeroing import GIVE_UP_NS
 from edge.sinks.event_printer import MessageSink
 from edge.sinks.jsonl import record_line
-from edge.sinks.npz import NpzSink
+from edge.sinks.mcap import McapSink
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import deformation
@@ -159,7 +160,7 @@ def test_an_age_from_a_clock_that_was_wrong_is_not_known():
 
 def test_what_was_subtracted_is_in_the_record_and_raw_counts_stay(tmp_path):
     bench = Bench()
-    sink = NpzSink(tmp_path / "drift.npz", (3, 4, 4), (40, 40))
+    sink = McapSink(tmp_path / "drift.mcap", make_contract())
     results = bench.play(1500, 25)
     for result in results:
         sink.write(result, {})
@@ -169,10 +170,10 @@ def test_what_was_subtracted_is_in_the_record_and_raw_counts_stay(tmp_path):
     record = json.loads(record_line(last, {}))
     assert record["drift_counts"]["common"][2] == pytest.approx(25, abs=2) and record["drift_counts"]["step"] == 0
     assert record["counts"] == last.scan.counts.tolist() and record["baseline"] == BASELINE.id
-    with np.load(tmp_path / "drift.npz") as kept:
-        np.testing.assert_array_equal(kept["counts"][-1], last.scan.counts)
-        np.testing.assert_array_equal(kept["baseline_counts"][0], BASELINE.counts)
-        zeroed = kept["counts"][-1] - kept["baseline_counts"][-1]
+    kept = arrays_of(tmp_path / "drift.mcap")
+    np.testing.assert_array_equal(kept["counts"][-1], last.scan.counts)
+    np.testing.assert_array_equal(kept["baseline_counts"][0], BASELINE.counts)
+    zeroed = kept["counts"][-1] - kept["baseline_counts"][-1]
     np.testing.assert_array_equal(zeroed, deformation(last.scan.counts, last.baseline))
     assert float(zeroed[2].sum()) == pytest.approx(last.force_counts, abs=0.1)
 

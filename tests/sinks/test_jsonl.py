@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import RUN, make_results, make_sure_results
 
-from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.sinks.json_encoding import ALWAYS, chosen_fields
@@ -35,7 +34,9 @@ class TestJsonLines:
             sink.write(result, RUN)
         sink.close()
         counters = RUN | {"unwritten": 0}
-        assert (tmp_path / "out.jsonl").read_bytes() == b"".join(record_line(result, counters) for result in results)
+        turns = [counters, counters, *[None] * 6]  # of each sensor, in the first record of these eight
+        expected = b"".join(map(record_line, results, turns))
+        assert (tmp_path / "out.jsonl").read_bytes() == expected
 
     @pytest.mark.parametrize(
         ("chosen", "more"),
@@ -177,28 +178,6 @@ class TestJsonLines:
         sink.close()
         assert [json.loads(line)["scan"] for line in path.read_text().splitlines()] == [r.scan.number for r in results]
 
-    def test_what_cannot_be_opened_is_told(self, tmp_path):
-        with pytest.raises(SinkError, match=r"none/out.jsonl: No such file"):
-            JsonLinesSink(str(tmp_path / "none" / "out.jsonl"))
-
-    def test_a_full_disk_is_told_and_closing_stays_quiet(self):
-        sink = JsonLinesSink("/dev/full")
-        with pytest.raises(SinkError, match="/dev/full: No space left") as raised:
-            sink.write(make_results(1)[0], {})
-        assert not isinstance(raised.value, SinkClosedError)
-        sink.close()
-
-    def test_a_reader_that_has_gone_is_an_ordinary_end(self, tmp_path):
-        fifo = tmp_path / "fifo"
-        os.mkfifo(fifo)
-        reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-        sink = JsonLinesSink(str(fifo))
-        sink.write(make_results(1)[0], {})
-        os.close(reader)
-        with pytest.raises(SinkClosedError, match="has gone"):
-            sink.write(make_results(1)[0], {})
-        sink.close()
-
     def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
         sink = JsonLinesSink(str(tmp_path / "out.jsonl"), source="replay")
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
@@ -239,11 +218,6 @@ class TestJsonLines:
         assert not has_room(write_end, 25_000)
         os.close(read_end)
         os.close(write_end)
-
-    def test_a_fifo_that_nobody_reads_is_refused_rather_than_waited_for(self, tmp_path):
-        os.mkfifo(tmp_path / "fifo")
-        with pytest.raises(SinkError, match=r"nobody reads \S+/fifo: start its reader first"):
-            JsonLinesSink(str(tmp_path / "fifo"))
 
     def test_a_recording_is_waited_for(self, tmp_path):
         fifo = tmp_path / "fifo"

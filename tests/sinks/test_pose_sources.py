@@ -254,7 +254,7 @@ class TestRos2:
     def test_a_program_counts_them(self, opened, publish, files, monkeypatch):
         pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
         opened("ros2:unused")  # sets the environment
-        options = [*base_options(files), "--source", "demo:loop", "--duration-s", "4", "--poses", "4=ros2:/arm/pose"]
+        options = [*base_options(files), "--source", "demo:loop", "--duration-s", "2", "--poses", "4=ros2:/arm/pose"]
         with start(*options, "--sink", "jsonl:-") as process:
             assert process.stdout is not None and process.stderr is not None
             lines = []
@@ -265,5 +265,5 @@ class TestRos2:
             err = process.stderr.read()
             assert process.wait() == 0, err
         # The first ones may have waited for the program, and then be refused as out of order.
-        assert records(lines[-1])[0]["counters"]["poses"] > 50
+        assert [one["counters"] for line in lines for one in records(line) if "counters" in one][-1]["poses"] > 10
         assert " 0 dropped" in err and "takes none" in err

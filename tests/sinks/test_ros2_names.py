@@ -37,9 +37,6 @@ def test_sensors_names_as_topics(sensor, topic):
 
 def test_names_that_ros_cannot_hold_are_refused():
     assert base_topic("/gripper/skin_1") == "gripper/skin_1"
-    for text in ("", "4", "a//b", "a/", "a b", "ä", "//a", "~/a"):
-        with pytest.raises(UsageError, match=r"is not a ROS topic: expected letters"):
-            base_topic(text)
     with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
         sensor_topic("skin", "ä" * 64, "pattern")
 

@@ -130,19 +130,6 @@ def test_a_force_is_a_wrench_where_all_of_it_is_known():
     assert ros_messages.wrench(replace(result, scan=scan), USPA44, UNIX_NS) is None
 
 
-@pytest.mark.parametrize(("source", "frame"), [("device", "4"), ("emulated", "emulated/4"), ("replay", "replay/4")])
-def test_the_frame_says_where_there_is_no_sensor(source, frame):
-    result = Result(make_scan(press_counts=3000), source, "m", "contact", force_n=2.5)
-    assert ros_messages.frame_of(result) == frame
-    said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {}), UNIX_NS))
-    assert said["header"]["frame_id"] == frame
-
-
-def test_nothing_known_in_newtons_is_no_wrench():
-    result = Result(make_scan(press_counts=3000), "device", "m", "contact", force_counts=3000.0)
-    assert ros_messages.wrench(result, USPA44, UNIX_NS) is None
-
-
 @pytest.mark.parametrize(("kind", "level"), [("lost", 40), ("silent", 30), ("back", 20), ("sink", 40)])
 def test_an_event_is_a_line_of_the_log(kind, level):
     data = ros_messages.log_message(Event(5, kind, None, "über"), UNIX_NS)

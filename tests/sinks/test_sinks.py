@@ -1,20 +1,16 @@
 import contextlib
 import io
-from pathlib import Path
 
 import pytest
-from edge_samples import ListSink, make_contract, make_scan
+from edge_samples import ListSink, make_scan
 from sink_samples import RUN, Terminal, make_results
 
-from edge.errors import SinkClosedError, SinkError, UsageError
+from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.sinks.event_printer import MessageSink
 from edge.sinks.fan_out import Fan
 from edge.sinks.jsonl import JsonLinesSink
-from edge.sinks.npz import NpzSink
-from edge.sinks.registry import FORMS, open_sink
-from edge.sinks.status_line import StatusSink
 from firmware_bridge.errors import LinkLostError
 
 
@@ -27,20 +23,6 @@ class TestFan:
         def fail(self, result):
             if self.error is not None:
                 raise self.error
-
-    def test_a_sink_that_fails_is_given_up_with_a_message_and_the_others_go_on(self):
-        told = []
-        fan, good, bad = Fan(told.append, lambda: 7), ListSink(), self.Failing(SinkError("disk full"))
-        for sink in (bad, good):
-            fan.add(sink)
-        results = make_results(2)
-        for result in results:
-            fan.write(result, RUN)
-        assert good.results == results and len(bad.results) == 1 and bad.closed
-        assert told == good.events == [Event(7, "sink", None, "disk full; the other sinks continue")]
-        with pytest.raises(SinkError, match="disk full"):
-            fan.close()
-        assert good.closed
 
     def test_trouble_that_lasts_is_told_once_and_again_when_it_comes_back(self):
         class Troubled(ListSink):
@@ -92,12 +74,6 @@ class TestFan:
             closing.callback(fan.close)
             raise LinkLostError("gone")
 
-    def test_the_last_to_fail_ends_it(self):
-        fan = Fan(lambda event: None)
-        fan.add(self.Failing(SinkError("disk full")))
-        with pytest.raises(SinkError, match="disk full"):
-            fan.write(make_results(1)[0], RUN)
-
     def test_readers_that_go_are_an_ordinary_end_of_the_last_sink_alone(self):
         fan = Fan(lambda event: None)
         first, second = (self.Failing(SinkClosedError(name)) for name in "ab")
@@ -137,33 +113,3 @@ def test_the_events_of_a_result_are_lines():
         events = tuple(Event(number, "refused", None, text) for text in texts)
         messages.write(Result(make_scan(number), "device", "tiny", "idle", events=events), {})
     assert stream.getvalue() == "edge-sr: zeroing refused\nedge-sr: zeroed; again\n"
-
-
-def test_forms_open_their_sinks(tmp_path):
-    contract = make_contract()
-    for text, kind in (
-        ("status", StatusSink),
-        (f"jsonl:{tmp_path}/a", JsonLinesSink),
-        (f"npz:{tmp_path}/a.npz", NpzSink),
-    ):
-        sink = open_sink(text, contract)
-        assert type(sink) is kind
-        sink.close()
-
-
-@pytest.mark.parametrize("text", ["", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "out.jsonl", "JSONL:a"])
-def test_other_forms_are_refused_listing_those_there_are(text, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError) as refused:
-        open_sink(text, make_contract())
-    assert repr(text) in str(refused.value)
-    for form in FORMS:
-        assert form in str(refused.value)
-    assert list(Path().iterdir()) == []
-
-
-@pytest.mark.parametrize("text", ["npz:a", "npz:a.mcap", "mcap:/dev/full", "mcap:a.npz"])
-def test_a_file_with_another_ending_is_refused_for_that(text):
-    ending = f".{text.partition(':')[0]}"
-    with pytest.raises(UsageError, match=rf"^sink '{text}' names '\S+', expected a file whose name ends in \{ending}$"):
-        open_sink(text, make_contract())

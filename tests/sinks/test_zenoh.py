@@ -30,7 +30,7 @@ from zenoh_samples import (
 )
 
 from edge import api
-from edge.errors import SinkError, UsageError
+from edge.errors import SinkError
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
@@ -57,7 +57,7 @@ class TestMessages:
         for number, result in enumerate(results):
             counters = {"scans": number}
             sink.write(result, counters)
-            said = plain(record(result, counters))
+            said = plain(record(result, None if number else counters))  # all within a second
             expected.append(("grip/4/scan", "application/json", said, {}))
             if result.pattern is not None and result.reused_from is None:
                 maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
@@ -122,7 +122,8 @@ class TestMessages:
             assert header["source"] == "replay"
             np.testing.assert_allclose(maps["pattern"], one["pattern"], atol=1e-7)
         for scan, one in zip(scans, records, strict=True):
-            assert scan == {name: one[name] for name in scan} | {"counters": scan["counters"]}
+            assert scan.pop("counters", {}).keys() | {"unwritten"} >= one.get("counters", {}).keys()
+            assert scan == {name: one[name] for name in scan}
 
     def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
@@ -270,21 +271,6 @@ class TestWhoComesAndGoes:
 
 
 class TestOpening:
-    @pytest.mark.parametrize(
-        ("target", "told"),
-        [
-            ("a//b", r"'a//b' for a key"),
-            ("a/*", r"'a/\*' for a key"),
-            ("@/a", r"'@/a' for a key"),
-            ("a?listen=x", r"'listen=x' after its key: expected zenoh:KEY, zenoh:KEY\?connect="),
-            ("a?connect=here", r"'connect=here' after its key"),
-            ("a?", r"'' after its key"),
-        ],
-    )
-    def test_what_cannot_be_understood_is_refused(self, target, told):
-        with pytest.raises(UsageError, match=told):
-            open_sink(f"zenoh:{target}", CONTRACT)
-
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
         with pytest.raises(SinkError, match=r"none.json5 is not a zenoh configuration: No such file"):
             open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT)

@@ -9,6 +9,7 @@ from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from edge.cli import main as cli
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
 from firmware_bridge.scans.mounting import Mounting
@@ -46,6 +47,13 @@ def record_into(path: Path, results, contract=None, **settings) -> Path:
         sink.write(result, {"dropped": 2})
     sink.close()
     return path
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz that `edge-sr convert` makes of a recording, next to it."""
+    assert cli.main(["convert", str(path), str(path.with_suffix(".npz"))]) == 0
+    with np.load(path.with_suffix(".npz")) as arrays:
+        return dict(arrays)
 
 
 def messages_of(path: Path) -> dict[str, list]:

@@ -93,7 +93,7 @@ def judge(seen: Sequence[Seen], told: Told) -> Found:
     found = Found()
     numbers: dict[str, int] = {}
     for one in seen:
-        found.last_counters = one.head["counters"]
+        found.last_counters = one.head.get("counters", found.last_counters)
         if one.counts is None:
             continue
         found.records += 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.bench.program import FINGERS, PRESS_COUNTS, REST_COUNTS, emulating
-from firmware_bridge.recording.formats import NPZ_FORMAT, NPZ_VERSION
+from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 
 TELLING: Final = 70
 """Steps of x, and of y: a reading encodes its cycle modulo TELLING**2, 49 s at 100 Hz."""

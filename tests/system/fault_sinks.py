@@ -6,13 +6,11 @@ import time
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import orjson
 from fault_records import Ran
 
-from edge.bench.program import FINGERS
-from edge.errors import SinkError
-from edge.sinks.npz import gather, parts_dir
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.recording.formats import load_recording
 
 SLOW_AFTER_S: Final = 3.0
 SLOW_FOR_S: Final = 4.0
@@ -28,7 +26,7 @@ def failing_sinks(folder: Path) -> list[str]:
     for name in ("slow", "gone"):
         os.mkfifo(folder / f"{name}.fifo")
         sinks.append(f"jsonl:{folder / name}.fifo")
-    return [*sinks, "jsonl:/dev/full", f"jsonl:{folder / 'full.jsonl'}", f"npz:{folder / 'full.npz'}"]
+    return [*sinks, "jsonl:/dev/full", f"jsonl:{folder / 'full.jsonl'}", f"mcap:{folder / 'full.mcap'}"]
 
 
 def fill_up() -> None:
@@ -43,7 +41,7 @@ def read_slowly(path: Path, ran: Ran) -> None:
         turn_s = time.monotonic()
         for line in stream:
             try:
-                ran.unwritten = orjson.loads(line)["counters"]["unwritten"]
+                ran.unwritten = orjson.loads(line).get("counters", {"unwritten": ran.unwritten})["unwritten"]
             except orjson.JSONDecodeError:
                 ran.broken.append(f"slow.fifo: record {ran.slow + 1} is not whole")
             ran.slow += 1
@@ -74,13 +72,10 @@ def look_into_files(folder: Path, ran: Ran) -> None:
             if head["scan"] != numbers.get(head["sensor"], -1) + 1:
                 ran.broken.append(f"full.jsonl: scan {head['scan']} of sensor {head['sensor']} in line {at + 1}")
             numbers[head["sensor"]] = head["scan"]
-    path = folder / "full.npz"
     try:
-        rows = gather(path) if parts_dir(path).exists() else 0
-        with np.load(path, allow_pickle=False) as recorded:
-            for name in FINGERS:
-                mine = recorded["scan"][recorded["sensor"] == name].tolist()
-                if mine != list(range(len(mine))):
-                    ran.broken.append(f"full.npz: {len(mine)} of {rows} scans are of sensor {name}, not all in order")
-    except (SinkError, OSError, ValueError) as error:
-        ran.broken.append(f"full.npz: {error}")
+        for track in load_recording(folder / "full.mcap").tracks:
+            mine = [] if track.numbers is None else track.numbers.tolist()
+            if mine != list(range(len(mine))):
+                ran.broken.append(f"full.mcap: {len(mine)} scans are of sensor {track.sensor}, not all in order")
+    except RecordingError as error:
+        ran.broken.append(f"full.mcap: {error}")

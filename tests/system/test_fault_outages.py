@@ -57,7 +57,7 @@ def test_every_promise_can_be_broken():
     told = forged.told
     sizes = [Size(float(n), 70.0 + n, 5, 9 + n) for n in range(90)]
     steady = [Size(float(n), 70.0, 5, 9) for n in range(90)]
-    said = "edge-sr: full.npz: File too large; the other sinks continue\n"
+    said = "edge-sr: full.mcap: File too large; the other sinks continue\n"
     good = Ran(exit_code=5, said=4 * said, seen=[*forged.seen], sizes=steady, told=told)
     assert all(promise.kept for promise in promises(good, judge(good.seen, told), told))
     assert show(good, judge(good.seen, told), told, lambda text: None)

@@ -79,7 +79,7 @@ def _findings(result: Result, silence_s: float | None, trouble: str | None) -> l
 
 
 def _values(result: Result, counters: Mapping[str, int], silence_s: float | None) -> dict[str, str]:
-    values = {name: _text(value) for name, value in record(result, {}).items() if isinstance(value, str | float | int)}
+    values = {name: _text(value) for name, value in record(result).items() if isinstance(value, str | float | int)}
     if silence_s is not None:
         values["scan_age_s"] = _text(silence_s)
     values["dead"] = ", ".join(f"{taxel}: {reason}" for taxel, reason in result.dead.items())

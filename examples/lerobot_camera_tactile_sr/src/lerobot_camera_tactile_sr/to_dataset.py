@@ -1,6 +1,6 @@
 """Recordings of edge-sr as a dataset of LeRobot: an episode for each file, at the dataset's own rate.
 
-tactile-sr-to-lerobot press.mcap grip.npz --repo-id me/presses --task "press the pad" --fps 30
+tactile-sr-to-lerobot press.mcap grip.mcap --repo-id me/presses --task "press the pad" --fps 30
 """
 
 import argparse

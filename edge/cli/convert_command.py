@@ -1,0 +1,188 @@
+"""`edge-sr convert`: a recording in another format, with what was recorded of it; nothing is computed."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from edge.errors import SinkError, UsageError
+from edge.terminal.progress_bar import Progress
+from firmware_bridge.errors import harmless
+from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.pose_columns import PoseColumns, PoseRows
+from firmware_bridge.recording.tracks import Recording
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import Scan
+
+_ENDINGS: Final = (".mcap", ".npz", ".csv")
+_WITHOUT: Final = {
+    (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
+    (
+        ".mcap",
+        ".csv",
+    ): "all but counts, times and poses: patterns, events, baselines and the mounting",
+    (
+        ".npz",
+        ".mcap",
+    ): "what was computed, patterns too (edge-sr replay computes it), the device's times, later baselines",
+    (".npz", ".csv"): "all but counts, times and poses: patterns, baselines and the mounting",
+    (".csv", ".mcap"): "the time of day, which the file does not state",
+    (".csv", ".npz"): "the vendor's newtons",
+}
+"""Parts of a recording that are not in the new file, by the endings of both."""
+
+
+def convert(options: argparse.Namespace) -> None:
+    """Write a recording in the format that the new name ends in, or for a CSV a file for each sensor.
+
+    Raises:
+        UsageError: the new name ends in none, or the format is that of the recording; a rate for one with times.
+        RecordingError: the recording cannot be used.
+        SourceError: a CSV of unknown rate.
+        SinkError: the new file exists, or cannot be written; then nothing is left of it.
+    """
+    source, target = Path(options.recording), Path(options.new)
+    was, ending = ".mcap" if source.is_dir() else source.suffix.lower(), target.suffix.lower()
+    if ending not in _ENDINGS:
+        raise UsageError(f"{target}: expected a name that ends in {', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}")
+    if was == ending:
+        raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
+    if options.rate_hz is not None and was != ".csv":
+        raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
+    _check_new(target)
+    replay = ReplayLink([source], options.rate_hz, paced=False)
+    for notice in replay.notices():
+        sys.stderr.write(f"edge-sr: {harmless(notice.text)}\n")
+    sensors = [track.sensor for track in replay.recordings[0].tracks]
+    files: dict[Path, str | None] = {target: None}
+    if ending == ".csv" and len(sensors) > 1:
+        parts = [name.replace("/", "-") for name in sensors]
+        if len(set(parts)) < len(parts):
+            parts = [str(number) for number in range(1, len(parts) + 1)]
+        files = {target.with_stem(f"{target.stem}-{part}"): name for part, name in zip(parts, sensors, strict=True)}
+    for path in files:
+        _check_new(path)
+    for path, sensor in files.items():
+        _write(replay, path, sensor)
+    _tell(f"not in it: {_WITHOUT[was, ending]}")
+
+
+def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
+    """Write one file, read it back before it gets its name, and report it."""
+    made: list[Recording] = []
+    try:
+        write_in_place(
+            path,
+            partial(_WRITERS[path.suffix.lower()], replay, sensor=sensor),
+            lambda draft: made.append(load_recording(draft)),
+            keep_before=False,
+        )
+    except SinkError:
+        raise
+    except OSError as error:
+        raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
+    recording = replay.recordings[0]
+    tracks = [track for track in recording.tracks if sensor in (None, track.sensor)]
+    expected, scans = (sum(len(track.counts) for track in some) for some in (tracks, made[0].tracks))
+    names = ", ".join(track.sensor for track in tracks)
+    lasting_s = max(float(replay.times_ns(track.sensor)[-1]) for track in tracks) / 1e9
+    emulated = ", EMULATED" if recording.origin == "emulated" else ""
+    size_mb = path.stat().st_size / 1e6
+    _tell(f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}")
+    if scans < expected:
+        _tell(f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell")
+
+
+def _tell(text: str) -> None:
+    sys.stdout.write(f"{harmless(text)}\n")
+
+
+def _check_new(path: Path) -> None:
+    if path.exists() or path.is_symlink():
+        raise SinkError(f"{path} exists: give another name, or delete it first")
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
+    """Yield the scans of a recording, each with the poses that it was made with first."""
+    total = sum(len(track.counts) for track in replay.recordings[0].tracks)
+    with closing(Progress("convert", total, "scan")) as bar:
+        while not replay.ended:
+            for scan in replay.read(0.0):
+                bar.advance(1)
+                yield scan, replay.poses()
+
+
+def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
+    from edge.sinks.npz_file import write_npz
+    from edge.sinks.recorded_rows import recorded_rows
+
+    recording = replay.recordings[0]
+    origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
+    rows: Iterator[dict[str, Any]] = recorded_rows(recording.path, geometry, origin)
+    poses = recording.poses
+    if recording.path.suffix.lower() == ".csv":
+        read = list(_scans(replay))
+        rows = (_row(scan, origin) for scan, _ in read)
+        poses = _columns([pose for _, some in read for pose in some])
+    write_npz(path, rows, recording.mountings, poses)
+
+
+def _row(scan: Scan, origin: str) -> dict[str, Any]:
+    counts = {"counts": scan.counts, "source": origin, "origin": origin}
+    return {"time_ns": scan.time_ns, "sensor": scan.sensor, "scan": scan.number} | counts
+
+
+def _columns(poses: list[TimedPose]) -> PoseColumns | None:
+    rows = PoseRows()
+    for pose in poses:
+        rows.add(pose)
+    return rows.columns()
+
+
+def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
+    from edge.sinks.mcap_scans import McapScans
+
+    recording = replay.recordings[0]
+    kind = recording.origin or "replay"
+    # 0: the time of recording is unknown.
+    to = McapScans(path, recording.tracks[0].geometry, recording.mountings, unix_offset_ns=0)
+    try:
+        for scan, poses in _scans(replay):
+            baseline = recording.baselines.get(scan.sensor)
+            age_s = None if baseline is None else scan.time_ns / 1e9 - baseline.created_unix_s
+            to.file.drain()
+            to.add_poses(poses)
+            frame = scan.sensor if kind == "device" else f"{kind}/{scan.sensor}"
+            to.add_scan(scan, kind, frame, baseline, age_s)
+            to.file.look()
+    except BaseException:
+        to.file.abandon()
+        raise
+    to.file.close()
+
+
+def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
+    from edge.sinks.csv_file import write_csv
+
+    recording = replay.recordings[0]
+    track = next(track for track in recording.tracks if sensor in (None, track.sensor))
+    mounting = recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
+    first_ns = replay.first_ns
+    poses = (
+        [] if recording.poses is None else [recording.poses.at(row, -first_ns) for row in range(len(recording.poses))]
+    )
+    own = [pose for pose in poses if pose.sensor == track.sensor] or [pose for pose in poses if pose.sensor is None]
+    write_csv(path, track, replay.times_ns(track.sensor), mounting, own, emulated=recording.origin == "emulated")
+
+
+_WRITERS: Final = {".mcap": _write_mcap, ".npz": _write_npz, ".csv": _write_csv}

@@ -1,0 +1,204 @@
+"""Recordings as npz: arrays with a row for each scan, as `edge-sr convert` and earlier releases write them."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
+from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.pose_columns import POSE_FIELDS, PoseColumns
+from firmware_bridge.recording.scan_messages import read_mounting
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, MOST_SENSORS, Recording, Track, is_rate, origin_of
+from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
+from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
+from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
+
+NPZ_FORMAT: Final = "tactile-recording"
+NPZ_VERSION: Final = 1
+MOST_NPZ_BYTES: Final = 1 << 31
+"""Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
+_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
+_ORIGINS: Final = ("origin", "source")
+"""Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
+_POSES: Final = ("pose_time_ns", "pose", "pose_sensor", "pose_holds", "pose_used_from_ns")
+_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
+_KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "real numbers", "fiu": "numbers"}
+
+
+def load_npz(path: Path) -> Recording:
+    """Read an npz; of one that lost its end the arrays that are whole, which `notes` then report.
+
+    Raises:
+        RecordingError: it is no recording, or a value is impossible.
+        OSError: the file cannot be read.
+    """
+    notes: list[str] = []
+    cut_off = f"{path} is damaged: its end is missing, and only its whole arrays are read; copy it again"
+    names = (*_REQUIRED, *_ORIGINS, *_POSES, "rate_hz", "mountings")
+    arrays = _read(path, names, lambda: notes.append(cut_off))
+    for name in _REQUIRED:
+        if name not in arrays:
+            lost = f"; {notes[0]}" if notes else ""
+            raise RecordingError(f"{path}, array '{name}': missing, expected what `edge-sr convert` writes{lost}")
+    form, version = arrays["format"], arrays["version"]
+    if str(form) != NPZ_FORMAT:
+        _refuse(path, "format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
+    if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
+        _refuse(path, "version", str(version)[:40], f"{NPZ_VERSION}")
+    counts = _checked_counts(path, arrays["counts"])
+    for name, kinds in (("sensor", "U"), ("scan", "iu"), ("time_ns", "iu")):
+        _check_array(path, name, arrays[name], kinds, counts.shape[:1])
+    sensors = arrays["sensor"]
+    tracks = tuple(
+        Track(sensor, counts[mine], _times(path, sensor, arrays["time_ns"][mine]))
+        for sensor in _sensors(path, sensors)
+        for mine in [sensors == sensor]
+    )
+    rate = arrays.get("rate_hz")
+    if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
+        _refuse(path, "rate_hz", str(rate)[:40], A_RATE)
+    return Recording(
+        path,
+        tracks,
+        None if rate is None else float(rate),
+        _baselines(path, tracks, sensors),
+        _mountings(path, arrays.get("mountings"), tracks),
+        notes=tuple(notes),
+        origin=_origin(path, arrays, len(counts)),
+        poses=None if notes and "pose" not in arrays else _poses(path, arrays),
+    )
+
+
+def _read(path: Path, names: Sequence[str], damaged: Callable[[], object]) -> dict[str, NDArray[Any]]:
+    try:
+        return read_npz(path, names, MOST_NPZ_BYTES, damaged)
+    except NpzError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _baselines(path: Path, tracks: Sequence[Track], sensors: NDArray[np.str_]) -> dict[str, Baseline]:
+    """Return the baselines of the first scan of each sensor, dated by the clock of the scans."""
+    arrays = _read(path, _BASELINE, lambda: None)
+    if len(arrays) < len(_BASELINE):
+        return {}
+    scan_shape = tracks[0].counts.shape[1:]
+    for name, kinds, shape in zip(_BASELINE, "Uff", ((), scan_shape, ()), strict=True):
+        _check_array(path, name, arrays[name], kinds, (len(sensors), *shape))
+    ids, counts, ages_s = (arrays[name] for name in _BASELINE)
+    baselines: dict[str, Baseline] = {}
+    for track in tracks:
+        first = int(np.argmax(sensors == track.sensor))
+        own, text, age_s = counts[first].astype(np.float32), str(ids[first]), float(ages_s[first])
+        if not text or track.time_ns is None:
+            continue
+        known = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
+        if not known.all() or not is_sensor_name(text):
+            _refuse(path, "baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
+        own.setflags(write=False)
+        taken_s = int(track.time_ns[0]) / NS_PER_S - (age_s if 0 <= age_s <= LAST_UNIX_S else math.nan)
+        baselines[track.sensor] = Baseline(track.sensor, own, taken_s, 1, "file", text)
+    return baselines
+
+
+def _sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
+    names = list(dict.fromkeys(sensors.tolist()))
+    if len(names) > MOST_SENSORS:
+        _refuse(path, "sensor", f"{len(names)} sensors", f"at most {MOST_SENSORS}")
+    for name in names:
+        if not is_sensor_name(name):
+            _refuse(path, "sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    return names
+
+
+def _mountings(path: Path, text: NDArray[Any] | None, tracks: Sequence[Track]) -> dict[str, Mounting]:
+    if text is None:
+        return {}
+    try:
+        texts = json.loads(str(text))
+        return {
+            one.sensor: read_mounting(texts[one.sensor], one.counts[0, 0].size) for one in tracks if one.sensor in texts
+        }
+    except (ValueError, TypeError, RecursionError) as error:
+        _refuse(path, "mountings", " ".join(str(error).split())[:120], "JSON as `edge-sr convert` writes it")
+
+
+def _times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[np.int64]:
+    if times.min() < 0 or times.max() > LAST_TIME_NS:
+        _refuse(path, "time_ns", f"times {times.min()}..{times.max()}", f"0..{LAST_TIME_NS}")
+    if (times[1:] < times[:-1]).any():  # not a difference, which wraps around
+        _refuse(path, "time_ns", f"times of sensor {sensor!r} that go back", "times that never fall")
+    return times.astype(np.int64)
+
+
+def _checked_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
+    shape = counts.shape
+    grid = len(shape) == 4 and shape[1] == len(AXES) and 0 < shape[2] * shape[3] <= MOST_TAXELS
+    if counts.dtype.kind not in "iu" or not grid or counts.size == 0:
+        most = f"{MOST_TAXELS} taxels at most"
+        expected = f"whole numbers of shape (scans, {len(AXES)}, rows, cols), {most}, at least one scan"
+        _refuse(path, "counts", f"{counts.dtype} of shape {counts.shape}", expected)
+    if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
+        got = f"counts {counts.min()}..{counts.max()}"
+        _refuse(path, "counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
+    absent = counts == ABSENT
+    if (absent.any(axis=1) != absent.all(axis=1)).any():
+        _refuse(path, "counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
+    return counts.astype(np.int32)
+
+
+def _origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> Literal["device", "emulated"] | None:
+    for name in _ORIGINS:
+        if name in arrays:
+            _check_array(path, name, arrays[name], "U", (scans,))
+            return origin_of(np.unique(arrays[name]).tolist())
+    return None
+
+
+def _poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | None:
+    found = {name: arrays[name] for name in _POSES if name in arrays}
+    if not found:
+        return None
+    for name in _POSES[:2]:
+        if name not in found:
+            raise RecordingError(f"{path}, array '{name}': missing, expected together with '{next(iter(found))}'")
+    count = found["pose_time_ns"].size
+    for name, kinds in zip(_POSES, ("iu", "fiu", "U", "b", "iu"), strict=True):
+        if name in found:
+            _check_array(path, name, found[name], kinds, (count, len(POSE_FIELDS)) if name == "pose" else (count,))
+    if not count:
+        return None
+    names, sensor = np.unique(found.get("pose_sensor", np.zeros(count, "U1")), return_inverse=True)
+    if len(names) > MOST_SENSORS:
+        raise RecordingError(f"{path}, array 'pose_sensor': {len(names)} sensors, expected at most {MOST_SENSORS}")
+    try:
+        return PoseColumns(
+            _whole(found["pose_time_ns"]),
+            found["pose"].astype(np.float64),
+            tuple(names.tolist()),
+            sensor.astype(np.int32),
+            found.get("pose_holds", np.zeros(count, bool)),
+            _whole(found.get("pose_used_from_ns", np.full(count, -1))),
+        )
+    except ValueError as error:
+        raise RecordingError(f"{path}, array 'pose' or another of the poses: {error}") from error
+
+
+def _whole(array: NDArray[Any]) -> NDArray[np.int64]:
+    """Return whole numbers as int64; those beyond it stay beyond all limits."""
+    return np.minimum(array, np.iinfo(np.int64).max).astype(np.int64)
+
+
+def _check_array(path: Path, name: str, array: NDArray[Any], kinds: str, shape: tuple[int, ...]) -> None:
+    if array.dtype.kind not in kinds or array.shape != shape:
+        _refuse(path, name, f"{array.dtype} of shape {array.shape}", f"{_KINDS[kinds]} of shape {shape}")
+
+
+def _refuse(path: Path, name: str, got: str, expected: str) -> NoReturn:
+    raise RecordingError(f"{path}, array '{name}': {got}, expected {expected}")

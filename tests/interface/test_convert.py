@@ -1,0 +1,243 @@
+"""`edge-sr convert`: all that a recording holds is in the new file, and nothing is replaced, lost or left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bridge_samples import make_counts, write_recording
+from edge_samples import ROOT, make_scan
+from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
+
+from edge.cli import main as cli
+from edge.perception.result import Result
+from edge.perception.result_fields import MAPS
+from edge.sinks.registry import open_sink
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.scan import Scan
+
+OLD = Path(__file__).parent / "first_version"
+
+
+def convert(*words: object) -> int:
+    return cli.main(["convert", *map(str, words)])
+
+
+def scans_of(path: Path) -> list[Scan]:
+    with ReplayLink([path], paced=False) as link:
+        scans = []
+        while not link.ended:
+            scans += link.read(0.0)
+        return scans
+
+
+@pytest.fixture
+def made(tmp_path) -> tuple[Path, list[Result]]:
+    """A recording of two sensors with all that scans may have, one of them mounted turned, with poses."""
+    results = make_results(odd_scans(), source="emulated", mountings={"4": TURNED})
+    path = tmp_path / "press.mcap"
+    sink = open_sink(f"mcap:{path}", SURE, mountings={"4": TURNED}, unix_offset_ns=10**18)
+    for number, result in enumerate(results):
+        if number % 4 == 0:
+            pose = PadPose(number, -number / 3, 10 * number, 0.4, 0.5)
+            sink.pose([TimedPose(pose, result.scan.time_ns, "4", True, result.scan.time_ns)])
+        sink.write(result, {"scans": number})
+    sink.close()
+    return path, results
+
+
+def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
+    path, results = made
+    arrays = arrays_of(path)
+    results = sorted(results, key=lambda one: one.scan.time_ns)
+    order = np.argsort(arrays["time_ns"], kind="stable")
+    rows = {name: array[order] for name, array in arrays.items() if array.shape[:1] == (len(results),)}
+    for row, result in enumerate(results):
+        scan = result.scan
+        assert (rows["sensor"][row], rows["scan"][row], rows["time_ns"][row]) == (
+            scan.sensor,
+            scan.number,
+            scan.time_ns,
+        )
+        assert rows["device_time_ns"][row] == (-1 if scan.device_ns is None else scan.device_ns)
+        assert (rows["counts"][row] == scan.counts).all()
+        assert (rows["state"][row], rows["source"][row], rows["model"][row]) == (result.state, "emulated", result.model)
+        assert rows["has_pattern"][row] == (result.pattern is not None)
+        assert rows["contact"][row] == (-1 if result.contact is None else result.contact)
+        for name in ("force_counts", "interval_mm", "baseline_age_s"):
+            value = np.nan if (value := getattr(result, name)) is None else value
+            np.testing.assert_allclose(rows[name][row], value, atol=0.06)
+        assert rows["baseline"][row] == ("" if result.baseline is None else result.baseline.id)
+        if result.baseline is not None:
+            assert (rows["baseline_counts"][row] == result.baseline.counts).all()
+        for field in MAPS:
+            values = getattr(result, field.attribute)
+            if values is not None:
+                np.testing.assert_allclose(rows[field.name][row], values, rtol=1e-6)
+            elif field.name in rows:
+                assert not rows[field.name][row].any()
+    assert set(arrays["origin"]) == {"emulated"} and arrays["pose_sensor"].tolist() == ["4"] * 6
+    assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
+
+
+@pytest.mark.parametrize("way", [("npz",), ("npz", "mcap"), ("npz", "mcap", "npz")], ids="-".join)
+def test_scans_poses_mountings_and_baselines_survive_any_way(made, tmp_path, way):
+    path, _ = made
+    for number, ending in enumerate(way):
+        new = tmp_path / f"{number}.{ending}"
+        assert convert(path, new) == 0
+        path = new
+    before, after = load_recording(made[0]), load_recording(path)
+    assert after.origin == "emulated" and dict(after.mountings) == dict(before.mountings) == {"4": TURNED}
+    assert {name: one.id for name, one in after.baselines.items()} == {
+        name: one.id for name, one in before.baselines.items()
+    }
+    for one, other in zip(before.baselines.values(), after.baselines.values(), strict=True):
+        assert (one.counts == other.counts).all()
+    for one, other in zip(before.tracks, after.tracks, strict=True):
+        assert (
+            one.sensor == other.sensor and (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
+        )
+    assert before.poses is not None and after.poses is not None
+    for name in ("time_ns", "values", "sensor", "holds", "used_from_ns"):
+        assert (getattr(before.poses, name) == getattr(after.poses, name)).all()
+
+
+def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp_path, capsys):
+    path, results = made
+    assert convert(path, tmp_path / "press.csv") == 0
+    out = capsys.readouterr().out
+    files = {name: tmp_path / f"press-{name.replace('/', '-')}.csv" for name in ("4", "left/6")}
+    for sensor, file in files.items():
+        own = [result.scan for result in results if result.scan.sensor == sensor]
+        whole = [scan for scan in own if scan.complete]
+        again = load_recording(file)
+        counts = np.array([scan.counts for scan in whole])
+        placed = TURNED.place_counts(again.tracks[0].counts) if sensor == "4" else again.tracks[0].counts
+        assert (placed == counts).all() and again.origin == "emulated"
+        assert f"{file}: {len(whole)} scans of sensor {sensor}, " in out
+    assert out.count("scans are left out: a taxel gave no reading") == 1 and "not in it: all but counts, times" in out
+    poses = load_recording(files["4"]).poses
+    assert (
+        poses is not None
+        and poses.values[0, :3].tolist() == [0.0, 0.0, 0.0]
+        and load_recording(files["left/6"]).poses is None
+    )
+
+
+def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):
+    scans = [make_scan(number, sensor=name) for number in range(3) for name in ("a/b", "a-b")]
+    path = record_into(tmp_path / "press.mcap", make_results(scans))
+    assert convert(path, tmp_path / "press.csv") == 0
+    assert [len(load_recording(tmp_path / f"press-{number}.csv").tracks[0].counts) for number in (1, 2)] == [3, 3]
+
+
+@pytest.mark.parametrize("ending", ["mcap", "npz"])
+def test_a_csv_becomes_a_recording_at_its_rate(tmp_path, ending):
+    source = write_recording(tmp_path / "finger.csv", make_counts(6), rate_hz=None)
+    new = tmp_path / f"new.{ending}"
+    assert convert(source, new, "--rate-hz", 50) == 0
+    scans = scans_of(new)
+    assert [scan.time_ns for scan in scans] == [number * 20_000_000 for number in range(6)]
+    assert all((scan.counts == counts).all() for scan, counts in zip(scans, make_counts(6), strict=True))
+
+
+def test_files_of_version_0_1_are_read(tmp_path):
+    """Its maps were in mm, and no channel stated that."""
+    assert convert(OLD / "press.npz", tmp_path / "a.mcap") == 0
+    assert convert(OLD / "press.mcap", tmp_path / "b.npz") == 0
+    before, after = np.load(OLD / "press.npz"), np.load(tmp_path / "b.npz")
+    np.testing.assert_allclose(after["pattern"], before["pattern"], atol=2e-7)
+    assert before["has_pattern"].sum() == after["has_pattern"].sum() > 0
+    assert ((after["baseline"] == "") == (before["baseline"] == "")).all() and len(set(after["baseline"])) == 2
+    for one, other in zip(scans_of(OLD / "press.npz"), scans_of(tmp_path / "a.mcap"), strict=True):
+        assert same_scan(other, one)
+
+
+def test_a_recording_that_breaks_off_gives_what_is_whole_with_a_note(made, tmp_path, capsys):
+    whole = made[0].read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    code = convert(tmp_path / "cut.mcap", tmp_path / "cut.npz")
+    err = capsys.readouterr().err
+    assert (code, "breaks off" in err) in ((0, True), (2, True)), err
+    assert (tmp_path / "cut.npz").exists() == (code == 0)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("press.mcap", 2, "required: NEW"),
+        ("press.mcap new.txt", 2, "new.txt: expected a name that ends in .mcap, .npz or .csv"),
+        ("press.mcap new.mcap", 2, "press.mcap and new.mcap have the same format"),
+        ("bag new.mcap", 2, "bag and new.mcap have the same format"),
+        ("press.mcap taken.npz", 5, "taken.npz exists: give another name, or delete it first"),
+        ("press.mcap none/new.npz", 5, "cannot write none/new.npz: No such file"),
+        ("none.mcap new.npz", 2, "none.mcap: cannot be read: No such file"),
+        ("text.mcap new.npz", 2, "text.mcap: not an MCAP file"),
+        ("text.csv new.npz", 2, "text.csv, line 1: "),
+        ("text.npz new.mcap", 2, "text.npz: not a whole .npz archive"),
+        ("bare.csv new.mcap", 2, "bare.csv does not state its rate: pass --rate-hz"),
+        ("press.mcap new.npz --rate-hz 9", 2, "--rate-hz is for a .csv alone: press.mcap has times of its own"),
+    ],
+)
+def test_what_cannot_be_converted_is_said_in_one_line_and_nothing_is_made(
+    words, code, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    record_into(Path("press.mcap"), make_results([make_scan()]))
+    for name in ("text.mcap", "text.csv", "text.npz", "taken.npz"):
+        Path(name).write_text("text")
+    Path("bag").mkdir()
+    write_recording(Path("bare.csv"), make_counts(3))
+    before = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
+    try:
+        assert convert(*words.split()) == code
+    except SystemExit as ended:
+        assert ended.code == code
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+    assert {path.name: path.stat().st_size for path in tmp_path.iterdir()} == before
+
+
+RUN = """
+import resource, signal, sys
+from edge.cli import main as cli
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(cli.main(["convert", *sys.argv[2:]]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "new"), [("press.mcap", "new.npz"), ("old.npz", "new.mcap"), ("press.mcap", "new.csv")]
+)
+def test_a_full_disk_leaves_nothing(source, new, tmp_path):
+    scans = [make_scan(number, press_counts=3000, noise=number) for number in range(300)]
+    record_into(tmp_path / "press.mcap", make_results(scans))
+    arrays_of(tmp_path / "press.mcap")
+    (tmp_path / "press.npz").rename(tmp_path / "old.npz")
+    where = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", RUN, "10000", source, new]
+    done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["old.npz", "press.mcap"]
+
+
+def test_ctrl_c_leaves_nothing(tmp_path):
+    write_recording(tmp_path / "long.csv", np.tile(make_counts(100), (100, 1, 1, 1)), rate_hz=100)
+    where = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
+    with subprocess.Popen(command, cwd=tmp_path, env=where, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        while not list(tmp_path.glob(".new.mcap.*")) and process.poll() is None:
+            pass
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, b"") and b"Traceback" not in err
+    assert [path.name for path in tmp_path.glob("*new*")] == [] and not list(tmp_path.glob(".new*"))

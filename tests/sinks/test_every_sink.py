@@ -1,0 +1,209 @@
+"""Contract of every sink: each kind of result and event comes back, it fails alone, and ends cleanly."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from edge_samples import ROOT, ListSink
+from mcap_samples import messages_of
+from sink_readers import CONTRACT, EVENTS, KINDS, PERIOD_NS, Jsonl, Mcap, Ros2, every_kind, told
+from sink_samples import RUN, make_sure_results
+
+from edge.errors import SinkClosedError, SinkError, UsageError
+from edge.perception.event import Event
+from edge.pipeline.sink import Sink
+from edge.sinks.fan_out import Fan
+from edge.sinks.json_encoding import COUNTED_NS
+from edge.sinks.jsonl import JsonLinesSink
+from edge.sinks.registry import FORMS, check_sink, open_sink
+from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.status_line import StatusSink
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+
+
+@pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__.lower())
+def opened(request, tmp_path):
+    """A sink with its reader, of each kind."""
+    made = request.param(tmp_path)
+    yield made
+    made.close()
+
+
+def test_each_kind_of_result_and_event_comes_back(opened):
+    results = every_kind()
+    sink: Sink = opened.sink
+    sink.pose([TimedPose(PadPose(1, 2), 3)])
+    for result in results:
+        sink.write(result, RUN)
+        opened.look()
+    for event in EVENTS[:2]:
+        sink.tell(event, RUN)
+    sink.wait()
+    assert sink.unwritten == 0
+    opened.close()
+    found, expected = opened.results(), [told(result) for result in results]
+    if isinstance(opened, Ros2):
+        expected = [one._replace(scan=None, force_counts=None) for one in expected if one.state != "dropped"]
+    for got, wanted in zip(found, expected, strict=True):
+        near = (got.highest, got.force_counts) == pytest.approx((wanted.highest, wanted.force_counts), abs=0.051)
+        assert near and got[:5] == wanted[:5]
+    events = opened.events()
+    assert events is None or events == [(event.kind, event.text) for event in EVENTS[:2]]
+
+
+def test_one_that_ends_without_a_result_leaves_nothing_behind(opened, tmp_path):
+    opened.sink.wait()
+    opened.close()
+    assert [path.name for path in tmp_path.iterdir() if path.stat().st_size] == []
+
+
+@pytest.mark.parametrize("kind", [Jsonl, Mcap])
+def test_counters_come_once_a_second_and_with_the_record_in_which_one_changes(kind, tmp_path):
+    opened, (first, *_) = kind(tmp_path), make_sure_results(1)
+    losses = (0, 0, 2, 2, 2, 2, 2)
+    times_ns = (0, PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS, COUNTED_NS, COUNTED_NS + 2 * PERIOD_NS, 5)  # played again
+    for number, (lost, time_ns) in enumerate(zip(losses, times_ns, strict=True)):
+        scan = replace(first.scan, number=number, time_ns=time_ns)
+        opened.sink.write(replace(first, scan=scan), {"scans": number, "dropped": lost})
+    opened.close()
+    if kind is Jsonl:
+        said = opened.lines()
+    else:
+        said = [json.loads(RESULT.decode(data)["record"]) for _, data in messages_of(opened.path)["/s4/result"]]
+    counted = {one["scan"]: one["counters"]["dropped"] for one in said if "counters" in one}
+    assert counted == {0: 0, 2: 2, 5: 2, 6: 2}
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from edge.errors import SinkError
+from dataclasses import replace
+from sink_readers import CONTRACT, every_kind
+from sink_samples import RUN
+from edge.sinks.registry import open_sink
+sink, contact = open_sink(sys.argv[1], CONTRACT), every_kind()[3]
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+try:
+    for number in range(2400):
+        sink.write(replace(contact, scan=replace(contact.scan, number=number)), RUN)
+    sink.close()
+except SinkError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [("jsonl:out.jsonl", "cannot write records to out.jsonl: File too large"),
+     ("mcap:out.mcap", "recording into out.mcap stopped: File too large; its ")],
+)  # fmt: skip
+def test_a_disk_that_fills_up_is_told_and_what_was_written_is_whole(form, words, tmp_path):
+    where = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, form], cwd=tmp_path, env=where, capture_output=True, text=True, timeout=60
+    )
+    assert done.stdout.startswith(words) and done.stdout.count("\n") == 1, done.stderr
+    if form.startswith("jsonl"):
+        lines = (tmp_path / "out.jsonl").read_text().splitlines()
+        assert [json.loads(line)["scan"] for line in lines] == list(range(len(lines))) != []
+        return
+    from firmware_bridge.recording.formats import load_recording
+
+    recording = load_recording(tmp_path / "out.mcap")
+    scans = sum(len(track.counts) for track in recording.tracks)
+    assert f"its {scans} scans can be played" in done.stdout
+    assert "breaks off (without an end" in recording.notes[0], "a chunk is there as a whole, or not at all"
+
+
+def gone(tmp_path: Path) -> Sink:
+    """Return a sink whose reader has left."""
+    os.mkfifo(tmp_path / "fifo")
+    reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
+    sink = JsonLinesSink(str(tmp_path / "fifo"))
+    os.close(reader)
+    return sink
+
+
+@pytest.mark.parametrize("bad", [lambda path: JsonLinesSink("/dev/full"), gone], ids=["full", "gone"])
+def test_a_sink_that_fails_leaves_the_others_going_and_each_hears_of_it(opened, bad, tmp_path):
+    events: list[Event] = []
+    fan, good, failing = Fan(events.append, lambda: 11), ListSink(), bad(tmp_path)
+    for sink in (failing, opened.sink, good):
+        fan.add(sink)
+    results = every_kind()
+    for result in results:
+        fan.write(result, RUN)
+        opened.look()
+    if isinstance(failing, JsonLinesSink) and not fan.failures:
+        fan.close()
+    else:
+        with pytest.raises(SinkError, match="No space left"):
+            fan.close()
+    opened.sink.close = lambda: None
+    opened.close()
+    assert good.results == results and good.closed and len(opened.results()) >= len(results) - 1
+    (event,) = events
+    assert event.kind == "sink" and event.text.endswith("; the other sinks continue") and good.events == events
+
+
+def test_the_failure_of_the_last_one_ends_the_run_and_a_reader_that_goes_is_an_ordinary_end(tmp_path):
+    for failing, kind in ((JsonLinesSink("/dev/full"), SinkError), (gone(tmp_path), SinkClosedError)):
+        fan = Fan(lambda event: None)
+        fan.add(failing)
+        with pytest.raises(SinkError) as ended:
+            fan.write(every_kind()[0], RUN)
+        assert type(ended.value) is kind
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "words"),
+    [
+        ("jsonl:none/out.jsonl", SinkError, "none/out.jsonl: No such file"),
+        ("jsonl:fifo", SinkError, "nobody reads fifo: start its reader first"),
+        ("mcap:none/out.mcap", SinkError, "cannot record into none/out.mcap: No such file"),
+        ("mcap:taken.mcap", SinkError, "taken.mcap exists: give another name, or delete it first"),
+        *((f"mcap:{name}", UsageError, "a file whose name ends in .mcap") for name in ("a", "/dev/full", "a.npz")),
+        ("npz:a.npz", UsageError, "record by --sink mcap:a.mcap, then edge-sr convert a.mcap a.npz"),
+        *((f"shm:{name}", SinkError, "cannot be a name") for name in ("a/b", "../x", ".x", "a b", "x" * 101)),
+        *((f"ros2:{name}", UsageError, "is not a ROS topic") for name in ("4", "a//b", "a/", "a b", "\u00e4", "~/a")),
+        ("ros2:skin?comands", UsageError, "'comands' after its topic, expected ros2:TOPIC or ros2:TOPIC?commands"),
+        ("zenoh:a//b", UsageError, "'a//b' for a key"),
+        ("zenoh:a/*", UsageError, "'a/*' for a key"),
+        ("zenoh:@/a", UsageError, "'@/a' for a key"),
+        ("zenoh:a?listen=x", UsageError, "'listen=x' after its key: expected zenoh:KEY, zenoh:KEY?connect="),
+        ("zenoh:a?connect=here", UsageError, "'connect=here' after its key"),
+        ("zenoh:a?", UsageError, "'' after its key"),
+        *((text, UsageError, ", ".join(FORMS)) for text in ("", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "x")),
+    ],
+)
+def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, error, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("taken.mcap").write_text("mine")
+    os.mkfifo("fifo")
+    with pytest.raises(error) as refused:
+        open_sink(text, CONTRACT)
+    assert words in str(refused.value) and str(refused.value).isprintable()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "taken.mcap"]
+    assert Path("taken.mcap").read_text() == "mine"
+    if error is UsageError:  # known before anything is opened
+        with pytest.raises(UsageError):
+            check_sink(text)
+
+
+@pytest.mark.parametrize("form", ["mcap:out.mcap", "ros2:skin"])
+def test_metres_need_a_model_whose_unit_is_known(form, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match="patterns are in 'counts', expected mm: use another sink"):
+        open_sink(form, replace(CONTRACT, output_unit="counts"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_status_is_a_sink_without_a_target():
+    assert isinstance(open_sink("status", CONTRACT), StatusSink)
