@@ -1,4 +1,4 @@
-"""Programs that put results over zenoh: their end, and the bench."""
+"""Programs that put results over zenoh: their end."""
 
 import os
 import re
@@ -7,14 +7,11 @@ import signal
 import subprocess
 import sys
 import time
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from bridge_samples import write_recording
-from edge_samples import ROOT, ended, make_scan, write_model
-from zenoh_load import PacedLink
-from zenoh_load import _figures as figures_of
+from edge_samples import ended, make_scan, write_model
 from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts
 
 from edge.terminal.forced_end import EXIT_FORCED
@@ -71,47 +68,3 @@ class TestEndOfTheProgram:
             words = program.communicate()[1].decode()
         assert program.returncode == EXIT_FORCED
         assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words)
-
-
-def test_the_bench_counts_what_comes():
-    wrote = [
-        {"written": 10, "patterns": 4, "dropped": 2, "cpu_s": 0.5},
-        {"written": 10, "patterns": 4, "dropped": 0, "cpu_s": 0.3},
-    ]
-    got = {"latencies_us": {"scan": [1000.0] * 15, "pattern": [2000.0] * 6}, "bytes": 4_000_000, "cpu_s": 0.1}
-    told = (10, 4, 2, 1, 1, 1, 2, 2, 2, 10, 25, 25, 40, 5)
-    assert figures_of(wrote, got, 2.0) == pytest.approx(told)
-
-
-def test_the_bench_gives_every_sensor_a_scan_a_tick():
-    sensors, given = ("4", "6"), []
-    link = PacedLink([make_scan(number) for number in range(150)], sensors, ticks=3)
-    while not link.ended:
-        given += link.read(1)
-    assert [(scan.sensor, scan.number) for scan in given] == [(name, tick) for tick in range(3) for name in sensors]
-    assert all(scan.time_ns <= later.time_ns for scan, later in pairwise(given))
-    assert given[0].counts.tolist() == make_scan(0).counts.tolist()
-
-
-def start_bench(*words, **settings):
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [sys.executable, str(ROOT / "tests/system/zenoh_load.py"), "--sensors", "1", "--processes", "1", *words]
-    return ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, start_new_session=True, **pipes, **settings))
-
-
-def test_an_interrupted_bench_ends_with_all_its_processes_and_one_line(tmp_path):
-    with start_bench("--out", str(tmp_path), preexec_fn=hear_interrupts) as bench:
-        while not bench.stdout.readline().startswith("|---"):
-            assert bench.poll() is None
-        time.sleep(0.5)  # its processes are starting, or have started
-        os.killpg(bench.pid, signal.SIGINT)
-        _, errors = bench.communicate()  # which all of them hold open
-    assert (bench.returncode, errors) == (130, "edge-sr: zenoh stopped before its end\n")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_bench_that_cannot_write_says_so_before_it_measures(tmp_path):
-    (tmp_path / "taken").touch()
-    with start_bench("--out", str(tmp_path / "taken")) as bench:
-        out, errors = bench.communicate()
-    assert (bench.returncode, out) == (1, "") and re.fullmatch(r"zenoh: .*File exists: '.*/taken'\n", errors)
