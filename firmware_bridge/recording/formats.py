@@ -208,4 +208,4 @@ def _npz_rate_hz(path: Path, rate: NDArray[Any] | None) -> float | None:
 
 
 def _refuse_array(path: Path, name: str, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, array '{name}': {got}, expected {expected}")
+    raise RecordingError(f"{path}, array '{name}': {' '.join(got.split())}, expected {expected}")
