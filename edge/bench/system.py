@@ -172,7 +172,8 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
     if not records or lost:
         return Cost(cpu_percent, None, None, lost, resident_mb)
     took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
-    return Cost(cpu_percent, *map(float, np.percentile(took_us, (50, 99))), lost, resident_mb)
+    p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
+    return Cost(cpu_percent, p50_us, p99_us, lost, resident_mb)
 
 
 @contextmanager
@@ -194,9 +195,12 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     command += ["--stamps", str(folder / "stamps.txt"), *map(str, played)]
     program = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
     program += ["--sink", "status"] if part == "at rest" else ["--sink", "jsonl:-", "--every-scan"]
-    pipes = {"stdout": subprocess.PIPE, "start_new_session": True}
     with subprocess.Popen(
-        [sys.executable, *command], stdin=subprocess.PIPE, env=environment(ROOT), **pipes
+        [sys.executable, *command],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=environment(ROOT),
+        start_new_session=True,
     ) as emulators:
         try:
             ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
@@ -210,8 +214,9 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                     [sys.executable, *program],
                     stdin=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
                     env=environment(tree),
-                    **pipes,
+                    start_new_session=True,
                 ) as process,
             ):
                 try:

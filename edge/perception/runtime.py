@@ -11,7 +11,7 @@ from edge.errors import UsageError, WindowError
 from edge.inference.model_interface import Model
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
-from edge.perception.event import Event, EventKind, Untimed
+from edge.perception.event import OLD_NS, UNCHECKED, Event, EventKind, Untimed, age_notes, notes_on_missing
 from edge.perception.gain_following import GainFollower
 from edge.perception.gain_learning import ContactModel
 from edge.perception.next_tap import TapAdvice
@@ -19,7 +19,6 @@ from edge.perception.pattern_check import REPEATS, PatternCheck
 from edge.perception.pattern_input import Due, DueQueue
 from edge.perception.pattern_result import Describer, checked, with_taps_that_belong
 from edge.perception.result import Result, overtaken, replace
-from edge.perception.scan_notes import OLD_NS, UNCHECKED, age_notes, notes_on_missing
 from edge.perception.sensor_state import Sensor
 from edge.perception.tap_poses import TapPoses
 from edge.perception.tap_tracker import TapTracker

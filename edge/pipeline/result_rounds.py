@@ -6,10 +6,9 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from operator import attrgetter
 from typing import Final
 
-from edge.perception.event import Event
+from edge.perception.event import OLD_NS, Event, waited_note
 from edge.perception.result import Result, replace
 from edge.perception.runtime import Runtime
-from edge.perception.scan_notes import OLD_NS, waited_note
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.deadline import Deadline
 from edge.pipeline.gain_keeper import GainKeeper

@@ -50,7 +50,7 @@ ENDLESS = """
 import onnxruntime, numpy as np, sys
 from onnx import TensorProto as Type, helper
 from edge.terminal.stop_signals import stop_on_signals
-from edge.cli.keyboard import terminal_keys
+from edge.cli.user_commands import terminal_keys
 from edge.pipeline.commands import Commands
 
 def value(name, kind, shape):
