@@ -12,7 +12,7 @@ run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
 
 test: $(VENV)/.dev  ## everything else, all tests; three at a time on two cores, since many mostly wait, and the soak beside
-	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider tests/system/test_soak.py & soak=$$!; \
+	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider tests/system/test_chaos.py & soak=$$!; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not soak"; tests=$$?; \
 	wait $$soak && test $$tests = 0
 
@@ -48,12 +48,7 @@ reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each co
 	$(REPORT) -m export.stability
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md
 	$(BIN)/edge-sr bench --threads 1 --out reports
-	$(BIN)/edge-sr bench --system --out reports/system
 	$(REPORT) tests/support/wire_faults.py --out reports/wire-faults.md
-	$(BIN)/python tests/system/faults.py 10 --seed 2 --out reports
-	$(BIN)/python tests/system/hand_soak.py 60 --out reports
-	$(BIN)/python tests/system/zenoh_load.py --out reports
-	$(REPORT) tests/system/fuzz.py --inputs 10000000 --seed 1 --blind --out reports/fuzz.md
 	$(REPORT) tests/system/mutation_survey.py --out reports/mutation.md
 
 reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why

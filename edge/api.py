@@ -11,12 +11,12 @@ request that cannot be met raises a BridgeError or an EdgeError with one clear l
 `edge-sr` works through this module alone, except for its bench, its live page, and a doctor that asks for presses.
 """
 
+import importlib
 import math
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
-from edge.doctor.unattended import examine
 from edge.errors import (
     EdgeError,
     MessageError,
@@ -31,16 +31,12 @@ from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, d
 from edge.inference.contract import Contract
 from edge.inference.model_interface import Model
 from edge.inference.timed_loading import unfinished_load
-from edge.mapping.sink import MapSink, ObjectMap
 from edge.perception.event import Event, Note
 from edge.perception.result import NextTap, Result
 from edge.perception.runtime import Runtime
 from edge.perception.wrench import Wrench
-from edge.pipeline.array_results import infer
-from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import Latest
-from edge.pipeline.pairing import paired
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.pump import pump
 from edge.pipeline.result_stream import Stream
@@ -49,7 +45,6 @@ from edge.pipeline.runtime_setup import load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, settled, with_recorded
-from edge.pose_sources.open_poses import PoseSource, open_poses
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
 from edge.validation import check_positive
@@ -75,9 +70,25 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
+    from edge.doctor.unattended import examine
+    from edge.mapping.sink import MapSink, ObjectMap
+    from edge.pipeline.array_results import infer
+    from edge.pipeline.baseline_capture import take_baselines
+    from edge.pipeline.pairing import paired
+    from edge.pose_sources.open_poses import PoseSource, open_poses
     from firmware_bridge.links.discovery import Found
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
+_ON_USE: Final = {
+    "examine": "edge.doctor.unattended",
+    "MapSink": "edge.mapping.sink",
+    "ObjectMap": "edge.mapping.sink",
+    "infer": "edge.pipeline.array_results",
+    "take_baselines": "edge.pipeline.baseline_capture",
+    "paired": "edge.pipeline.pairing",
+    "PoseSource": "edge.pose_sources.open_poses",
+    "open_poses": "edge.pose_sources.open_poses",
+}
 __all__ = [
     "DEFAULT_MODEL",
     "DEMO_LOOP",
@@ -151,6 +162,13 @@ __all__ = [
     "take_baselines",
     "unfinished_load",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return what is imported on use."""
+    if name not in _ON_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_ON_USE[name]), name)
 
 
 def open_source(

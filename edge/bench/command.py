@@ -15,10 +15,8 @@ from edge.bench.errors import BenchError
 from edge.bench.live_report import Page, head, line
 from edge.bench.machine import this_machine
 from edge.bench.processes import measured, start_up
-from edge.bench.program import PROGRAM_SOURCES
 from edge.bench.provenance import provenance, with_head
-from edge.bench.system import SystemRow
-from edge.bench.system_section import show_system
+from edge.bench.system import show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
@@ -57,7 +55,7 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     _make_folder(options.out)
     frozen = load_frozen_set(contenders.FROZEN_FILE)
     everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
-    system = options.system or options.sensors is not None
+    system = options.system or options.sensors is not None or options.against is not None
     threads = sorted(set(options.threads))
     few = "" if options.ticks >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses mean little)"
     date = datetime.now(UTC).isoformat(timespec="seconds")
@@ -68,7 +66,7 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     lines: list[dict[str, Any]] = []
     try:
         if system:
-            lines += map(_flat, show_system(options.ticks, options.sensors, page))
+            lines += show_system(options.ticks, options.sensors or 1, options.against, page)
         else:
             errors = _errors(everyone, frozen, lines, page)
             _run_times(everyone, threads, options, frozen, lines, page)
@@ -182,18 +180,10 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
     return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
 
 
-def _flat(row: SystemRow) -> dict[str, Any]:
-    """Return a row of the whole program as cells of a flat table."""
-    cells = {"method": row.name, "scans": row.scans, "cpu_percent": row.cpu_percent, "resident_mb": row.resident_mb}
-    for name, times in (("run_time", row.run_time), ("latency", row.latency)):
-        cells |= {} if times is None else {f"{name}_{figure}": getattr(times, figure) for figure in FIGURES}
-    return cells | ({} if row.losses is None else asdict(row.losses))
-
-
 def _write(
     folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
 ) -> None:
-    sources = ["edge/bench/command.py", "edge/bench/worker.py", *(PROGRAM_SOURCES if system else [])]
+    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing", "worker"))]
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:

@@ -34,11 +34,7 @@ def bench_parser() -> argparse.ArgumentParser:
     add("--threads", metavar="N", type=whole(1), nargs="+", default=[1, 2], help="numbers of threads (default 1 2)")
     add("--models", metavar="DIR", type=Path, help="folder of your own models, measured as well")
     add("--only", metavar="NAME", nargs="+", help="measure only these methods")
-    add("--system", action="store_true", help="measure the whole program only: 6 minutes with 3000 ticks")
-    add(
-        "--sensors",
-        metavar="N",
-        type=whole(3),
-        help="measure the whole program with so many sensors only: 2 minutes with 3000 ticks",
-    )
+    add("--system", action="store_true", help="measure the whole program only: 2 minutes with 3000 ticks")
+    add("--sensors", metavar="N", type=whole(1), help="measure the whole program with so many sensors (default 1)")
+    add("--against", metavar="COMMIT", help="measure the whole program in turn with that of another commit")
     return parser

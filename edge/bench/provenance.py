@@ -1,9 +1,9 @@
-"""Head of a report: the command, commit and models that it was made from, as a block of TOML, and the report's age.
+"""Head of a report: the command, commit and inputs that it was made from, as a block of TOML, and the report's age.
 
     python -m edge.bench.provenance
 
-prints a line for each report: fresh, or stale and why. A report is stale where a model or set that it names has
-changed, or a source that it names is gone or has changed since its commit. It is a list and not a gate: exit code 0.
+prints a line for each report: fresh, or stale and why. A report is stale where an input that it names is gone or has
+changed: a model, a set, or one of the few sources that its maker names. It is a list and not a gate: exit code 0.
 """
 
 import argparse
@@ -26,7 +26,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 DIGITS: Final = 12
 """Number of digits kept of a SHA-256."""
 UNKNOWN: Final = "unknown"
-
+"""Word for a commit outside a checkout, and for the hash of an input of which none was kept."""
 _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MULTILINE)
 
 
@@ -37,12 +37,12 @@ class Provenance:
     Attributes:
         command: that makes it.
         date: ISO 8601, UTC.
-        commit: checked out meanwhile, or UNKNOWN outside a checkout.
+        commit: checked out meanwhile, or UNKNOWN.
         tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
         machine: processor, cores and versions.
         seed: of all chance, or None where each source has its own.
-        sources: files that make it, below ROOT.
-        models: file below ROOT -> hash, of each model or frozen set it used.
+        models: file below ROOT -> hash, of each model or set that it used.
+        sources: the same of the files and folders that make it.
     """
 
     command: str
@@ -51,28 +51,28 @@ class Provenance:
     tree: str
     machine: str
     seed: int | None
-    sources: tuple[str, ...]
     models: dict[str, str]
+    sources: dict[str, str]
 
     def __str__(self) -> str:
         """Return the block of TOML that stands at the head of the page."""
-        keys = {key: value for key, value in asdict(self).items() if key != "models" and value is not None}
-        lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items()]
-        lines += ["", "[models]", *(f"{json.dumps(path)} = {json.dumps(value)}" for path, value in self.models.items())]
-        return "\n".join(["```toml", *(lines if self.models else lines[:-2]), "```"])
+        lines = ["```toml"]
+        for key, value in asdict(self).items():
+            if isinstance(value, dict):
+                lines += ["", f"[{key}]", *(f"{json.dumps(path)} = {json.dumps(value[path])}" for path in value)]
+            elif value is not None:
+                lines.append(f"{key} = {json.dumps(value)}")
+        return "\n".join([*lines, "```"])
 
     def stale(self) -> Iterator[str]:
         """Yield why the report is stale; nothing where it is fresh."""
-        for name, before in self.models.items():
+        for name, before in {**self.models, **self.sources}.items():
             if not (ROOT / name).exists():
-                yield f"{name} is not here, so whether it has changed is unknown"
+                yield f"{name} is not here"
+            elif before == UNKNOWN:
+                yield f"of {name} no hash was kept"
             elif file_hash(ROOT / name) != before:
                 yield f"{name} has changed"
-        yield from (f"{name} is gone" for name in self.sources if not (ROOT / name).exists())
-        names = _git("diff", "--name-only", self.commit, "--", *self.sources)
-        if names is None:
-            yield f"commit {self.commit} is not here, so whether its sources have changed is unknown"
-        yield from (f"{name} has changed" for name in (names or "").splitlines() if (ROOT / name).exists())
 
 
 def provenance(
@@ -82,7 +82,7 @@ def provenance(
 
     Args:
         command: that makes it.
-        sources: files that make it, below ROOT.
+        sources: the few files or folders, below ROOT, by which its figures would change.
         models: files of models and frozen sets that it uses.
         seed: of all chance.
     """
@@ -94,8 +94,8 @@ def provenance(
         tree=UNKNOWN if changes is None else "changed" if changes else "clean",
         machine=this_machine(),
         seed=seed,
-        sources=tuple(_below_root(Path(source)) for source in sources),
         models={_below_root(path): file_hash(path) for path in sorted({path.resolve() for path in models})},
+        sources={_below_root(ROOT / source): file_hash(ROOT / source) for source in sources},
     )
 
 
@@ -105,10 +105,9 @@ def read_provenance(page: str) -> Provenance | None:
     if block is None:
         return None
     try:
-        values: dict[str, Any] = {"seed": None, "models": {}} | tomllib.loads(block[1])
-        values["sources"] = tuple(values["sources"])
+        values: dict[str, Any] = {"seed": None, "models": {}, "sources": {}} | tomllib.loads(block[1])
         return Provenance(**{field.name: values[field.name] for field in fields(Provenance)})
-    except (tomllib.TOMLDecodeError, KeyError, TypeError):
+    except (tomllib.TOMLDecodeError, KeyError):
         return None
 
 
@@ -119,12 +118,13 @@ def with_head(page: str, made: Provenance) -> str:
 
 
 def file_hash(path: Path) -> str:
-    """Return a hash of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS]
+    """Return a hash of a file's bytes, or of all Python files below a folder."""
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:DIGITS]
 
 
 def _below_root(path: Path) -> str:
-    path = (path if path.is_absolute() else ROOT / path).resolve()
+    path = path.resolve()
     return path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else path.name
 
 
@@ -137,28 +137,18 @@ def _git(*arguments: str) -> str | None:
     return done.stdout.strip()
 
 
-def lines(folder: Path) -> Iterator[str]:
-    """Yield one line per report of a folder and those in it."""
+def main(arguments: list[str] | None = None) -> None:
+    """Print a line for each report of a folder and those in it."""
+    parser = argparse.ArgumentParser(description="List the reports: fresh, or stale and why.")
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "reports", help="default: reports")
+    folder: Path = parser.parse_args(arguments).folder
     for path in sorted(folder.rglob("*.md")):
         made = read_provenance(path.read_text(encoding="utf-8"))
-        name = path.relative_to(folder).as_posix()
-        if made is None:
-            yield f"{name}: no head: make it again with its command"
-        elif why := "; ".join(made.stale()):
-            yield f"{name}: stale, of {made.date[:10]} ({made.commit}): {why}"
-        else:
-            yield f"{name}: fresh ({made.commit})"
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run the command line."""
-    summary = "List the reports: fresh, or stale and why."
-    parser = argparse.ArgumentParser(prog="python -m edge.bench.provenance", description=summary)
-    parser.add_argument(
-        "folder", type=Path, nargs="?", default=ROOT / "reports", help="folder of the reports (default: reports)"
-    )
-    for text in lines(parser.parse_args(arguments).folder):
-        sys.stdout.write(f"{text}\n")
+        verdict = "no head: make it again with its command"
+        if made is not None:
+            why = "; ".join(made.stale())
+            verdict = f"stale, of {made.date[:10]} ({made.commit}): {why}" if why else f"fresh ({made.commit})"
+        sys.stdout.write(f"{path.relative_to(folder).as_posix()}: {verdict}\n")
 
 
 if __name__ == "__main__":

@@ -1,255 +1,273 @@
-"""Measurement of the whole program, row by row: processor time, latency, losses, start-up and memory."""
+"""Cost of the whole program: edge-sr in a process of its own, its emulated sensors in another, watched from outside.
 
+Processor time at rest and in contact, and the time from a scan's last byte to its record. With another commit, both
+trees run in turn, round by round, so that what else the machine does meets both.
+"""
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tarfile
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from edge.bench.processes import STARTS, usable_cores
-from edge.bench.program import Line, Play, Program, edge_sr, parsed, plain_loop
-from edge.bench.timing import Times, summary
+from edge.bench.errors import BenchError
+from edge.bench.live_report import Page, head, line
+from edge.bench.ratios import ratio_of
+from edge.pipeline.pump import uncollected
+from firmware_bridge.recording.csv_reader import CSV_HEADER
+from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
+ROOT: Final = Path(__file__).parents[2]
+ROUNDS: Final = 5
 SETTLE_S: Final = 2.0
-ALL: Final = 500
-PLAIN, IDLE, IDLE_RECORDED = "plain loop", "at rest", "at rest, recorded"
-FAST_HZ: Final = 5000.0
-FAST: Final = f"at rest, {FAST_HZ:g} Hz"
-HELD, MOVING, FEW = "held still", "every scan new", "every scan new, pattern alone"
-TWO, TWO_RECORDED = "two sensors, every scan new", "two sensors, every scan new, recorded"
-HAND: Final = 16
-"""Sensors of a hand."""
+RATE_HZ: Final = 100.0
+CONTROLLERS: Final = ("4", "6", "8", "10")
+"""Names of the sensors on a bus: at 1 Mbit/s it carries no more."""
+FRAME_US: Final = 130
+PRESSED_SHARE: Final = 3
+"""In contact, one sensor in so many is pressed, rounded up."""
+PARTS: Final = ("at rest", "in contact")
+COLUMNS: Final = ("what", "CPU %", "last byte to record p50 us", "p99 us", "lost", "MB")
+_SCANS: Final = 500
+_TEXT: Final = """\
+edge-sr in a process of its own reads emulated sensors, a process too, over pseudo-terminals, by buses of four. CPU is
+of all its threads, by the scheduler, in % of one core. At rest there is the status line alone; in contact a third of
+the sensors, at least one, is pressed, each scan gets a pattern, and records of some 25 kB go to a pipe that is read at
+once. Lost: scans without a pattern or a record, and frames that did not arrive; where there are any, records cannot be
+matched with scans. Medians of {} rounds of {:g} s, least to most in brackets."""
 
 
-@dataclass(frozen=True, slots=True)
-class Losses:
-    """Numbers of scans, or taxels, that were late or lost in a row.
+class Cost(NamedTuple):
+    """Cost of a round; times in [us], None where records are not read or scans were lost."""
 
-    Attributes:
-        late: patterns later than one period after their scan.
-        dropped: overtaken by a newer scan before the inference.
-        overruns: scans thrown away unseen.
-        torn: taxels missing on the wire.
-    """
-
-    late: int
-    dropped: int
-    overruns: int
-    torn: int
-
-
-@dataclass(frozen=True, slots=True)
-class Used:
-    """Usage of the machine by a program during a row.
-
-    Attributes:
-        seconds: length of the row, in [s].
-        cpu_percent: processor time of all its threads, in [% of one core].
-        thread_percent: the same of each thread that takes any, the most first.
-        resident_mb: memory at the end, in [MB].
-        preempted: number of times a thread lost its processor against its will.
-        others_percent: processor time of everything else on the machine, in [% of one core].
-        stolen_percent: processor time that the host took away from all cores, in [% of one core].
-    """
-
-    seconds: float
     cpu_percent: float
-    thread_percent: tuple[float, ...]
+    p50_us: float | None
+    p99_us: float | None
+    lost: int
     resident_mb: float
-    preempted: int
-    others_percent: float
-    stolen_percent: float
 
 
-@dataclass(frozen=True, slots=True)
-class SystemRow(Used):
-    """Measurement of one run of the whole program.
+class Program:
+    """Process that reads emulated sensors, and its records where it writes any."""
 
-    Attributes:
-        name: of the row.
-        scans: number of scans in the run.
-        run_time: of the inference; None where there was none.
-        latency: from the last byte of a scan to its record read by the bench; None where no records are read, or scans
-            were lost, so that records cannot be matched.
-        losses: None where no records are read.
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process = process
+        self._folder = Path(f"/proc/{process.pid}")
+
+    def records(self, seconds: float) -> list[tuple[int, dict[str, Any]]]:
+        """Return the records of so long without their maps, each with its time of arrival in [ns].
+
+        Raises:
+            BenchError: the program ended.
+        """
+        if self._process.stdout is None:
+            raise ValueError("the program's stdout is not a pipe")
+        heads: list[tuple[int, bytes]] = []  # parsed later: a pause to parse them would fill the pipe
+        end_ns = time.monotonic_ns() + int(seconds * 1e9)
+        while not heads or heads[-1][0] < end_ns:
+            text = self._process.stdout.readline()
+            if not text:
+                raise BenchError(f"edge-sr ended with {self._process.wait()} while it was measured")
+            heads.append((time.monotonic_ns(), text.partition(b',"pattern":')[0]))
+        return [(time_ns, json.loads(text if text.endswith(b"\n") else text + b"}")) for time_ns, text in heads]
+
+    def cpu_s(self) -> float:
+        """Return the processor time of all its threads, as the scheduler counts it, in [s]."""
+        try:
+            tasks = list((self._folder / "task").iterdir())
+            return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
+        except OSError as error:
+            raise BenchError("edge-sr ended while it was measured") from error
+
+    def resident_mb(self) -> float:
+        """Return its resident memory, in [MB]."""
+        return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def tree_of(commit: str, folder: Path) -> Path:
+    """Write the runtime of a commit into a folder.
+
+    Raises:
+        BenchError: there is no such commit here.
     """
-
-    name: str
-    scans: int
-    run_time: Times | None = None
-    latency: Times | None = None
-    losses: Losses | None = None
-
-    @property
-    def rate_hz(self) -> float:
-        """Scans a second, of all sensors together, in [Hz]."""
-        return self.scans / self.seconds
+    command = ["git", "-C", str(ROOT), "archive", commit, "edge", "firmware_bridge"]
+    archive = subprocess.run(command, capture_output=True, check=False)
+    if archive.returncode:
+        raise BenchError(f"{commit}: {archive.stderr.decode(errors='replace').strip().splitlines()[-1]}")
+    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
+        files.extractall(folder, filter="data")
+    return folder
 
 
-@dataclass(frozen=True, slots=True)
-class StartUp:
-    """Starts of the program: each from its spawn to the record of its first pattern, in [s], and the memory then."""
+def show_system(scans: int, sensors: int, against: str | None, page: Page) -> list[dict[str, Any]]:
+    """Measure the whole program, in turn with another commit where one is named, and show it row by row.
 
-    first_pattern_s: tuple[float, ...]
-    resident_mb: float
+    Args:
+        scans: of each sensor, in all rounds of a row.
+        sensors: number of them.
+        against: the other commit.
+        page: shows it.
+
+    Raises:
+        BenchError: a process ended, or there is no such commit.
+    """
+    found: list[dict[str, Any]] = []
+    round_s = scans / RATE_HZ / ROUNDS
+    page.section("The whole program", _TEXT.format(ROUNDS, round_s), head(COLUMNS))
+    with tempfile.TemporaryDirectory() as name:
+        trees = {"": ROOT}
+        if against is not None:
+            (Path(name) / "tree").mkdir()
+            trees[f", {against}"] = tree_of(against, Path(name) / "tree")
+        rounds = [(part, number) for part in PARTS for number in range(ROUNDS)]
+        costs: dict[str, list[Cost]] = defaultdict(list)
+        for part, number in page.tracked(rounds, "the program"):
+            for tree, folder in trees.items():
+                page.progress(part + tree)
+                costs[part + tree].append(measured(part, sensors, round_s, folder))
+            if number == ROUNDS - 1:
+                for tree in trees:
+                    found.append(_row(f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}", costs[part + tree]))
+                    page.say(line([str(cell) for cell in found[-1].values()]))
+                if against is not None:
+                    page.say(line(_ratios(f"{part}, ratio", costs[part], costs[f"{part}, {against}"])))
+    return found
 
 
-ROWS: Final = 9
-"""Number of rows that `rows` yields."""
-HAND_ROWS: Final = 4
-"""Number of rows that `hand_rows` yields."""
-
-
-def hand_names(sensors: int) -> tuple[str, str, str, str]:
-    """Return the names of the rows of many sensors: the plain loop, at rest, a third in contact, and recorded."""
-    contact = f"{sensors} sensors, a third in contact, two cores"
-    return f"plain loop of {sensors} sensors", f"{sensors} sensors at rest", contact, f"{contact}, recorded"
-
-
-def rows(scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
-    """Yield every row, of so many scans at 100 Hz and as much time at 5000; `tell` gets the name of each row first.
+def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost:
+    """Measure one round of the program as it is in a tree.
 
     Raises:
         BenchError: a process ended.
     """
-    seconds = scans / 100
-    moving, two = Play(pressed=ALL, moving=True), Play(sensors=2, pressed=ALL, moving=True)
-    with tempfile.TemporaryDirectory() as folder_name:
-        folder = Path(folder_name)
-        yield from _at_rest(folder, (PLAIN, IDLE), Play(), scans, tell)
-        tell(TWO)
-        yield _unrecorded(folder, TWO, two, scans)
-        for name, play, options in (
-            (IDLE_RECORDED, Play(), ()),
-            (HELD, Play(pressed=ALL), ()),
-            (MOVING, moving, ("--every-scan",)),
-            (FEW, moving, ("--every-scan", "--fields", "run_time_us,pattern")),
-            (TWO_RECORDED, two, ("--every-scan",)),
-            (FAST, Play(rate_hz=FAST_HZ, waits=True), ()),
-        ):
-            tell(name)
-            yield _measured(folder, name, play, seconds, *options)
+    with tempfile.TemporaryDirectory() as name, edge_sr(Path(name), part, sensors, tree) as program:
+        if part == "at rest":
+            time.sleep(SETTLE_S)
+            before_s, start_s = program.cpu_s(), time.monotonic()
+            time.sleep(seconds)
+            records: list[tuple[int, dict[str, Any]]] = []
+        else:
+            program.records(SETTLE_S)
+            before_s, start_s = program.cpu_s(), time.monotonic()
+            records = program.records(seconds)
+        cpu_percent = 100 * (program.cpu_s() - before_s) / (time.monotonic() - start_s)
+        resident_mb, stamps = program.resident_mb(), (Path(name) / "stamps.txt").read_text()
+    times_ns: dict[str, list[int]] = defaultdict(list)
+    for one in stamps.splitlines():
+        sensor, _, time_ns = one.partition(" ")
+        times_ns[sensor].append(int(time_ns))
+    counters = [record["counters"] for _, record in records if record.get("counters")]
+    names = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")
+    lost = sum(counters[-1].get(name, 0) for name in names) if counters else 0
+    if not records or lost:
+        return Cost(cpu_percent, None, None, lost, resident_mb)
+    took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
+    p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
+    return Cost(cpu_percent, p50_us, p99_us, lost, resident_mb)
 
 
-def hand_rows(sensors: int, scans: int, tell: Callable[[str], None]) -> Iterator[SystemRow]:
-    """Yield the rows of many sensors, of so many scans of each; `tell` gets the name of each row first.
+@contextmanager
+def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterator[Program]:
+    """Run `edge-sr` of a tree over emulated sensors, with stored baselines; all files lie in `folder`.
 
     Raises:
-        BenchError: a process ended.
+        BenchError: the emulators did not start.
     """
-    plain, rest, contact, recorded = hand_names(sensors)
-    third = Play(sensors=sensors, pressed=ALL, moving=True, touched=-(-sensors // 3))
-    cores = usable_cores()[-2:]
-    with tempfile.TemporaryDirectory() as folder_name:
-        folder = Path(folder_name)
-        yield from _at_rest(folder, (plain, rest), Play(sensors=sensors), scans, tell)
-        tell(contact)
-        yield _unrecorded(folder, contact, third, scans, cores)
-        tell(recorded)
-        yield _measured(folder, recorded, third, scans / third.rate_hz, "--every-scan", cores=cores)
+    buses = -(-sensors // len(CONTROLLERS))
+    prefixes = [""] if buses == 1 else [f"bus{bus}/" for bus in range(buses)]
+    names = [prefixes[number % buses] + CONTROLLERS[number // buses] for number in range(sensors)]
+    rest = _rest_counts().reshape(4, 4, 3).transpose(2, 0, 1).astype(np.float32)
+    save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in names])
+    pressed = -(-sensors // PRESSED_SHARE) if part == "in contact" else 0
+    played = [write_recording(folder / f"{number}.csv", number, pressed=number < pressed) for number in range(sensors)]
+    command = ["-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop", "--buses", str(buses)]
+    command += ["--rate-hz", str(RATE_HZ), "--frame-us", str(FRAME_US * -(-sensors // buses))]
+    command += ["--stamps", str(folder / "stamps.txt"), *map(str, played)]
+    program = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
+    program += ["--sink", "status"] if part == "at rest" else ["--sink", "jsonl:-", "--every-scan"]
+    with subprocess.Popen(
+        [sys.executable, *command],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=environment(ROOT),
+        start_new_session=True,
+    ) as emulators:
+        try:
+            ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
+            if not all(ports):
+                raise BenchError("the emulator did not start")
+            for prefix, port in zip(prefixes, ports, strict=True):
+                program += ["--source", f"{prefix.replace('/', '=')}slcan:{port}"]
+            with (
+                uncollected(),  # or a pause of our own collector would count as the program's
+                subprocess.Popen(
+                    [sys.executable, *program],
+                    stdin=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    env=environment(tree),
+                    start_new_session=True,
+                ) as process,
+            ):
+                try:
+                    yield Program(process)
+                finally:
+                    process.kill()  # its last records are of no interest
+        finally:
+            if emulators.stdin:
+                emulators.stdin.close()
 
 
-def _at_rest(
-    folder: Path, names: tuple[str, str], play: Play, scans: int, tell: Callable[[str], None]
-) -> Iterator[SystemRow]:
-    """Yield the rows of a plain loop and of the program, with the status line alone."""
-    tell(" and ".join(names))
-    apart = [folder / "plain", folder / "idle"]
-    for one in apart:
-        one.mkdir()
-    # At the same time, since what else runs on the machine moves both, and their ratio is the target.
-    with plain_loop(apart[0], play) as plain, edge_sr(apart[1], play, sink="status") as idle:
-        time.sleep(SETTLE_S)
-        usages = [_Usage(plain), _Usage(idle)]
-        time.sleep(scans / play.rate_hz)
-        used = [usage.since() for usage in usages]
-    for name, one in zip(names, used, strict=True):
-        yield SystemRow(**asdict(one), name=name, scans=scans * play.sensors)
+def environment(tree: Path) -> dict[str, str]:
+    """Return the environment for a process of a tree; its bytecode is kept, as that of an installed program is."""
+    paths = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
+    return os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
 
 
-def _unrecorded(folder: Path, name: str, play: Play, scans: int, cores: Sequence[int] = ()) -> SystemRow:
-    with edge_sr(folder, play, "--every-scan", sink="status", cores=cores) as program:
-        time.sleep(SETTLE_S)
-        usage = _Usage(program)
-        time.sleep(scans / play.rate_hz)
-        return SystemRow(**asdict(usage.since()), name=name, scans=scans * play.sensors)
+def write_recording(path: Path, number: int, *, pressed: bool) -> Path:
+    """Write scans of a sensor at rest, or in a contact that moves, so that each scan differs from the one before."""
+    rng = np.random.default_rng([0, number])
+    counts = _rest_counts() + rng.integers(-3, 4, (_SCANS, 16, 3))
+    if pressed:
+        turn = 2 * np.pi * np.arange(_SCANS)[:, None] / 100
+        taxels = np.arange(16)
+        away = (taxels // 4 - 1.5 - np.sin(turn)) ** 2 + (taxels % 4 - 1.5 - np.cos(turn)) ** 2
+        counts[:, :, 2] += np.rint(3000 * np.exp(-2 * away)).astype(int)  # local, as no drift is
+    np.savetxt(path, counts.reshape(_SCANS, -1), "%d", ",", header=",".join(CSV_HEADER), comments="")
+    return path
 
 
-def _measured(
-    folder: Path, name: str, play: Play, seconds: float, *options: str, cores: Sequence[int] = ()
-) -> SystemRow:
-    with edge_sr(folder, play, *options, cores=cores) as program:
-        program.lines(60.0, most=1)
-        program.skip(SETTLE_S)
-        usage, heads = _Usage(program), program.heads(seconds)
-        since = usage.since()
-    return _recorded(name, parsed(heads), since, program.stamps_ns())
+def _rest_counts() -> Any:
+    return np.array([16_000, 16_400, 38_600]) + 37 * np.arange(16)[:, None]
 
 
-def start_up() -> StartUp:
-    """Return several starts, one after the other, and the median of their memory."""
-    took_s: list[float] = []
-    resident_mb: list[float] = []
-    with tempfile.TemporaryDirectory() as folder_name:
-        for _ in range(STARTS):
-            with edge_sr(Path(folder_name), Play(pressed=ALL)) as program:
-                took_s.append(program.first_pattern_s())
-                resident_mb.append(program.resident_mb())
-    return StartUp(tuple(took_s), float(np.median(resident_mb)))
+def _row(name: str, costs: Sequence[Cost]) -> dict[str, Any]:
+    columns = zip(*costs, strict=True)
+    return {"method": name} | dict(zip(COLUMNS[1:], map(_middle, columns), strict=True))
 
 
-class _Usage:
-    """Usage of a process from now on."""
-
-    def __init__(self, program: Program) -> None:
-        self._program = program
-        self._threads, self._preempted, self._machine = program.thread_cpu_s(), program.preemptions(), _machine_s()
-        self._start_s = time.monotonic()
-
-    def since(self) -> Used:
-        """Return the usage until now."""
-        took_s = time.monotonic() - self._start_s
-        now = self._program.thread_cpu_s()
-        percent = sorted((100 * (cpu_s - self._threads.get(task, 0.0)) / took_s for task, cpu_s in now.items()))[::-1]
-        busy, stolen = (
-            100 * (after - before) / took_s for after, before in zip(_machine_s(), self._machine, strict=True)
-        )
-        return Used(
-            took_s,
-            sum(percent),
-            tuple(share for share in percent if share >= 0.01),
-            self._program.resident_mb(),
-            self._program.preemptions() - self._preempted,
-            max(busy - sum(percent), 0.0),
-            stolen,
-        )
+def _middle(values: Sequence[float | None]) -> str:
+    known = sorted(value for value in values if value is not None)
+    if not known:
+        return "-"
+    shown = [f"{value:.4g}" for value in (known[len(known) // 2], known[0], known[-1])]
+    return f"{shown[0]} ({shown[1]} to {shown[2]})"
 
 
-def _machine_s() -> tuple[float, float]:
-    """Return the time that all cores were busy for this machine, and that the host took away, in [s]."""
-    ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
-    user, nice, system, _, _, interrupts, soft_interrupts, stolen = (tick / 100 for tick in ticks[:8])
-    return user + nice + system + interrupts + soft_interrupts, stolen
-
-
-def _recorded(name: str, lines: list[Line], used: Used, stamps_ns: dict[str, list[int]]) -> SystemRow:
-    first, last = lines[0].record["counters"], lines[-1].record["counters"]
-    lost = {key: last[key] - first[key] for key in ("late", "dropped", "overruns", "torn_wire")}
-    run_times_us = [line.record["run_time_us"] for line in lines if line.record["run_time_us"] is not None]
-    distinguishable = not (last["overruns"] or last["missing_taxels"] or last["duplicates"])
-    return SystemRow(
-        **asdict(used),
-        name=name,
-        scans=len(lines),
-        run_time=summary([round(1e3 * run_time_us) for run_time_us in run_times_us]) if run_times_us else None,
-        latency=summary(latencies_ns(lines, stamps_ns)) if distinguishable else None,
-        losses=Losses(lost["late"], lost["dropped"], lost["overruns"], lost["torn_wire"]),
-    )
-
-
-def latencies_ns(lines: list[Line], stamps_ns: dict[str, list[int]]) -> list[int]:
-    """Return the time from each scan's last byte to its record, in [ns]; matched by number, so no scan may be lost."""
-    return [line.time_ns - stamps_ns[line.record["sensor"]][line.record["scan"]] for line in lines]
+def _ratios(name: str, costs: Sequence[Cost], others: Sequence[Cost]) -> list[str]:
+    """Return the ratios of both trees' rounds, where each was measured."""
+    cells = [name]
+    for ours, theirs in list(zip(zip(*costs, strict=True), zip(*others, strict=True), strict=True))[:3]:
+        both = [pair for pair in zip(ours, theirs, strict=True) if None not in pair]
+        cells.append(str(ratio_of(*zip(*both, strict=True))) if both else "-")
+    return [*cells, "", ""]

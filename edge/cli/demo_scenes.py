@@ -1,4 +1,4 @@
-"""Scenes of the demo: a line before each names its fault, and a line after it the outcome."""
+"""Robot and scenes of the demo: where it taps next, and a line before and after each scene on its fault and outcome."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -10,6 +10,37 @@ import numpy as np
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
+from firmware_bridge.poses.pad_pose import PadPose
+
+
+class DemoRobot(Sink):
+    """Sink that passes on the proposal after each tap of the demo's figure, or that there is none."""
+
+    def __init__(self, recording: Path, touch: Callable[[PadPose | None], object]) -> None:
+        """Load the taps.
+
+        Args:
+            recording: .npz with `counts`, `tap` and `option_counts` as in `DemoScore`.
+            touch: called with the pose of each proposal; None where nothing is proposed.
+        """
+        with np.load(recording, allow_pickle=False) as data:
+            options = data["option_counts"]
+            taps = np.concatenate([data["counts"][data["tap"] >= 0], options.reshape(-1, *options.shape[2:])])
+        self._taps = {counts.tobytes() for counts in taps.astype(np.int32)}
+        self._touch = touch
+        self._tapping = False
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Ask for the next tap once this one is over."""
+        if result.contact:
+            self._tapping |= result.scan.counts.tobytes() in self._taps
+        elif self._tapping and result.contact is False:
+            self._tapping = False
+            self._touch(None if result.next_tap is None else result.next_tap.target)
+
+    def close(self) -> None:
+        """Do nothing: the robot ends with its source."""
+
 
 _FREE: Final = -1
 _FOREIGN, _MAGNET, SLIDE = 0, 1, 2

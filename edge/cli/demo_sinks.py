@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, TextIO
 
 from edge.cli.demo_map import DemoMap
-from edge.cli.demo_robot import DemoRobot
-from edge.cli.demo_scenes import DemoScenes
+from edge.cli.demo_scenes import DemoRobot, DemoScenes
 from edge.cli.demo_score import DemoScore, Scored, score_picture, score_table
 from edge.inference.bundled import demo_recording
 from edge.perception.event import Event

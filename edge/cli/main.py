@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from edge.api import (
     DEMO_LOOP,
@@ -17,7 +17,6 @@ from edge.api import (
     BridgeError,
     DeviceError,
     EdgeError,
-    MapSink,
     ModelError,
     SinkError,
     Source,
@@ -25,7 +24,6 @@ from edge.api import (
     UsageError,
     open_source,
     save_baselines,
-    take_baselines,
     unfinished_load,
 )
 from edge.cli.run_options import (
@@ -43,6 +41,9 @@ from edge.cli.run_options import (
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 from firmware_bridge.in_place import BACKUP_SUFFIX
+
+if TYPE_CHECKING:
+    from edge.api import MapSink
 
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
@@ -120,7 +121,9 @@ def _map(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _follow(options: argparse.Namespace, statistics: Statistics | None = None, mapping: MapSink | None = None) -> None:
+def _follow(
+    options: argparse.Namespace, statistics: Statistics | None = None, mapping: "MapSink | None" = None
+) -> None:
     if options.source == ["demo"] and options.view is not None and not set(options.sink) - {"status"}:
         options.source = [DEMO_LOOP]  # a person may look at a page for long; a sink gets one round
     source = _open_source(options, math.inf if options.give_up_s is None else options.give_up_s)
@@ -177,6 +180,7 @@ def _models(arguments: Sequence[str]) -> int:
 
 def _baseline(arguments: Sequence[str]) -> int:
     options = baseline_parser().parse_args(arguments)
+    from edge.api import take_baselines
     from edge.terminal.stop_signals import stop_on_signals
 
     replaced = options.out.exists()

@@ -22,7 +22,6 @@ from edge.api import (
     Contract,
     DeviceError,
     Fan,
-    MapSink,
     Sink,
     SinkClosedError,
     Source,
@@ -31,19 +30,18 @@ from edge.api import (
     find_model,
     load_baselines,
     load_model,
-    open_poses,
     open_runtime,
     open_sink,
     pump,
 )
 from edge.cli.run_options import runtime_options
 from edge.cli.user_commands import user_commands
-from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.event_printer import MessageSink
 from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
+    from edge.api import MapSink
     from edge.cli.demo_sinks import Demo
     from edge.pipeline.replay_setup import Player
     from edge.view.live_view import LiveView
@@ -58,7 +56,7 @@ def run(
     options: argparse.Namespace,
     source: Source,
     statistics: Statistics | None = None,
-    mapping: MapSink | None = None,
+    mapping: "MapSink | None" = None,
     player: "Player | None" = None,
 ) -> None:
     """Run `edge-sr` without a command, or a command that runs the same way.
@@ -99,7 +97,7 @@ def run(
             source,
             contextlib.ExitStack() as closing,
         ):
-            hint = partial(silence_hint, options.source, source.counters)
+            hint = partial(_silence_hint, options.source, source)
             unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
             messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
             opener = partial(
@@ -158,6 +156,8 @@ def run(
             if view is not None:
                 sinks += view.sinks
             for text in options.poses:
+                from edge.api import open_poses
+
                 closing.callback(open_poses(text, commands.poses).close)
             if options.realtime:  # last, so that it does not affect what the page and the sinks have started
                 from edge.cli.realtime import realtime
@@ -221,6 +221,12 @@ def recorded_text(made_s: float, now_s: float) -> str:
         f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
     )
     return f"recorded on {time.strftime('%Y-%m-%d at %H:%M', time.localtime(made_s))}, {ago}"
+
+
+def _silence_hint(sources: Sequence[str], source: Source) -> str:
+    from edge.pipeline.silence_hint import silence_hint
+
+    return silence_hint(sources, source.counters)
 
 
 def _tell(line: str) -> None:

@@ -1,4 +1,4 @@
-"""Texts of the help of `edge-sr` and its small commands, in the form that edge.terminal.help_format lays out."""
+"""Texts of the help of `edge-sr` and its small commands, in the form that edge.terminal.argument_types lays out."""
 
 from typing import Final
 

@@ -22,13 +22,10 @@ from edge.cli.run_help import (
 )
 from edge.errors import UsageError
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
-from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.pose_sources.open_poses import check_poses
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser, add_source, counts_per_newton, not_negative, port, positive, whole
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS
-from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
 VIEW_PORT: Final = 8077
 SINK_HELP: Final = "output for results, such as jsonl:-; repeat it for several; edge-sr --help lists all"
@@ -83,6 +80,8 @@ def record_parser() -> argparse.ArgumentParser:
 
 def map_parser() -> argparse.ArgumentParser:
     """Return the parser of `edge-sr map`: the map's size and files, and the options of `edge-sr`."""
+    from edge.mapping.object_map import PX_PER_MM, SIZE_MM
+
     parser = Parser(
         prog="edge-sr map",
         usage="edge-sr map [options]",
@@ -190,6 +189,8 @@ def understood(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
         if not any(text.startswith("jsonl:") for text in options.sink):
             raise UsageError("--fields requires a sink of JSON records, such as --sink jsonl:-")
     for text in options.poses:
+        from edge.pose_sources.open_poses import check_poses
+
         check_poses(text)
     runtime_options(options)
     return options
@@ -313,6 +314,8 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
 
 def baseline_parser() -> argparse.ArgumentParser:
     """Return the parser of `edge-sr baseline`."""
+    from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+
     parser = Parser(
         prog="edge-sr baseline",
         usage="edge-sr baseline --out FILE",

@@ -1,11 +1,143 @@
 """Commands of a run from its user: lines on stdin, keys of a terminal, and SIGUSR1."""
 
 import contextlib
+import os
+import select
+import signal
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Final
 
-from edge.cli.keyboard import terminal_keys
-from edge.pipeline.commands import ZERO, Commands, read_stdin
+from edge.pipeline.commands import RESET, ZERO, Command, Commands, read_stdin
+from edge.terminal.forced_end import before_force
 from edge.terminal.stop_signals import handled
+
+KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
+READ_BYTES: Final = 64
+ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+
+
+class Keys:
+    """Producer of commands from keys of a terminal; it never waits, and ignores other keys than KEYS."""
+
+    def __init__(self, commands: Commands, descriptor: int) -> None:
+        """Start with the terminal as it is.
+
+        Args:
+            commands: queue that the keys' commands are put into.
+            descriptor: of a terminal.
+        """
+        self._commands = commands
+        self._descriptor = descriptor
+        self._before: list[Any] | None = None
+        self._gone = False
+
+    def read(self) -> None:
+        """Put the commands of the keys pressed since the last call."""
+        if self._gone or not self._foreground():
+            return
+        if self._before is None:
+            self.take()  # in the foreground again
+        if not select.select([self._descriptor], [], [], 0)[0]:
+            return
+        try:
+            keys = os.read(self._descriptor, READ_BYTES)
+        except OSError:  # the terminal was closed, which ends keys but not the run
+            keys = b""
+        self._gone = not keys
+        for key in keys:
+            command = KEYS.get(bytes([key]))
+            if command is not None:
+                self._commands.put(command)
+
+    def take(self) -> None:
+        """Set the terminal to pass keys one by one, unseen; Ctrl-C and Ctrl-Z remain signals."""
+        import termios
+
+        if self._gone or self._before is not None or not self._foreground():
+            return
+        try:
+            before = termios.tcgetattr(self._descriptor)
+            mode = termios.tcgetattr(self._descriptor)
+            mode[3] &= ~(termios.ICANON | termios.ECHO)
+            mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, mode)
+        except termios.error:
+            self._gone = True
+        else:
+            self._before = before
+
+    def give_back(self, *, for_good: bool = False) -> None:
+        """Restore the terminal's settings, unless the program is in the background, where another uses it."""
+        import termios
+
+        self._gone = self._gone or for_good
+        before, self._before = self._before, None
+        if before is not None and self._foreground():
+            try:
+                termios.tcsetattr(self._descriptor, termios.TCSANOW, before)
+            except termios.error:
+                self._gone = True
+
+    def _foreground(self) -> bool:
+        try:
+            return os.tcgetpgrp(self._descriptor) == os.getpgrp()
+        except OSError:  # not the terminal of this session, or gone
+            return False
+
+
+@contextmanager
+def terminal_keys(commands: Commands) -> Iterator[None]:
+    """Take keys as commands within a with statement, if stdin is a terminal."""
+    if os.name != "posix" or sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
+        yield
+        return
+    keys = Keys(commands, sys.stdin.fileno())
+    commands.ask(keys.read)
+    with _given_back_on_signals(keys), before_force(partial(keys.give_back, for_good=True)):
+        keys.take()
+        try:
+            yield
+        finally:
+            keys.give_back()
+
+
+@contextmanager
+def _given_back_on_signals(keys: Keys) -> Iterator[None]:
+    """Restore the terminal before a signal that ends or stops the program has its usual effect."""
+    before: dict[int, Any] = {}
+
+    def end(number: int, frame: object) -> None:
+        keys.give_back(for_good=True)
+        earlier = before[number]
+        # From now on the signal has its earlier handler: the first one may have set the handler of the second.
+        signal.signal(number, earlier)
+        if callable(earlier):
+            earlier(number, frame)
+        elif earlier == signal.SIG_DFL:
+            os.kill(os.getpid(), number)
+
+    def stop(number: int, frame: object) -> None:
+        keys.give_back()
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGTSTP)  # here it stops
+        signal.signal(signal.SIGTSTP, stop)
+        keys.take()
+
+    ours: dict[int, Any] = {getattr(signal, name): end for name in ENDING if hasattr(signal, name)}
+    ours[signal.SIGTSTP] = stop
+    for number, handler in ours.items():
+        before[number] = signal.getsignal(number)
+        if before[number] != signal.SIG_IGN:  # as under nohup, or in a shell without jobs
+            signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, handler in ours.items():
+            if signal.getsignal(number) is handler:
+                signal.signal(number, before[number])
 
 
 @contextlib.contextmanager

@@ -9,10 +9,9 @@ from edge.errors import UsageError, WindowError
 from edge.inference.model_interface import Model
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
-from edge.perception.event import EventKind, Untimed
+from edge.perception.event import EventKind, Untimed, notes_on_missing
 from edge.perception.gain_learning import ContactModel
 from edge.perception.result import Result
-from edge.perception.scan_notes import notes_on_missing
 from edge.perception.sensor import Common, Sensor, Settings
 from edge.perception.step import Origin, Step
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads

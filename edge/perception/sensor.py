@@ -12,13 +12,12 @@ from edge.perception.baseline_doubt import BaselineDoubt
 from edge.perception.change_gate import LastReading
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
-from edge.perception.event import EventKind, Note, Untimed
+from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Note, Untimed, age_notes
 from edge.perception.gain_following import GainFollower, Learn
 from edge.perception.gain_learning import ContactModel
 from edge.perception.health import Health
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.pattern_stages import Check, Describe
-from edge.perception.scan_notes import OLD_NS, UNCHECKED, age_notes
 from edge.perception.sensor_pad import SensorPad
 from edge.perception.step import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker

@@ -7,10 +7,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.event import Event, Note
+from edge.perception.event import OLD_NS, Event, Note, waited_note
 from edge.perception.pattern_check import Reason
 from edge.perception.result import Filled, NextTap, Result, State, WrenchOrigin
-from edge.perception.scan_notes import OLD_NS, waited_note
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses.pad_pose import PadPose

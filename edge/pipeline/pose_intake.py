@@ -6,8 +6,7 @@ from typing import Final, Protocol
 
 from edge.inference.bundled import POSED_MODEL
 from edge.perception.event import Event
-from edge.pipeline.pose_fields import PoseError
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.pose_queue import PoseError, PoseQueue
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS

@@ -1,4 +1,4 @@
-"""Poses that wait for the loop: any thread puts, the oldest are dropped where the loop is too slow."""
+"""Poses as messages, and those that wait for the loop: any thread puts, a slow loop loses the oldest."""
 
 import json
 import threading
@@ -6,8 +6,93 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
 
-from edge.pipeline.pose_fields import PoseError, pose_of_fields
+from edge.validation import as_float
+from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.scans.scan import is_sensor_name
+
+FURTHEST_AHEAD_NS: Final = 1_000_000_000
+"""Longest time that a pose may lie ahead of now, in [ns]: all others until then would come too late."""
+_FIELDS: Final = ("cmd", "x_mm", "y_mm", "turn_deg", "error_mm", "error_deg", "sensor", "time_ns", "holds")
+
+
+class PoseError(ValueError):
+    """A pose that cannot be taken; the message is one line for the user.
+
+    Attributes:
+        reason: short name of the reason, the same for all poses that are refused for it.
+    """
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
+    """Return the pose in parsed JSON such as {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
+
+    Args:
+        fields: x_mm and y_mm; as wanted turn_deg, error_mm, error_deg, sensor, time_ns and holds.
+        now_ns: monotonic time of its arrival, which is its time if it has none, in [ns].
+
+    Raises:
+        PoseError: a field is missing, unknown, of another kind or out of range.
+    """
+    if fields.get("cmd", "pose") != "pose":
+        raise PoseError("cmd", f"cmd is {_shown(fields['cmd'])}, expected pose: only poses are taken here")
+    unknown = sorted(map(str, fields.keys() - set(_FIELDS)))
+    if unknown:
+        raise PoseError("unknown", f"it has {_shown(unknown[0])}, expected some of {', '.join(_FIELDS)}")
+    number = dict.fromkeys(("x_mm", "y_mm"), None) | {
+        "turn_deg": 0.0,
+        "error_mm": PLACE_ERROR_MM,
+        "error_deg": TURN_ERROR_DEG,
+    }
+    values = {name: _number(name, fields.get(name, default)) for name, default in number.items()}
+    sensor, holds, time_ns = fields.get("sensor"), fields.get("holds", False), fields.get("time_ns", now_ns)
+    if not (sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))):
+        raise PoseError("sensor", f"sensor is {_shown(sensor)}, expected the name of a sensor, or null")
+    if not isinstance(holds, bool):
+        raise PoseError("holds", f"holds is {_shown(holds)}, expected true or false")
+    if not isinstance(time_ns, int) or isinstance(time_ns, bool) or not 0 <= time_ns < 2**63:
+        raise PoseError("time_ns", f"time_ns is {_shown(time_ns)}, expected a whole number of nanoseconds")
+    try:
+        pose = PadPose(**values)
+    except ValueError as error:
+        raise PoseError("range", str(error)) from error
+    return in_time(TimedPose(pose, time_ns, sensor, holds), now_ns)
+
+
+def in_time(timed: TimedPose, now_ns: int) -> TimedPose:
+    """Return a pose that does not lie far ahead of now.
+
+    Raises:
+        PoseError: it does.
+    """
+    ahead_ns = timed.time_ns - now_ns
+    if ahead_ns > FURTHEST_AHEAD_NS:
+        raise PoseError(
+            "time_ns",
+            f"time_ns is {ahead_ns / 1e9:.3g} s ahead of now, expected CLOCK_MONOTONIC of this machine, as in "
+            "records: leave it out for the time of arrival",
+        )
+    return timed
+
+
+def _number(name: str, value: object) -> float:
+    number = as_float(value)
+    if number is None:
+        raise PoseError(name, f"{name} is {'missing' if value is None else _shown(value)}, expected a number")
+    return number
+
+
+def _shown(value: object) -> str:
+    """Return a value of a stranger in a few printable characters."""
+    try:
+        return ascii(value)[:40]
+    except ValueError:
+        return "a number of too many digits"
+
 
 WAITING_POSES: Final = 1024
 """Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""

@@ -13,7 +13,7 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.pipeline.latest import Latest, NewestResults
-from edge.pipeline.pose_fields import PoseError, pose_of_fields
+from edge.pipeline.pose_queue import PoseError, pose_of_fields
 from edge.pipeline.result_rounds import Rounds
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source

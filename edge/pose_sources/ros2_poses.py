@@ -14,8 +14,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from edge.errors import SinkError
-from edge.pipeline.pose_fields import PoseError
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.stamp_clock import StampClock
 from edge.pose_sources.tool_frame import pad_pose, placed
 from edge.sinks.ros2.dds_domain import join

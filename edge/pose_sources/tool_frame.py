@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.pipeline.pose_fields import PoseError
+from edge.pipeline.pose_queue import PoseError
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
 MOST_TILT_DEG: Final = 10.0

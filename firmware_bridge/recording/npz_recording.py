@@ -201,4 +201,4 @@ def _check_array(path: Path, name: str, array: NDArray[Any], kinds: str, shape: 
 
 
 def _refuse(path: Path, name: str, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, array '{name}': {got}, expected {expected}")
+    raise RecordingError(f"{path}, array '{name}': {' '.join(got.split())}, expected {expected}")

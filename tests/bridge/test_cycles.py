@@ -1,7 +1,5 @@
 """Cycles of scans: none mixes two, whatever is lost, and a sensor's place is recovered; readings name their cycle."""
 
-import time
-
 import pytest
 from bridge_samples import read_until_lost
 from cycle_samples import (
@@ -19,12 +17,9 @@ from cycle_samples import (
     read,
     swapping,
 )
-from fault_emulator import FaultyEmulator
-from fault_injector import Injector
-from fault_stretches import parse_stretches
-from fault_truth import Truth
 
 from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP
 
@@ -154,10 +149,9 @@ def test_other_layouts_are_cut_alike(model):
 @pytest.mark.parametrize("first_frame", [0, 5, 11, 15])
 def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_canable):
     """The real serial path is used, as its reader waits for the bytes of a cycle and could sleep through one."""
-    lost = Injector(parse_stretches("dead=4.5@.15+.01,dead=4.3@.25+.01"), Truth())
     recording = numbered(60, first=FIRST)
     with (
-        FaultyEmulator([recording], first_frame=first_frame, old_canable=old_canable, faults=lost) as emulator,
+        Emulator([recording], first_frame=first_frame, old_canable=old_canable) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         scans = read_until_lost(link)
@@ -166,17 +160,4 @@ def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_
     assert all(len(numbers) == 1 for numbers in of_cycles)
     assert counters["resynchronised"] >= (16 - first_frame) % 16
     # Without stamps a machine that is busy for long cannot show that no cycle was lost meanwhile.
-    assert 2 <= lost.truth.fates["dead"] <= 4 and len(scans) > (20 if old_canable else 40)
-
-
-def test_a_fault_that_is_due_while_the_emulator_stands_still_comes_after_it():
-    """A busy machine may stop any program: what was to be played then, faults too, is played when it goes on."""
-
-    def stand_still(what, stretch):
-        if (what, stretch.name) == ("begin", "vanished"):
-            time.sleep(0.5)
-
-    faults = Injector(parse_stretches("vanished@.1+.01,dead=4.5@.2+.2"), Truth(), tell=stand_still)
-    with FaultyEmulator([numbered(60)], faults=faults) as emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_until_lost(link)
-    assert 19 <= faults.truth.fates["dead"] <= 21 and len(scans) > 55
+    assert len(scans) > (20 if old_canable else 40)

@@ -56,7 +56,7 @@ def pages(site) -> dict[Path, Page]:
 
 
 def test_the_first_page_and_the_reports_are_there(site, pages):
-    assert {"index.html", "trouble.html", "reports/bench.html", "reports/system/bench.html", "decisions.html"} <= {
+    assert {"index.html", "trouble.html", "reports/bench.html", "decisions.html"} <= {
         path.relative_to(site).as_posix() for path in pages
     }
     assert (site / "reports" / "families.png").read_bytes() == (ROOT / "reports" / "families.png").read_bytes()

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edge_samples import BASELINE, make_contract
-from fuzz_recordings import archive, npy, recording_arrays, stored
-from hostile_samples import one_line
+from hostile_samples import archive, npy, one_line, recording_arrays, stored
 
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import load_frozen_set

@@ -1,7 +1,7 @@
 """Sensor files made to harm."""
 
 import pytest
-from fuzz_recordings import sensor_toml_seeds
+from hostile_samples import sensor_toml
 
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.sensor_file.model import load_sensor_file
@@ -19,7 +19,7 @@ from firmware_bridge.sensor_file.model import load_sensor_file
     ],
 )
 def test_a_sensor_file_made_to_harm_is_one_line(tmp_path, old, new, complaint):
-    text = sensor_toml_seeds()[0].decode()
+    text = sensor_toml(tmp_path).decode()
     assert old in text
     path = tmp_path / "sensor.toml"
     path.write_text(text.replace(old, new, 1))

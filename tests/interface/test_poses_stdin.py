@@ -13,9 +13,8 @@ from pose_samples import make_posed_contract
 
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
-from edge.pipeline.pose_fields import FURTHEST_AHEAD_NS, PoseError, pose_of_fields
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
-from edge.pipeline.pose_queue import WAITING_POSES, PoseQueue
+from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
 from edge.pipeline.pump import pump
 from edge.pipeline.result_rounds import Rounds
 from edge.pipeline.result_stream import Stream

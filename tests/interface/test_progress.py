@@ -10,12 +10,10 @@ import struct
 import subprocess
 import sys
 import termios
-from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
-import page_cost as view
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_contract, write_model
@@ -201,17 +199,12 @@ def test_what_is_tracked_comes_whole_and_must_tell_how_much_it_is():
 
 
 def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeypatch):
-    """These steps take most of the time of `python -m export.to_onnx` and `python tests/system/page_cost.py`."""
+    """These steps take most of the time of `python -m export.to_onnx`."""
     reached = []
     monkeypatch.setattr(Progress, "advance", lambda bar: reached.append((bar._what, bar._total)))
     monkeypatch.setattr(confidence, "doubts_and_errors", lambda *_: np.ones((3, 40)))
     assert set(confidence.fit_confidence(SimpleNamespace(contract=make_contract(taps=2)), [None] * 3)) == {"1", "2"}
     assert reached == [("confidence", 3)] * 3
-    monkeypatch.setattr(view, "_running", lambda *_: nullcontext(SimpleNamespace(lines=lambda _: [])))
-    monkeypatch.setattr(view, "_looking", lambda *_: nullcontext())
-    monkeypatch.setattr(view.Blocks, "measure", lambda *_: None)
-    view.measured(2, 0.0)
-    assert reached[3:] == [("the live page", 8)] * 8
 
 
 AT_ONCE = """

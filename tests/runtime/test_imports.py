@@ -98,3 +98,28 @@ def test_a_run_loads_what_it_uses_and_starts_two_threads(tmp_path):
     assert ast.literal_eval(threads) == ["MainThread", "ending", "scan-reader"]
     assert not set(ast.literal_eval(modules)) & (UNUSED_IN_A_REPLAY | FORBIDDEN)
     assert "edge.sinks.status_line" in ast.literal_eval(modules)
+
+
+MOST_MODULES = 145
+"""Modules of ours that a run of the demo with a file of records loads: each is work for a reader, and for a start."""
+COUNTED = """
+import sys
+from edge.cli.main import main
+code = main(["--source", "demo", "--duration-s", "1", "--sink", "jsonl:" + sys.argv[1]])
+print(code, *(name for name in sorted(sys.modules) if name.partition(".")[0] in ("edge", "firmware_bridge")))
+"""
+
+
+def test_the_demo_loads_few_modules(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", COUNTED, str(tmp_path / "out.jsonl")],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    code, *modules = done.stdout.split("\n")[-2].split()
+    assert code == "0", done.stderr
+    assert 50 < len(modules) <= MOST_MODULES, modules

@@ -6,7 +6,7 @@ from math import cos, radians, sin
 import numpy as np
 import pytest
 
-from edge.pipeline.pose_fields import PoseError
+from edge.pipeline.pose_queue import PoseError
 from edge.pose_sources.stamp_clock import EARLY_NS, LATE_NS, StampClock
 from edge.pose_sources.tool_frame import MOST_TILT_DEG, pad_pose, placed
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG

@@ -1,4 +1,4 @@
-"""Programs that put results over zenoh: their end, and the bench."""
+"""Programs that put results over zenoh: their end."""
 
 import os
 import re
@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording
 from edge_samples import ended, make_scan, write_model
-from zenoh_load import _figures as figures_of
 from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts
 
 from edge.terminal.forced_end import EXIT_FORCED
@@ -69,13 +68,3 @@ class TestEndOfTheProgram:
             words = program.communicate()[1].decode()
         assert program.returncode == EXIT_FORCED
         assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words)
-
-
-def test_the_bench_counts_what_comes():
-    wrote = [
-        {"written": 10, "patterns": 4, "dropped": 2, "cpu_s": 0.5},
-        {"written": 10, "patterns": 4, "dropped": 0, "cpu_s": 0.3},
-    ]
-    got = {"latencies_us": {"scan": [1000.0] * 15, "pattern": [2000.0] * 6}, "bytes": 4_000_000, "cpu_s": 0.1}
-    told = (10, 4, 2, 1, 1, 1, 2, 2, 2, 10, 25, 25, 40, 5)
-    assert figures_of(wrote, got, 2.0) == pytest.approx(told)

@@ -13,11 +13,9 @@ cannot be run, since the interface has changed or the clone is shallow, is repor
 """
 
 import argparse
-import io
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from collections.abc import Sequence
@@ -25,7 +23,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from ratios import Ratio, ratio_of
+from edge.bench.errors import BenchError
+from edge.bench.ratios import Ratio, ratio_of
+from edge.bench.system import tree_of
 
 ROOT: Final = Path(__file__).parents[2]
 MOST_RATIO: Final = 1.1
@@ -101,28 +101,13 @@ def compare(tree: Path, before: Path, pairs: int = PAIRS) -> dict[str, tuple[Rat
     found: dict[str, tuple[Ratio, float]] = {}
     for part in PARTS:
         under, over = zip(*least_us[part], strict=True)
-        found[part] = ratio_of(over, under, paired=True), sorted(over)[pairs // 2]
+        found[part] = ratio_of(over, under), sorted(over)[pairs // 2]
     return found
 
 
 def slower(ratio: Ratio) -> bool:
     """Return True for a loss of more than a tenth that is no noise."""
     return ratio.ratio > MOST_RATIO and ratio.low > 1
-
-
-def tree_of(commit: str, folder: Path) -> Path:
-    """Write the runtime of a commit into a folder.
-
-    Raises:
-        ChildError: there is no such commit here.
-    """
-    command = ["git", "-C", str(ROOT), "archive", commit, "edge", "firmware_bridge"]
-    archive = subprocess.run(command, capture_output=True, check=False)
-    if archive.returncode:
-        raise ChildError(archive.stderr.decode(errors="replace").strip().splitlines()[-1])
-    with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
-        files.extractall(folder, filter="data")
-    return folder
 
 
 def run_child(core: int) -> None:
@@ -199,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         try:
             found = compare(ROOT, tree_of(commit, Path(folder)))
-        except ChildError as error:
+        except (ChildError, BenchError) as error:
             print(f"hot path: {commit} cannot be compared with: {error}")
             return 0
     for part, (ratio, took_us) in found.items():

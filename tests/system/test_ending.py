@@ -1,5 +1,6 @@
 """A signal ends `edge-sr` in time, whatever its clients, sinks and model are doing: processes, sockets and pipes."""
 
+import json
 import os
 import pty
 import re
@@ -49,7 +50,7 @@ ENDLESS = """
 import onnxruntime, numpy as np, sys
 from onnx import TensorProto as Type, helper
 from edge.terminal.stop_signals import stop_on_signals
-from edge.cli.keyboard import terminal_keys
+from edge.cli.user_commands import terminal_keys
 from edge.pipeline.commands import Commands
 
 def value(name, kind, shape):
@@ -226,3 +227,19 @@ def test_nothing_is_left_of_the_watch_where_it_ends_in_time():
         assert stop.wait(60)
     assert not any(thread.name == "ending" for thread in threading.enumerate())
     assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_kill_9_leaves_whole_records(tmp_path):
+    """All but the last line of a file are whole, and hold what another sink has shown: sinks are served in order."""
+    recording = write_recording(tmp_path / "played.csv", make_counts(200), rate_hz=400)
+    command = [*EDGE_SR, "--source", f"replay:{recording}", "--rate-hz", "400"]
+    command += ["--sink", f"jsonl:{tmp_path}/out.jsonl", "--sink", "jsonl:-"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+    with subprocess.Popen(command, env=ENVIRONMENT, **pipes) as process:
+        shown = [process.stdout.readline() for _ in range(30)]
+        process.send_signal(signal.SIGKILL)
+        shown += process.stdout.read().split(b"\n")[:-1]
+    assert process.returncode == -signal.SIGKILL
+    lines = (tmp_path / "out.jsonl").read_bytes().split(b"\n")[:-1]
+    assert [json.loads(line)["scan"] for line in lines] == list(range(len(lines)))
+    assert len(lines) >= len(shown) >= 30

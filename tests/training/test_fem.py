@@ -111,8 +111,7 @@ def test_patterns_are_the_nodes_or_lie_straight_between_them():
     slope = 0.3 + 0.01 * pad.nodes_mm[:, None] - 0.02 * pad.nodes_mm[None, :]
     fine_mm = (np.arange(40) - 19.5) * 0.47
     expected = 0.3 + 0.01 * fine_mm[:, None] - 0.02 * fine_mm[None, :]
-    assert np.allclose(pad.pattern(slope[None], 10)[0], expected, atol=1e-6)
-    assert np.allclose(pad.pattern(slope[None], 5)[0], slope[1:-1, 1:-1], atol=1e-6)
+    assert np.allclose(pad.pattern(slope[None])[0], expected, atol=1e-6)
 
 
 def test_a_leap_too_far_is_named():
@@ -124,10 +123,10 @@ def test_a_leap_too_far_is_named():
 def test_wrong_input_is_refused():
     pad = FemPad(3, 1)
     flat = np.zeros((pad.size, pad.size))
-    with pytest.raises(ValueError, match=r"shape \(5, 5\), expected"):
+    with pytest.raises(ValueError, match=r"depth \(5, 5\), expected"):
         pad.press(np.zeros((5, 5)), np.array([0.1]))
-    for steps in ([0.0, 0.1], [0.2, 0.1], []):
-        with pytest.raises(ValueError, match="rising from above 0"):
+    for steps in ([0.0, 0.1], [0.2, 0.1]):
+        with pytest.raises(ValueError, match="expected rising"):
             pad.press(flat, np.array(steps))
     with pytest.raises(ValueError, match=r"nothing lies within 0\.1 mm"):
         pad.press(flat + NOTHING_MM, np.array([0.1]))

@@ -5,12 +5,16 @@ and condensed) avoid locking as the rubber becomes incompressible. Contact is fr
 touching node stays at the surface's height above the node's initial place, and is free in the plane. An active set
 determines the touching nodes: no node may be pulled, and none may overlap the surface.
 
-FElupe is required, which is GPL and therefore a separate extra; only this module imports it.
+Each surface takes minutes, so results are kept in a folder. FElupe is required, which is GPL and therefore a separate
+extra; only this module imports it.
 """
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +23,12 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
 from train.physics.mooney_rivlin import C2_SHARE, MooneyRivlin
+from train.surfaces.depth_image import Pose, Relief, depth_image
+from train.surfaces.named_surfaces import surface_mesh
 
 try:
     import felupe
@@ -30,6 +36,14 @@ except ModuleNotFoundError as error:
     message = f"the FEM reference needs felupe (GPL): {how_to_install('fem')}"
     raise ModuleNotFoundError(message, name="felupe") from error
 
+SCALE: Final = 10
+"""Patterns are compared at 40 x 40, as in the paper."""
+CENTRE: Final = Pose(0.0, 0.0, 0.0)
+"""Position 5, rotation 0 of the paper."""
+LAYER: Final = replace(Layer(), poisson=0.495)
+"""Layer of rubber: the solver's own Poisson's ratio is lower to account for free sides, which the elements have."""
+_EDITION: Final = 1
+"""Edition of kept results; raise it when the results of the elements change."""
 _RESIDUAL: Final = 1e-6
 """Out-of-balance forces at which a step is done, as a share of the reactions."""
 _MAX_NEWTON: Final = 12
@@ -46,25 +60,73 @@ class NoEquilibriumError(TrainError, ArithmeticError):
     """Failure of the elements to converge; the message names step and indentation."""
 
 
-@dataclass(frozen=True, slots=True)
-class FemPresses:
-    """Equilibria of one press, step by step.
+class Mesh(NamedTuple):
+    """Fineness of the elements: nodes per taxel pitch, and elements over the thickness."""
 
-    Attributes:
-        indentation_mm: (s,), in [mm].
-        push_n: (s, size, size), force down on each node, in [N]; 0 without contact.
-        displacement_mm: (s, size, size), of the surface's nodes, downwards, in [mm]; row = y, column = x.
-        touching: (s, size, size), the nodes that touch.
-        newton_steps: (s,), linear systems solved, over all active sets.
-        residual: (s,), force out of balance as a share of the reactions.
-        run_s: (s,), in [s].
+    scale: int
+    cells_high: int
+
+    def __str__(self) -> str:
+        return f"{self.scale} nodes a pitch, {self.cells_high} high"
+
+
+FINEST: Final = Mesh(10, 8)
+"""Mesh whose nodes are the pixels of the 40 x 40 pattern."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Patterns (s, 40, 40) of one press in [mm], its forces (s,) in [N], and the run time of each step in [s]."""
+
+    patterns_mm: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    run_s: NDArray[np.float32]
+
+
+def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path) -> Verdict:
+    """Press a named surface into the middle of the pad at rising indentations (s,), or load the kept result.
+
+    Raises:
+        NoEquilibriumError: a step did not converge.
+    """
+    question = {
+        "edition": _EDITION,
+        "surface": surface,
+        "mesh": mesh,
+        "pose": asdict(CENTRE),
+        "indentation_mm": np.round(indentation_mm, 6).tolist(),
+        "layer": asdict(LAYER),
+        "c2_share": C2_SHARE,
+        "geometry": asdict(USPA44),
+    }
+    path = folder / f"fem-{hashlib.sha256(json.dumps(question).encode()).hexdigest()[:16]}.npz"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        pad = FemPad(*mesh, LAYER)
+        found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
+        pattern, forces, times = pad.pattern(found.displacement_mm), found.force_n, found.run_s
+        unfinished = path.with_suffix(".part.npz")  # a run that is stopped leaves no half result under the name
+        # Half precision is 0.05 % of a displacement, a tenth of the mesh's own error.
+        np.savez_compressed(unfinished, patterns_mm=pattern.astype(np.float16), force_n=forces, run_s=times)
+        unfinished.rename(path)
+    with np.load(path, allow_pickle=False) as kept:
+        return Verdict(*(kept[name].astype(np.float32) for name in ("patterns_mm", "force_n", "run_s")))
+
+
+def relief(surface: str) -> Relief:
+    """Return a named surface as a relief."""
+    return Relief(surface, surface_mesh(surface))
+
+
+class FemPresses(NamedTuple):
+    """Equilibria of one press at its steps (s,): force down and displacement of each node (s, size, size).
+
+    `residual` is the force out of balance as a share of the reactions.
     """
 
-    indentation_mm: NDArray[np.float64]
     push_n: NDArray[np.float64]
     displacement_mm: NDArray[np.float64]
     touching: NDArray[np.bool_]
-    newton_steps: NDArray[np.int64]
     residual: NDArray[np.float64]
     run_s: NDArray[np.float64]
 
@@ -82,11 +144,6 @@ class FemPad:
         cells_high: elements over the thickness.
         layer: thickness, and the material at small strain.
         c2_share: C2 / (C1 + C2).
-        geometry: of a square sensor.
-
-    Attributes:
-        nodes_mm: (size,), places of the nodes along a side, from the centre, in [mm].
-        cell_mm: distance of neighbouring nodes, except for the last before the rim, in [mm].
     """
 
     def __init__(
@@ -95,11 +152,9 @@ class FemPad:
         cells_high: int = 8,
         layer: Layer = Layer(),  # noqa: B008 - frozen
         c2_share: float = C2_SHARE,
-        geometry: SensorGeometry = USPA44,
     ) -> None:
-        self.cell_mm = geometry.pixel_pitch_mm(scale)
-        self.nodes_mm = _nodes_mm(geometry, scale)
-        self._geometry = geometry
+        self.cell_mm = USPA44.pixel_pitch_mm(scale)
+        self.nodes_mm = _nodes_mm(scale)
         self._rubber = MooneyRivlin.of_layer(layer, c2_share)
         heights_mm = np.linspace(0, layer.thickness_mm, cells_high + 1)
         self._mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, heights_mm)
@@ -119,33 +174,29 @@ class FemPad:
             indentation_mm: (s,), rising, in [mm].
 
         Raises:
-            ValueError: shapes do not fit, indentations do not rise from above 0, or nothing lies within reach.
+            ValueError: shapes do not fit, indentations do not rise, or nothing lies within reach.
             NoEquilibriumError: a step did not converge.
         """
         steps_mm = np.asarray(indentation_mm, dtype=np.float64)
-        self._check(depth_mm, steps_mm)
+        if depth_mm.shape != (self.size, self.size) or not (np.diff(steps_mm, prepend=0.0) > 0).all():
+            raise ValueError(
+                f"depth {depth_mm.shape}, expected {self.size} squared; steps {steps_mm} mm, expected rising"
+            )
+        if not (depth_mm < steps_mm[0]).any():
+            raise ValueError(f"nothing lies within {steps_mm[0]:.3g} mm of the pad, the first indentation")
         press = _Press(self._region, self._rubber, self.size)
         found = [
             press.advance(step_mm, step_mm - depth_mm, f"step {i + 1} of {len(steps_mm)}, indentation {step_mm:.3g} mm")
             for i, step_mm in enumerate(steps_mm)
         ]
-        return FemPresses(steps_mm, *map(np.array, zip(*found, strict=True)))
+        return FemPresses(*map(np.array, zip(*found, strict=True)))
 
-    def pattern(self, displacement_mm: NDArray[np.floating], scale: int = 10) -> NDArray[np.float32]:
-        """Interpolate node displacements (s, size, size) linearly to the pixels of the pattern at x`scale`."""
-        rows, cols = self._geometry.pattern_shape(scale)
-        pixel_mm = self._geometry.pixel_pitch_mm(scale)
-        y_mm, x_mm = ((np.arange(count) - (count - 1) / 2) * pixel_mm for count in (rows, cols))
+    def pattern(self, displacement_mm: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Interpolate node displacements (s, size, size) linearly to the pixels of the pattern at SCALE."""
+        pixel_mm, count = USPA44.pixel_pitch_mm(SCALE), USPA44.cols * SCALE
+        along_mm = (np.arange(count) - (count - 1) / 2) * pixel_mm
         surface = RegularGridInterpolator((self.nodes_mm, self.nodes_mm), np.moveaxis(displacement_mm, 0, -1))
-        return np.moveaxis(surface(tuple(np.meshgrid(y_mm, x_mm, indexing="ij"))), -1, 0).astype(np.float32)
-
-    def _check(self, depth_mm: NDArray[np.floating], steps_mm: NDArray[np.float64]) -> None:
-        if depth_mm.shape != (self.size, self.size):
-            raise ValueError(f"a depth image of shape {depth_mm.shape}, expected {(self.size, self.size)}")
-        if steps_mm.ndim != 1 or not len(steps_mm) or not (np.diff(steps_mm, prepend=0.0) > 0).all():
-            raise ValueError(f"indentations {steps_mm.tolist()} mm, expected one or more, rising from above 0")
-        if not (depth_mm < steps_mm[0]).any():
-            raise ValueError(f"nothing lies within {steps_mm[0]:.3g} mm of the pad, the first indentation")
+        return np.moveaxis(surface(tuple(np.meshgrid(along_mm, along_mm, indexing="ij"))), -1, 0).astype(np.float32)
 
 
 class _Press:
@@ -170,10 +221,8 @@ class _Press:
             moved *= indentation_mm / self._indentation_mm
         down_mm = self._down_mm()
         self._touch(self._touching | (wanted_mm > down_mm))
-        newton_steps = 0
         for _ in range(_MAX_SETS):
             result = self._balance(wanted_mm, name)
-            newton_steps += result.iterations
             upwards_n = result.fun.reshape(-1, 3)[:, 2]
             out_of_balance_n = upwards_n[self._top].reshape(self._touching.shape)
             push_n = np.where(self._touching, -out_of_balance_n, 0.0)
@@ -186,9 +235,7 @@ class _Press:
         else:
             raise NoEquilibriumError(f"{name}: what touches still changes after {_MAX_SETS} rounds; {_REMEDY}")
         self._indentation_mm = indentation_mm
-        residual = float(result.fnorms[-1])
-        run_s = perf_counter() - start
-        return push_n, down_mm, self._touching.copy(), newton_steps, residual, run_s
+        return push_n, down_mm, self._touching.copy(), float(result.fnorms[-1]), perf_counter() - start
 
     def _down_mm(self) -> NDArray[np.float64]:
         return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
@@ -256,11 +303,9 @@ class _TangentSolver:
         return factors.solve(load)
 
 
-def _nodes_mm(geometry: SensorGeometry, scale: int) -> NDArray[np.float64]:
+def _nodes_mm(scale: int) -> NDArray[np.float64]:
     """Return the pixels of the pattern, continued to the pad's rim in the same steps, the last at least half a step."""
-    cell_mm = geometry.pixel_pitch_mm(scale)
-    pixels = geometry.cols * scale
-    margin = int((geometry.width_mm / cell_mm - pixels) // 2)
-    inner = pixels + 2 * margin
+    cell_mm, pixels = USPA44.pixel_pitch_mm(scale), USPA44.cols * scale
+    inner = pixels + 2 * int((USPA44.width_mm / cell_mm - pixels) // 2)
     places_mm = (np.arange(inner) - (inner - 1) / 2) * cell_mm
-    return np.concatenate([[-geometry.width_mm / 2], places_mm, [geometry.width_mm / 2]])
+    return np.concatenate([[-USPA44.width_mm / 2], places_mm, [USPA44.width_mm / 2]])

@@ -21,16 +21,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_cache import (
-    CENTRE,
-    FINEST,
-    REFERENCE_POISSON,
-    SCALE,
-    Mesh,
-    Verdict,
-    press_or_recall,
-    relief,
-)
+from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, Verdict, press_or_recall, relief
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
@@ -252,8 +243,6 @@ def _convergence(verdicts: dict[Mesh, list[Verdict]]) -> list[Row]:
         {
             "mesh": str(mesh),
             "force, % of the finest's": float(100 * (np.stack([v.force_n for v in found]) / force_n).mean()),
-            "Newton steps a step": float(np.mean([v.newton_steps for v in found])),
-            "largest residual": float(np.max([v.residual for v in found])),
             "s a surface": _time_s(found),
         }
         for mesh, found in verdicts.items()
@@ -269,7 +258,7 @@ def _how(surfaces: int, steps: int, psf: str) -> str:
         f"against FEM ({psf}). Depth x indentation: the touching pixels at the indentation, sharp. Depth x force, as "
         "the paper has it: one factor fitted in the same way. layer: bonded layer without sides, Polonsky-Keer, "
         f"Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio "
-        f"{REFERENCE_POISSON:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
+        f"{LAYER.poisson:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
         "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
         "was worked out."
     )

@@ -1,0 +1,280 @@
+"""`edge-sr` among faults of the wire, judged from outside: by what its records say, and by what was sent.
+
+    python tests/system/chaos.py MINUTES [--sensors 16] [--seed 1] [--faults lost@2+3] [--calm]
+
+plays sensors on buses of four, a third of them pressed every other 2.5 s. Each reading tells its taxel and cycle. So
+none is made up or old, no whole scan and no pattern mixes cycles without saying so, and every loss is counted. In runs
+of minutes memory, descriptors and latency must stay flat as well. Exit code 1 where a promise was not kept.
+"""
+
+import argparse
+import math
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import IO, Final
+
+import numpy as np
+import orjson
+from chaos_judge import RATE_HZ, REST_COUNTS, Judge, telling
+from chaos_wire import FaultyBus, Sent, stretches
+from numpy.typing import NDArray
+
+from edge.pipeline.pump import uncollected
+from edge.sinks.pipe_capacity import PIPE_BYTES
+from edge.terminal.argument_types import whole
+from edge.terminal.progress_bar import tracked
+from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.emulator_thread import EmulatorThread
+from firmware_bridge.emulation.xela_controller import FRAME_S
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.zeroing.baseline import Baseline, save_baselines
+
+ROOT: Final = Path(__file__).parents[2]
+CONTROLLERS: Final = ("4", "6", "8", "10")
+FIELDS: Final = "counts,fresh,dead,state,note,device_time_ns,latency_us"
+QUIET_S: Final = 0.5
+END_TIMEOUT_S: Final = 30.0
+WINDOW_S: Final = 5.0
+WARM_UP_S: Final = 15.0
+LONG_MINUTES: Final = 2.0
+"""Length from which memory is judged: in less time all is used for the first time."""
+MOST_MB_PER_MINUTE: Final = 0.3
+MOST_LATENCY_RATIO: Final = 5.0
+
+
+def rest_counts() -> NDArray[np.float32]:
+    """Return the baseline (3, 4, 4) of all sensors."""
+    rest = np.zeros((3, 4, 4), dtype=np.float32) + np.array(REST_COUNTS, dtype=np.float32)[:, None, None]
+    rest[2] += 37 * np.arange(16).reshape(4, 4)
+    return rest
+
+
+def timeline(scans: dict[str, NDArray[np.int64]], end_s: Callable[[], float]) -> Iterator[Sent]:
+    """Yield the frames of the sensors on a bus, mixed as on a full one, until a time since the first."""
+    lanes = [(USPA44_MAP.wire_order(name), counts) for name, counts in scans.items()]
+    for cycle in count():
+        for place in range(16):
+            for lane, (order, counts) in enumerate(lanes):
+                time_s = cycle / RATE_HZ + (place * len(lanes) + lane) * FRAME_S
+                if time_s > end_s():
+                    return
+                can_id, taxel = order[place]
+                words = b"".join(int(value).to_bytes(2, "big") for value in counts[cycle % len(counts), taxel])
+                yield Sent(time_s, CanFrame(can_id, b"\x93" + words + b"\x0f"), cycle)
+
+
+@dataclass
+class Run:
+    """Outcome of a run.
+
+    Attributes:
+        judge: its judge.
+        faults: number of stretches, by fault.
+        exit_code, said: of edge-sr.
+        windows: minute, memory in [MB], threads and descriptors, and the lower quartile of the latency in [us].
+    """
+
+    judge: Judge = field(default_factory=Judge)
+    faults: Counter[str] = field(default_factory=Counter)
+    exit_code: int | None = None
+    said: str = ""
+    windows: list[tuple[float, float, int, float]] = field(default_factory=list)
+
+    def growth(self) -> tuple[float, float]:
+        """Return the slope of the memory in [MB a minute], of the second half, and half of its 95 % interval."""
+        minutes, mb, *_ = np.array(self.windows[-max(4, len(self.windows) // 2) :]).T
+        (slope, _), covariance = np.polyfit(minutes, mb, 1, cov=True)
+        return float(slope), float(1.96 * np.sqrt(covariance[0, 0]))
+
+    def latency_ratio(self) -> float:
+        """Return the latency of the last third of the windows to that of the first."""
+        third = max(1, len(self.windows) // 3)
+        first, last = (
+            statistics.median(one[3] for one in part) for part in (self.windows[:third], self.windows[-third:])
+        )
+        return last / first
+
+
+class Chaos:
+    """A run of edge-sr among faults.
+
+    Attributes:
+        run: its outcome so far.
+    """
+
+    def __init__(self, sensors: int, seed: int, faults: str) -> None:
+        """Prepare buses of four sensors with faults as `chaos_wire.stretches` takes them; nothing is started yet."""
+        self.run = Run()
+        buses = -(-sensors // len(CONTROLLERS))
+        self._prefixes = ["" if buses == 1 else f"bus{bus}/" for bus in range(buses)]
+        self._scans: list[dict[str, NDArray[np.int64]]] = [{} for _ in range(buses)]
+        for number in range(sensors):
+            scans, name = self._scans[number % buses], CONTROLLERS[number // buses]
+            scans[name] = telling(number, touched=number < -(-sensors // 3))
+        self._seed, self._faults, self._end_s = seed, faults, math.inf
+
+    def play(self, seconds: float) -> Run:
+        """Run for so long, and judge."""
+        with (
+            tempfile.TemporaryDirectory() as name,
+            uncollected(),  # or no thread would read for a tenth of a second
+            EmulatorThread(buses := self._buses(Path(name))),
+            self._program(Path(name), buses) as process,
+        ):
+            lines = SimpleQueue[bytes]()
+            reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
+            reader.start()
+            self._follow(lines, process, seconds)
+            self._end_s = 0.0  # the sensors are switched off, so that the accounts close
+            self._judge(lines, QUIET_S)
+            process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                self.run.exit_code = process.wait(END_TIMEOUT_S)
+            process.kill()
+            reader.join()
+            self._judge(lines, 0.0)
+            self.run.said = (Path(name) / "said").read_text(errors="replace")
+        for bus in buses:
+            self.run.faults += bus.begun
+        self.run.judge.close(buses, self.run.said, self.names)
+        if self.run.exit_code != 0 or "Traceback" in self.run.said:
+            self.run.judge.broken.append(f"exit code {self.run.exit_code}: {self.run.said[-2000:]}")
+        return self.run
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of all sensors, as records have them."""
+        return [prefix + name for prefix, scans in zip(self._prefixes, self._scans, strict=True) for name in scans]
+
+    def _buses(self, folder: Path) -> list[FaultyBus]:
+        buses: list[FaultyBus] = []
+        for number, (prefix, scans) in enumerate(zip(self._prefixes, self._scans, strict=True)):
+            seed = self._seed + number
+            on_sent = partial(self.run.judge.sent, prefix)
+            sent = timeline(scans, lambda: self._end_s)
+            buses.append(FaultyBus(sent, stretches(self._faults, seed), seed, folder / f"adapter{number}", on_sent))
+            self.run.judge.back_ns[prefix] = buses[-1].back_ns
+        return buses
+
+    @contextmanager
+    def _program(self, folder: Path, buses: Sequence[FaultyBus]) -> Iterator[subprocess.Popen[bytes]]:
+        baselines = [Baseline.of(name, rest_counts(), time.time(), 100, "file") for name in self.names]
+        save_baselines(folder / "zero.json", baselines)
+        command = [sys.executable, "-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
+        for prefix, bus in zip(self._prefixes, buses, strict=True):
+            command += ["--source", f"{prefix.replace('/', '=')}slcan:{bus.line.path}"]
+        with (
+            (folder / "said").open("wb") as said,
+            subprocess.Popen(
+                [*command, "--sink", "jsonl:-", "--fields", FIELDS],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=said,
+                env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": ""},
+                start_new_session=True,
+            ) as process,
+        ):
+            try:
+                yield process
+            finally:
+                process.kill()
+
+    def _follow(self, lines: SimpleQueue[bytes], process: subprocess.Popen[bytes], seconds: float) -> None:
+        """Judge records for so long from the first on, and measure memory and latency window by window."""
+        start_s = time.monotonic()
+        while process.poll() is None and not self.run.judge.records and time.monotonic() < start_s + END_TIMEOUT_S:
+            self._judge(lines, 0.1)
+        warm_up_s = min(WARM_UP_S, seconds / 4)
+        self._judge(lines, warm_up_s)
+        windows = max(4, round((seconds - warm_up_s) / WINDOW_S))
+        for number in tracked(range(windows), "chaos", "window"):
+            if process.poll() is not None:
+                break
+            self.run.judge.latencies_us.clear()
+            self._judge(lines, (seconds - warm_up_s) / windows)
+            latencies_us = sorted(self.run.judge.latencies_us)
+            folder = Path(f"/proc/{process.pid}")
+            mb = int((folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+            held = sum(len(list((folder / name).iterdir())) for name in ("task", "fd"))
+            quiet_us = latencies_us[len(latencies_us) // 4] if latencies_us else math.nan
+            self.run.windows.append(((number + 1) * (seconds - warm_up_s) / windows / 60, mb, held, quiet_us))
+
+    def _judge(self, lines: SimpleQueue[bytes], seconds: float) -> None:
+        """Judge the records that come within this time, and all that wait."""
+        end_s = time.monotonic() + seconds
+        while True:
+            try:
+                self.run.judge.take(orjson.loads(lines.get(timeout=max(0.0, end_s - time.monotonic()))))
+            except Empty:
+                return
+
+
+def _read(stream: IO[bytes], lines: SimpleQueue[bytes]) -> None:
+    """Fetch records at once, since what finds no room is left out for a reader that is slow."""
+    rest = b""
+    while data := os.read(stream.fileno(), PIPE_BYTES):
+        *whole, rest = (rest + data).split(b"\n")
+        for one in whole:
+            lines.put(one)
+
+
+def promises(run: Run, minutes: float, sensors: int) -> list[str]:
+    """Return what was not kept, of a run of minutes its growth as well."""
+    broken = list(dict.fromkeys(run.judge.broken))
+    if len(run.judge.records) != sensors:
+        broken.append(f"{len(run.judge.records)} of {sensors} sensors have records")
+    if minutes >= LONG_MINUTES:
+        slope, half = run.growth()
+        if slope - half > MOST_MB_PER_MINUTE:
+            broken.append(f"memory grows by {slope:.3f} MB a minute (+- {half:.3f})")
+        if run.latency_ratio() > MOST_LATENCY_RATIO:
+            broken.append(f"the latency of the last third is {run.latency_ratio():.2f} times that of the first")
+    return broken
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("minutes", type=float, metavar="MINUTES")
+    parser.add_argument("--sensors", type=whole(1), default=16, metavar="N", help="default 16")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the faults (default 1)")
+    parser.add_argument("--faults", metavar="F", help="default: all of them, mixed")
+    parser.add_argument("--calm", action="store_true", help="no faults")
+    options = parser.parse_args(arguments)
+    seconds = 60 * options.minutes
+    faults = "" if options.calm else options.faults or f"mixed@1+{seconds - 1:g}"
+    run = Chaos(options.sensors, options.seed, faults).play(seconds)
+    judge = run.judge
+    for minute, mb, held, quiet_us in run.windows[:: max(1, len(run.windows) // 12)]:
+        print(f"minute {minute:.1f}: {mb:.1f} MB, {held} threads and descriptors, latency {quiet_us:.0f} us")
+    print(
+        f"{judge.records.total()} records, {judge.whole} whole, {judge.patterns} patterns; {run.faults.total()} faults "
+        f"of {len(run.faults)} kinds; an adapter that was back was used within {judge.back_s:.2f} s"
+    )
+    print(", ".join(f"{name} {number}" for name, number in judge.counters.items() if number))
+    if options.minutes >= LONG_MINUTES:
+        slope, half = run.growth()
+        print(
+            f"memory {slope:+.3f} MB a minute (+- {half:.3f}), latency {run.latency_ratio():.2f} of the first third's"
+        )
+    broken = promises(run, options.minutes, options.sensors)
+    print("\n".join(["broken:", *broken[:20]]) if broken else "every promise was kept")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
