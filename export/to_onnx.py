@@ -40,7 +40,7 @@ from train.errors import CheckpointError, TrainError
 from train.freeze import held_out
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
-from train.learning.interval_calibration import half_width_mm
+from train.learning.interval_fit import half_width_mm
 from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import write_out

@@ -32,8 +32,7 @@ from export.to_onnx import export, main
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import CheckpointError
 from train.learning.checkpoint import infer, load_network
-from train.learning.interval_calibration import half_width_mm, interval_coverage
-from train.learning.interval_fit import readings_of_presses
+from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
 from train.networks.registry import build
 from train.networks.symmetric import write_out

@@ -21,7 +21,7 @@ from export.to_onnx import export
 from export.verify import verify
 from train.errors import DatasetError
 from train.learning.checkpoint import fit_network
-from train.networks.one_or_more import OneOrMoreNet
+from train.networks.fusion import OneOrMoreNet
 from train.physics.pad_draws import KNOWN
 from train.surfaces.tap_schedules import REACH_MM
 

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.learning.interval_calibration import calibrate, half_width_mm, interval_coverage
+from train.learning.interval_fit import calibrate, half_width_mm, interval_coverage
 
 LEVELS = [0.1, 0.5, 0.8, 0.9, 0.99]
 
