@@ -19,7 +19,7 @@ from export_samples import (
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.evaluation.evaluate import infer_all, judge, judge_model, mean_error
+from edge.evaluation.evaluate import infer_all, judge, mean_error
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
@@ -95,22 +95,6 @@ def test_the_contract_tells_error_and_coverage_for_every_number_of_taps(folder, 
         assert told[str(given)]["coverage_90"] == pytest.approx(covered, abs=2e-4)
     assert set(told) == {"1", "2"} and told["1"] != told["2"]
     assert 0 < told["2"]["coverage_90"] < 1
-
-
-def test_deviations_are_judged_in_the_same_runs_as_patterns(session, frozen):
-    class Counted:
-        name, contract, runs = session.name, session.contract, 0
-
-        def run(self, window):
-            self.runs += 1
-            return session.run(window)
-
-        deviation = property(lambda self: session.deviation)
-
-    counted = Counted()
-    errors = judge_model(counted, frozen)
-    assert counted.runs == len(frozen) == len(errors["coverage_90"])
-    assert len(set(errors["coverage_90"].tolist())) > 1, "every frame has its own deviations"
 
 
 @pytest.mark.parametrize("name", ["sure", pytest.param("sure-int8", marks=pytest.mark.night)])

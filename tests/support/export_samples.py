@@ -88,8 +88,8 @@ def published_model(folder: Path) -> None:
     net = build("srcnn", 2)
     for module in net.modules():
         if isinstance(module, torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.running_mean, -1, 1)
-            torch.nn.init.uniform_(module.running_var, 0.5, 2)
+            torch.nn.init.uniform_(module.get_buffer("running_mean"), -1, 1)
+            torch.nn.init.uniform_(module.get_buffer("running_var"), 0.5, 2)
     with torch.no_grad():
         list(net.parameters())[-1].abs_()  # or no pattern would be above zero
     save_checkpoint(folder / "peer.pt", net, "srcnn")

@@ -67,11 +67,6 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     assert "not determined" in identify.table("4", found.contacts, pad)
 
 
-def test_more_contacts_leave_less_open(mixture):
-    few, many = (sensor(mixture, 5, count)[2] for count in (3, 100))
-    assert (many.deviations < few.deviations).all()
-
-
 def test_weak_and_clipped_contacts_are_not_used(mixture):
     read = contacts(mixture, 20, np.ones(CHANNELS), np.zeros(len(CONSTANTS)), 6)
     read[:5] *= 0.1
