@@ -10,6 +10,7 @@ import torch
 from edge_samples import make_contract
 from press_samples import make_press_set
 
+from edge.inference.familiarity import contact_features
 from edge.inference.small_network import small_network
 from edge.inference.trust import trust_of
 from train import trust
