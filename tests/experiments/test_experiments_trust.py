@@ -144,6 +144,7 @@ class TestPage:
         parts = ("", "-models", "-grips", "-faults", "-taps", "-psnr")
         rows = {part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in parts}
         assert [row["contacts of"] for row in rows[""]] == [*SHARES, "all", "light"]
+        assert any(float(row["stsr-int8 %"]) > 0 for row in rows["-grips"]), "noise is no grip"
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows["-faults"]}
         cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
         for part in ("-taps", "-psnr"):
