@@ -13,7 +13,7 @@ run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 
 test: $(VENV)/.dev  ## everything else, all tests; three at a time on two cores, since many mostly wait, and the soak beside
 	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider tests/system/test_chaos.py & soak=$$!; \
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not soak"; tests=$$?; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not soak and not night"; tests=$$?; \
 	wait $$soak && test $$tests = 0
 
 lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English

@@ -14,7 +14,6 @@ import onnx
 from google.protobuf.message import DecodeError
 
 from edge.errors import EdgeError
-from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
 from export.graphs.reference import contract_in
@@ -43,7 +42,7 @@ def give_checks(source: Path, path: Path) -> None:
     if differing:
         raise ExportError(f"{path} differs from {source} in {', '.join(differing)}: make its checks with train.trust")
     trust = trust if own is None else replace(trust, tap=own.tap)
-    made = replace(contract, version=CONTRACT_VERSION, trust=trust.to_json()).to_metadata()
+    made = replace(contract, trust=trust.to_json()).to_metadata()
     stated = {entry.key: entry.value for entry in model.metadata_props} | made
     del model.metadata_props[:]
     for key, value in stated.items():

@@ -11,6 +11,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -39,7 +40,7 @@ from train.errors import CheckpointError, TrainError
 from train.freeze import held_out
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
-from train.learning.interval_calibration import half_width_mm
+from train.learning.interval_fit import half_width_mm
 from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import write_out
@@ -147,37 +148,29 @@ def export(
     writer = Writer(folder, frozen, validation, report, trust, one_tap)
     if one_tap is not None and net.takes_poses:  # before minutes of tracing
         writer.model_of_one_tap("float32" if calibration is None else "int8")
-    if calibration is None:
-        if intervals is not None:
-            found = intervals.corrected(net, level)
-            net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        model = to_model(net, geometry, batch)
-        single = model if batch in (1, ANY_BATCH) else to_model(net, geometry)
-        parity = check_parity(net, model, frozen, contract)
-        return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
-
-    traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
-    single = to_model(net, geometry, traced)
-    check_parity(net, single, frozen, contract)
-    seen = calibration_batch(calibration, contract)
-    beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
-    in_float, integers = single, quantised(single, seen, every=every, beyond=beyond)
-    integer_net, levels = net, {}
     if intervals is not None:
         found = intervals.corrected(net, level)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        in_float = to_model(net, geometry, traced)
-        found = intervals.conformed(net, quantised(in_float, seen, every=every, beyond=beyond))
-        integer_net, levels = found.net, found.interval_levels
-        integers = quantised(to_model(integer_net, geometry, traced), seen, every=every, beyond=beyond)
-    float_error = writer.error(in_float, contract)
-    model = (
-        integers
-        if batch == traced
-        else quantised(to_model(integer_net, geometry, batch), seen, every=every, beyond=beyond)
-    )
+    traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
+    single = to_model(net, geometry, traced)
+    parity = check_parity(net, single, frozen, contract)
+    if calibration is None:
+        model = single if batch == traced else to_model(net, geometry, batch)
+        if model is not single:
+            check_parity(net, model, frozen, contract)
+        return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
+
+    beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
+    quantise = partial(quantised, seen=calibration_batch(calibration, contract), every=every, beyond=beyond)
+    integers = quantise(single)
+    if intervals is not None:
+        found = intervals.conformed(net, integers)
+        net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
+        integers = quantise(to_model(net, geometry, traced))
+    model = integers if batch == traced else quantise(to_model(net, geometry, batch))
     integer, convs = convolutions(model)
-    contract = replace(contract, arithmetic="int8", test_error={}, confidence={}, interval_levels=levels)
+    float_error = writer.error(single, contract)
+    contract = replace(contract, arithmetic="int8", test_error={}, confidence={})
     cost = _cost(float_error, writer.error(integers, contract))
     facts = [f"{integer} of {convs} convolutions in int8", *cost]
     return writer.write(checkpoint.stem + INT8_SUFFIX, model, integers, contract, facts)

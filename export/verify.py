@@ -49,7 +49,7 @@ from train.data.real_grips import recorded_sets
 from train.errors import TrainError
 from train.learning.checkpoint import load_network
 from train.networks.blocks import PatternNet
-from train.networks.one_or_more import OneOrMoreNet
+from train.networks.fusion import OneOrMoreNet
 
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20

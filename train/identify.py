@@ -27,8 +27,7 @@ from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sens
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
-from train.learning.contact_mixture import CONSTANTS, normalise
-from train.learning.gain_estimate import learned
+from train.learning.contact_mixture import CONSTANTS, learned, normalise
 from train.physics.pad_draws import RANGES
 
 _APART: Final = 0.1

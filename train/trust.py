@@ -19,8 +19,7 @@ from train.data.presses import PressSet
 from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
 from train.learning.forward_operator import fit_forward_model
-from train.learning.posed_tap_check import fit_posed_tap_network
-from train.learning.tap_check import fit_tap_network
+from train.learning.tap_checks import fit_posed_tap_network, fit_tap_network
 
 NAME: Final = "trust.json"
 """File in the folder of the checkpoints."""

@@ -18,18 +18,6 @@ from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 8
-ADDED: Final = MappingProxyType(
-    {
-        5: ("pad_inputs", "takes_gains", "traction_scale"),
-        6: ("trust", "interval_levels"),
-        7: ("takes_poses", "reach_mm"),
-    },
-)
-"""Keys that each version added; without them a model takes no pad, gives no traction, checks nothing, takes no pose.
-
-Version 8 added none, and took from `trust` what the runtime no longer reads."""
-FIRST_VERSION: Final = 4
-"""First version that is still loaded."""
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
@@ -175,25 +163,24 @@ class Contract:
 
     def to_metadata(self) -> dict[str, str]:
         """Return the contract as the string map of ONNX metadata."""
-        keys = _keys(self.version)
-        return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items() if key in keys}
+        return {KEY_PREFIX + key: json.dumps(value) for key, value in asdict(self).items()}
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> "Contract":
-        """Read and check a contract, of this version or an earlier one.
+        """Read and check a contract of this version.
 
         Raises:
             ModelError: a key is missing, unreadable or out of range; the key is named.
         """
         version = _value(metadata, "version")
         # Before the other keys, which another version may lack.
-        if type(version) is not int or not FIRST_VERSION <= version <= CONTRACT_VERSION:
-            expected = f"expected {FIRST_VERSION} to {CONTRACT_VERSION}: export the model again with this release"
+        if type(version) is not int or version != CONTRACT_VERSION:
+            expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {key: _value(metadata, key) for key in _keys(version)}
+        values = {one.name: _value(metadata, one.name) for one in fields(cls)}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
-        values["pad_inputs"] = tuple(map(tuple, values.get("pad_inputs", ())))
+        values["pad_inputs"] = tuple(map(tuple, values["pad_inputs"]))
         return cls(**values)
 
     def check_sensor(self, geometry: SensorGeometry) -> None:
@@ -267,12 +254,6 @@ class Contract:
         return False
 
 
-def _keys(version: int) -> list[str]:
-    """Return the keys of a contract of this version."""
-    later = {name for added, names in ADDED.items() if added > version for name in names}
-    return [one.name for one in fields(Contract) if one.name not in later]
-
-
 def _value(metadata: Mapping[str, str], key: str) -> Any:
     text = metadata.get(KEY_PREFIX + key)
     if text is None:
@@ -319,7 +300,7 @@ def _check(values: Mapping[str, Any]) -> None:
         refuse(
             "confidence", "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
         )
-    if not is_interval_levels(values.get("interval_levels", {})):
+    if not is_interval_levels(values["interval_levels"]):
         refuse("interval_levels", "for each percentage a positive number for every region")
     scaling = values["counts_per_unit"]
     if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
@@ -332,13 +313,13 @@ def _check(values: Mapping[str, Any]) -> None:
     if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
         refuse("test_error", "a map from taps to metrics")
     _check_pad_and_traction(values, refuse)
-    takes_poses, reach_mm = values.get("takes_poses", False), values.get("reach_mm", 0.0)
+    takes_poses, reach_mm = values["takes_poses"], values["reach_mm"]
     if not isinstance(takes_poses, bool):
         refuse("takes_poses", "true or false")
     if not is_number(reach_mm) or reach_mm < (LEAST_UNIT if takes_poses else 0):
         refuse("reach_mm", f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0")
     try:
-        trust = trust_of(values.get("trust", {}), len(values.get("pad_inputs", [])), poses=takes_poses)
+        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=takes_poses)
         readings = len(AXES) * values["rows"] * values["cols"]
         if trust is not None and trust.forward.operator.shape[1] != readings:
             raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
@@ -349,16 +330,15 @@ def _check(values: Mapping[str, Any]) -> None:
 
 
 def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
-    """Check the keys that version 5 added, if they exist."""
-    inputs = values.get("pad_inputs", [])
+    inputs = values["pad_inputs"]
     if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
         expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
         refuse("pad_inputs", f"a list of [name, centre, spread], {expected}")
     if len({name for name, _, _ in inputs}) < len(inputs):
         refuse("pad_inputs", "no name twice")
-    if not isinstance(values.get("takes_gains", False), bool):
+    if not isinstance(values["takes_gains"], bool):
         refuse("takes_gains", "true or false")
-    scale = values.get("traction_scale")
+    scale = values["traction_scale"]
     if scale is not None and (type(scale) is not int or not 1 <= scale <= MOST["scale"]):
         refuse("traction_scale", f"a whole number from 1 to {MOST['scale']}, or null for a model without traction")
     if scale is not None and len(AXES) * values["rows"] * values["cols"] * scale**2 > MOST_PIXELS:

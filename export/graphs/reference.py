@@ -19,7 +19,7 @@ from edge.inference.contract import Contract
 from export.errors import ExportError
 from export.graphs.joined import branches
 from train.networks.blocks import PatternNet
-from train.networks.one_or_more import OneOrMoreNet
+from train.networks.fusion import OneOrMoreNet
 from train.networks.registry import build
 from train.networks.symmetric import write_out
 

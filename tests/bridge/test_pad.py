@@ -1,4 +1,4 @@
-"""Models of contract version 5: what they take of the pad, and what of it reaches them."""
+"""Models of a contract: what they take of the pad, and what of it reaches them."""
 
 import re
 from dataclasses import replace
@@ -69,15 +69,8 @@ class TestContract:
         assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
 
     def test_what_is_written_is_read(self):
-        for contract in (make_pad_contract(), *(make_contract(version=version) for version in (7, 6, 5, 4))):
+        for contract in (make_pad_contract(), make_contract()):
             assert Contract.from_metadata(contract.to_metadata()) == contract
-        assert len(make_contract().to_metadata()) == len(make_contract(version=5).to_metadata()) + 4
-        assert len(make_contract(version=5).to_metadata()) == len(make_contract(version=4).to_metadata()) + 3
-
-    def test_of_version_4_later_keys_are_not_looked_at(self):
-        metadata = make_contract(version=4).to_metadata() | {"tactile.traction_scale": "2", "tactile.pad_inputs": "{"}
-        contract = Contract.from_metadata(metadata)
-        assert contract.traction_scale is None and contract.pad_width == 0
 
     @pytest.mark.parametrize(
         ("key", "value", "expected"),
@@ -107,12 +100,11 @@ class TestContract:
 
 
 class TestSession:
-    @pytest.mark.parametrize("version", [4, 5])
-    def test_a_model_without_pad_and_traction_runs_as_ever(self, tmp_path, version):
-        session = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(version=version)))
+    def test_a_model_without_pad_and_traction_runs_as_ever(self, tmp_path):
+        session = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract()))
         window = random_window()
         np.testing.assert_allclose(session.run(window), tiny_pattern(window), atol=1e-6)
-        assert session.traction is None and session.contract.version == version
+        assert session.traction is None
 
     @pytest.mark.parametrize("factor", [None, 1.6])
     def test_pad_and_traction_are_bound_beside_window_and_pattern(self, tmp_path, factor):
@@ -177,7 +169,7 @@ class TestSession:
                 r"\[1, 3, 8, 8\], but .*\[1, 3, 12, 12\]",
             ),
             (
-                {"metadata": make_contract(version=4).to_metadata()},
+                {"metadata": make_contract().to_metadata()},
                 r"pad tensor\(float\) \[1, 5\], but its contract states window tensor\(float\) \[1, 12, 4, 4\]$",
             ),
         ],

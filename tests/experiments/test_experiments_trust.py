@@ -6,16 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_samples import FakeModel, make_pad_contract, write_model
-from experiment_samples import quick_bench
+from experiment_samples import quick_bench, save_recordings
 from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
-from train.experiments.sensor import trust_checks
-from train.experiments.support import contact_verdicts, wrong_taps
-from train.experiments.support.pushed import PushedSensor
-from train.experiments.support.sensor_faults import FAULTS, FIELDS, steel_field
-from train.experiments.support.wrong_patterns import judged
+from train.experiments.sensor import contact_verdicts, trust_checks, wrong_taps
+from train.experiments.sensor.pushed import PushedSensor
+from train.experiments.sensor.sensor_faults import FAULTS, FIELDS, steel_field
 from train.families.catalogue import SHARES
 
 
@@ -89,7 +87,7 @@ class TestVerdicts:
 
 def test_patterns_that_are_off_are_counted_by_how_far(wide):
     """The fake model's patterns are in no relation to the truth: what counts is who is counted where."""
-    found = judged(FakeModel(make_trusted_contract()), wide, [None] * len(wide))
+    found = contact_verdicts.judged(FakeModel(make_trusted_contract()), wide, [None] * len(wide))
     assert len(found.off) and np.isfinite(found.off).all() and (found.off > 1).all()
     cells = found.cells(np.ones(len(found.off), dtype=bool))
     assert cells["contacts"] == cells["> 50% off"] == cells["> 100% off"] == len(found.off)
@@ -102,25 +100,24 @@ class TestTaps:
         elsewhere = np.roll(press(), 2, axis=-1)
         right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))
         truth = np.zeros((1, 40, 40), dtype=np.float32)
-        found = [wrong_taps.guarded(model, wrong_taps.Windows(one, truth), 4) for one in (right, wrong)]
+        found = [wrong_taps.guarded(model, one, truth, 4) for one in (right, wrong)]
         assert [one.taps_used.tolist() for one in found] == [[4], [1]]
         assert [one.foreign.tolist() for one in found] == [[[False] * 3], [[True] * 3]]
-        alone = wrong_taps.guarded(model, wrong_taps.Windows(wrong, truth), 1)
+        alone = wrong_taps.guarded(model, wrong, truth, 1)
         assert alone.psnr_db == pytest.approx(found[1].psnr_db, abs=0.05) and found[0].psnr_db != found[1].psnr_db
 
     def test_cases_change_earlier_taps_alone_or_mirror_all(self, wide):
         firm = wrong_taps.firm(wide)
         made = wrong_taps.cases(firm)
-        right = made["right"]
+        right, truth = made["right"]
         for name in ("another surface", "order reversed", "not turned"):
-            assert np.array_equal(made[name].counts[:, 0], right.counts[:, 0]), name
-            assert (made[name].counts[:, 1] != right.counts[:, 1]).any(axis=(1, 2, 3)).all(), name
-        mirrored = made["turned the other way"]
-        assert np.array_equal(mirrored.truth[..., ::-1], right.truth)
-        assert np.array_equal(mirrored.counts[:, :, 0, :, ::-1], -right.counts[:, :, 0])
-        assert np.array_equal(mirrored.counts[:, :, 1:, :, ::-1], right.counts[:, :, 1:])
-        longer = wrong_taps.twice_the_angle(firm, 2)
-        assert np.array_equal(longer["twice the angle"].counts[:, 1], right.counts[:, 2])
+            counts = made[name][0]
+            assert np.array_equal(counts[:, 0], right[:, 0]), name
+            assert (counts[:, 1] != right[:, 1]).any(axis=(1, 2, 3)).all(), name
+        mirrored, image = made["turned the other way"]
+        assert np.array_equal(image[..., ::-1], truth)
+        assert np.array_equal(mirrored[:, :, 0, :, ::-1], -right[:, :, 0])
+        assert np.array_equal(mirrored[:, :, 1:, :, ::-1], right[:, :, 1:])
 
     def test_the_next_press_is_another_of_the_same_pad(self):
         pads = np.array([3, 3, 5, 7, 7, 7])
@@ -139,17 +136,19 @@ def test_a_pushed_sensor_remembers_suspicion():
 
 
 class TestPage:
-    def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory):
+    def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
+        save_recordings(tmp_path / "recordings")
+        monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path / "recordings"))
         page = trust_checks.run(quick_bench(tmp_path_factory), tmp_path).read_text()
         assert page.startswith("# trust-checks\n") and "quick run" in page
-        parts = ("", "-models", "-faults", "-taps", "-psnr", "-times")
+        parts = ("", "-models", "-grips", "-faults", "-taps", "-psnr")
         rows = {part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in parts}
-        assert [row["contacts of"].rstrip("*") for row in rows[""]] == [*SHARES, "others alone", "all", "light"]
+        assert [row["contacts of"] for row in rows[""]] == [*SHARES, "all", "light"]
+        assert any(float(row["stsr-int8 %"]) > 0 for row in rows["-grips"]), "noise is no grip"
         assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows["-faults"]}
         cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
         for part in ("-taps", "-psnr"):
-            named = [row["earlier taps"] for row in rows[part]]
-            assert named == [*cases, "right, longer sequences", "twice the angle"]
+            assert [row["earlier taps"] for row in rows[part]] == cases
 
     def test_a_model_without_checks_is_refused_in_a_line(self, tmp_path, tmp_path_factory):
         for name in ("stsr", "stsr-small", "mtsr2", "mtsr4", "mtsr7"):

@@ -5,7 +5,6 @@ from edge_samples import make_contract, make_pad_contract, write_model
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust, make_trust, make_trusted_contract
 
-from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.checks import main
 
@@ -18,13 +17,12 @@ def checks_of(path):
 
 def test_a_model_without_checks_gets_them_and_one_of_poses_keeps_those_of_its_taps(tmp_path):
     source = write_model(tmp_path / "source.onnx", make_trusted_contract())
-    plain = write_model(tmp_path / "plain.onnx", make_trusted_contract(trust={}, version=7))
+    plain = write_model(tmp_path / "plain.onnx", make_trusted_contract(trust={}))
     own = make_posed_trust(4.0).to_json() | {"contact": {**make_trust().to_json()["contact"], "limit": 1.0}}
     shared = {key: getattr(make_trusted_contract(), key) for key in ("pad_inputs", "takes_gains", "output_full_scale")}
     posed = write_posed_model(tmp_path / "posed.onnx", make_posed_contract(trust=own, **shared))
     main([str(source), str(plain), str(posed)])
     assert checks_of(plain) == checks_of(source) == make_trust().to_json()
-    assert ModelSession(plain).contract.version == CONTRACT_VERSION
     assert checks_of(posed) == {**make_trust().to_json(), "tap": own["tap"]}
 
 

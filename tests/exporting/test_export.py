@@ -1,70 +1,56 @@
+"""Export of networks that take no poses: contract, parity, intervals, files, and the command."""
+
 import json
-from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
 import torch
-from dataset_samples import make_sequences
+from export_samples import (
+    PRESSES,
+    SURE,
+    export_with_intervals,
+    made_once,
+    published_model,
+    save_checkpoint,
+    small_models,
+    some_frames,
+)
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.evaluation.evaluate import judge, judge_model, mean_error
-from edge.evaluation.test_set import FrozenSet
-from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, Contract
+from edge.evaluation.evaluate import infer_all, judge, mean_error
+from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
+from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
 from export.errors import ExportError, ParityError
 from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun, differences, read_windows
+from export.graphs.reference import network_of, origin_of
 from export.to_onnx import export, main
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import CheckpointError
-from train.freeze import freeze
-from train.learning.checkpoint import Training, fit_network, infer, load_network
-from train.learning.interval_calibration import half_width_mm, interval_coverage
-from train.learning.training_loop import Recipe
+from train.learning.checkpoint import infer, load_network
+from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
+from train.networks.compact import CompactNet
 from train.networks.registry import build
-from train.physics.sensor_noise import Nuisances
-
-COMPACT = Training(
-    "sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options={"channels": 16, "blocks": 1}
-)
-
-
-def frozen_at(scale: int, taps: int = 4) -> FrozenSet:
-    """Six presses, not those of the training."""
-    return freeze(make_sequences(taps=taps, seed=1), Nuisances.none(), seed=1, scale=scale)
-
-
-def at_frames(frozen: FrozenSet, frames) -> FrozenSet:
-    """Some of its frames."""
-    names = ("newest", "tap", "indentation_mm", "force_n")
-    return replace(frozen, **{name: getattr(frozen, name)[frames] for name in names})
+from train.networks.symmetric import write_out
 
 
 @pytest.fixture(scope="module")
 def frozen():
-    return frozen_at(10)
+    return some_frames()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A compact network at the test set's scale, as training leaves it, and what was exported of it."""
-    folder = tmp_path_factory.mktemp("checkpoints")
-    fit_network(COMPACT, make_sequences(taps=2), frozen_at(10), folder)
-    export(folder / "sure.pt", folder, frozen_at(10))
-    return folder
+    return made_once(tmp_path_factory, small_models)
 
 
 @pytest.fixture(scope="module")
-def batched(folder, frozen, tmp_path_factory):
-    """Folders of the same network, exported for 3 windows in one run and for any number."""
-    folders = {}
-    for batch in (3, ANY_BATCH):
-        folders[batch] = tmp_path_factory.mktemp("batched")
-        export(folder / "sure.pt", folders[batch], frozen, batch=batch)
-    return folders
+def session(folder):
+    return ModelSession(folder / "plain" / "sure.onnx")
 
 
 @pytest.fixture
@@ -72,34 +58,19 @@ def traced(folder, monkeypatch):
     """The exported graph in place of one that is traced again, which takes seconds."""
 
     def to_model(net, geometry, batch=1):
-        model = onnx.load(folder / "sure.onnx")
+        model = onnx.load(folder / "plain" / "sure.onnx")
         del model.metadata_props[:]
         return model
 
     monkeypatch.setattr(to_onnx, "to_model", to_model)
 
 
-@pytest.fixture(scope="module")
-def session(folder):
-    return ModelSession(folder / "sure.onnx")
-
-
-def save_untrained(path, name, scale, **options):
-    """A checkpoint of first weights, which is enough to be exported."""
-    torch.manual_seed(0)
-    net = build(name, scale, **options)
-    torch.save(net.state_dict(), path)
-    report = {"network": name, "scale": scale, "options": options, "contact_level": 0.5, "training_sha256": "ab" * 32}
-    path.with_suffix(".json").write_text(json.dumps(report))
-    return path
-
-
 def test_an_exported_network_keeps_its_contract(folder, session, frozen):
     contract, report = session.contract, json.loads((folder / "sure.json").read_text())
     assert (contract.version, contract.taps, contract.scale, contract.sensor) == (CONTRACT_VERSION, 2, 10, "uSPa44")
     assert (contract.counts_per_unit, contract.angle_step_deg) == ((500.0, 500.0, 1000.0), 5.0)
-    assert contract.training_sha256 == report["training_sha256"] == COMPACT.sha256(report["data_sha256"])
-    assert contract.contact_level == report["contact_level"]
+    assert contract.training_sha256 == report["training_sha256"] == SURE.sha256(report["data_sha256"])
+    assert contract.contact_level == report["contact_level"] and contract.interval_levels == {}
     assert contract.test_set_sha256 == frozen.sha256() and contract.output_full_scale == frozen.full_scale_mm
 
 
@@ -107,8 +78,8 @@ def test_the_runtime_computes_what_was_trained_both_outputs(folder, session, fro
     net, _ = load_network(folder / "sure.pt")
     windows = frozen.windows(2)
     patterns, deviations = infer(net, windows)
-    assert deviations is not None and net.deviation_scale != 1
-    for window, pattern, deviation in list(zip(windows, patterns, deviations, strict=True))[::10]:
+    assert deviations is not None and net.deviation_scale != 1 and patterns.max() > 0
+    for window, pattern, deviation in list(zip(windows, patterns, deviations, strict=True))[::5]:
         np.testing.assert_allclose(session.run(session.contract.scale_window(window)), pattern, atol=1e-6)
         np.testing.assert_allclose(session.deviation, deviation, rtol=1e-5)
 
@@ -126,30 +97,56 @@ def test_the_contract_tells_error_and_coverage_for_every_number_of_taps(folder, 
     assert 0 < told["2"]["coverage_90"] < 1
 
 
-def test_deviations_are_judged_in_the_same_runs_as_patterns(session, frozen):
-    class Counted:
-        name, contract, runs = session.name, session.contract, 0
-
-        def run(self, window):
-            self.runs += 1
-            return session.run(window)
-
-        deviation = property(lambda self: session.deviation)
-
-    counted = Counted()
-    errors = judge_model(counted, frozen)
-    assert counted.runs == len(frozen) == len(errors["coverage_90"])
-    assert len(set(errors["coverage_90"].tolist())) > 1, "every frame has its own deviations"
+@pytest.mark.parametrize("name", ["sure", pytest.param("sure-int8", marks=pytest.mark.night)])
+def test_intervals_hold_on_the_presses_that_set_them(folder, name, tmp_path):
+    if name != "sure":
+        export_with_intervals(folder / "sure.pt", tmp_path, PRESSES)
+    session = ModelSession((folder if name == "sure" else tmp_path) / f"{name}.onnx")
+    for given in (1, 2):
+        assert_intervals_hold(session, given)
+    levels = session.contract.interval_levels
+    assert list(levels) == ["50", "80", "90", "95"]
+    assert all(low <= high for low, high in zip(levels["50"], levels["95"], strict=True))
 
 
-def test_exporting_again_gives_the_same_bytes_without_traces_of_the_machine(folder, frozen, tmp_path):
-    line = export(folder / "sure.pt", tmp_path, frozen)
-    assert [path.name for path in tmp_path.iterdir()] == ["sure.onnx"]
-    assert line.startswith("sure.onnx: 0.") and "dB" in line and "interval covers" in line
-    content = (tmp_path / "sure.onnx").read_bytes()
-    assert content == (folder / "sure.onnx").read_bytes()
+def assert_intervals_hold(session, given):
+    held: dict[int, list[bool]] = {}
+    for one in readings_of_presses(PRESSES, 2):
+        for window, pad, truth in zip(one.with_taps(given), one.pads, one.truth, strict=True):
+            pattern = session.run(window.reshape(2, 3, 4, 4), pad)
+            region = regions(pattern[None], session.contract.contact_level, 4)[0]
+            inside = np.abs(pattern - truth) <= half_width_mm(session.deviation)
+            for number in np.unique(region):
+                held.setdefault(int(number), []).extend(inside[region == number].tolist())
+    assert len(held) > 1
+    assert [float(np.mean(share)) for share in held.values()] == pytest.approx([0.9] * len(held), abs=0.02)
+
+
+def test_the_network_of_the_graph_has_the_correction_which_leaves_patterns_as_they_are(folder, session, frozen):
+    model = onnx.load(folder / "sure.onnx")
+    net, corrected = network_of(model), ModelSession(folder / "sure.onnx")
+    assert origin_of(model)["options"]["intervals"] is True
+    assert isinstance(net, CompactNet) and net.intervals is not None
+    windows = np.stack([corrected.contract.scale_window(one) for one in frozen.windows(2)[::8]])
+    deviations = net(torch.from_numpy(windows).flatten(1, 2))[1].detach().numpy()
+    for window, expected in zip(windows, deviations, strict=True):
+        corrected.run(window)
+        np.testing.assert_allclose(corrected.deviation, expected, rtol=1e-4)
+    patterns = [infer_all(one.run, one.contract, frozen) for one in (corrected, session)]
+    np.testing.assert_allclose(*patterns, atol=1e-7)
+
+
+def test_a_file_has_no_traces_of_the_machine_and_no_weights_elsewhere(folder):
+    content = (folder / "sure.onnx").read_bytes()
     assert b".py" not in content and b"/tmp" not in content
     assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
+
+
+@pytest.mark.night
+def test_exporting_again_gives_the_same_bytes(folder, frozen, tmp_path):
+    line = export(folder / "sure.pt", tmp_path, frozen)
+    assert line.startswith("sure.onnx: 0.") and "dB" in line and "interval covers" in line
+    assert (tmp_path / "sure.onnx").read_bytes() == (folder / "plain" / "sure.onnx").read_bytes()
 
 
 def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, tmp_path, traced, monkeypatch):
@@ -161,28 +158,13 @@ def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, 
         export(folder / "sure.pt", tmp_path, frozen)
     assert path.read_bytes() == b"the one before" and [one.name for one in tmp_path.iterdir()] == ["sure.onnx"]
     export(folder / "sure.pt", tmp_path, frozen)
-    assert path.read_bytes() == (folder / "sure.onnx").read_bytes()
+    assert path.read_bytes() == (folder / "plain" / "sure.onnx").read_bytes()
     assert (tmp_path / "sure.onnx.bak").read_bytes() == b"the one before"
-
-
-def test_a_seed_size_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path):
-    path = save_untrained(tmp_path / "peer.pt", "stsr", 4)
-    line = export(path, tmp_path, at_frames(frozen, slice(0, 96, 30)))
-    assert "x4, not evaluated, the test set is of x10, parity" in line
-    session = ModelSession(tmp_path / "peer.onnx")
-    assert session.contract.pattern_shape == (16, 16) and session.contract.interval_factor is None
-    assert session.contract.test_error == {}
-    window = session.contract.scale_window(frozen.windows(1)[40])
-    with torch.inference_mode():
-        expected = load_network(path)[0](torch.from_numpy(window).reshape(1, 3, 4, 4))[0]
-    assert expected.max() > 0
-    np.testing.assert_allclose(session.run(window), expected, rtol=1e-4, atol=1e-6)
-    assert session.deviation is None
 
 
 @pytest.mark.parametrize("head", ["leave", "uncertainty", "traction"])
 def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp_path, monkeypatch, head):
-    model = onnx.load(folder / "sure.onnx")
+    model = onnx.load(folder / "plain" / "sure.onnx")
     factor = 1.2 if head == "uncertainty" else 1.001  # regions move deviations by more than additions do
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
@@ -194,59 +176,51 @@ def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("batch", [3, ANY_BATCH])
-def test_a_batch_is_one_run_of_many_windows(folder, frozen, batched, batch):
-    model = onnx.load(batched[batch] / "sure.onnx")
-    contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
-    assert contract.batch == batch and contract.window_shape == (batch, 6, 4, 4)
-    windows = read_windows(frozen, contract)[:7]
-    single = GraphRun(onnx.load(folder / "sure.onnx"))
-    for together, alone in zip(GraphRun(model)(windows), single(windows), strict=True):
+def test_any_batch_is_one_run_of_many_windows(folder, frozen):
+    session = ModelSession(folder / "sure.onnx")
+    assert session.contract.batch == ANY_BATCH and session.contract.window_shape == (ANY_BATCH, 6, 4, 4)
+    windows = [session.contract.scale_window(window) for window in frozen.windows(2)[:3]]
+    together = session.run_together(windows).copy()
+    np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.night
+def test_a_fixed_batch_is_filled_and_cut(folder, session, frozen, tmp_path):
+    windows = read_windows(frozen, session.contract)[:7]
+    export(folder / "sure.pt", tmp_path, frozen, batch=3)
+    graphs = (GraphRun(onnx.load(place / "sure.onnx")) for place in (tmp_path, folder / "plain"))
+    for together, alone in zip(*(run(windows) for run in graphs), strict=True):
         np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
 
 
-def test_the_runtime_takes_any_batch_and_refuses_another_than_one(folder, frozen, batched, tmp_path):
-    session, contract = ModelSession(batched[ANY_BATCH] / "sure.onnx"), ModelSession(folder / "sure.onnx").contract
-    windows = [contract.scale_window(window) for window in frozen.windows(2)[:3]]
-    together = session.run_together(windows).copy()
-    np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
-    with pytest.raises(ModelError, match=r"'batch' is 3, .* export it with --batch any"):
-        ModelSession(batched[3] / "sure.onnx")
+def test_a_batch_of_none_is_refused(folder):
     with pytest.raises(ExportError, match="a batch of 0 asked for"):
-        export(folder / "sure.pt", tmp_path, frozen, batch=0)
+        to_model(write_out(load_network(folder / "sure.pt")[0]), USPA44, batch=0)
 
 
-@pytest.mark.parametrize("taps", [1, 7])  # of two it is exported above, and in between no code is another
-@pytest.mark.parametrize("kind", ["", "compact-"])
-def test_networks_of_both_families_are_exported(tmp_path, taps, kind):
-    name = f"{kind}mtsr{taps}" if taps > 1 else f"{kind}stsr"
-    options = {"channels": 16, "blocks": 1} if kind else {}
-    seven = at_frames(freeze(make_sequences(taps=7, seed=1), Nuisances.none(), seed=1, scale=10), slice(0, 96, 30))
-    export(save_untrained(tmp_path / "one.pt", name, 4, **options), tmp_path, seven)
-    assert ModelSession(tmp_path / "one.onnx").contract.taps == taps
-
-
-@pytest.mark.parametrize("scale", [4, 6, 8, 20])  # 10 is that of every other test
-def test_every_scale_is_exported(frozen, tmp_path, scale):
-    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", scale, channels=16, blocks=1)
-    assert f"x{scale}" in export(path, tmp_path, frozen)
-    assert ModelSession(tmp_path / "one.onnx").contract.pattern_shape == (4 * scale, 4 * scale)
-
-
-def test_batch_normalisation_is_folded_into_the_convolutions(frozen, tmp_path):
-    net = build("mtsr2", 4).eval()
-    for module in net.modules():
-        if isinstance(module, torch.nn.BatchNorm2d):
-            torch.nn.init.uniform_(module.running_mean, -1, 1)
-            torch.nn.init.uniform_(module.running_var, 0.5, 2)
-    model = to_model(net, USPA44)
+def test_a_published_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path_factory):
+    """Its batch normalisation is folded into the convolutions."""
+    folder = made_once(tmp_path_factory, published_model)
+    model, session = onnx.load(folder / "peer.onnx"), ModelSession(folder / "peer.onnx")
     assert "BatchNormalization" not in {node.op_type for node in model.graph.node}
-    windows = np.random.default_rng(0).normal(size=(3, 6, 4, 4)).astype(np.float32)
-    run = GraphRun(model)
+    assert session.contract.pattern_shape == (8, 8) and session.contract.interval_factor is None
+    assert session.contract.test_error == {} and session.deviation is None
+    windows = read_windows(frozen, session.contract)[:3]
     with torch.inference_mode():
-        expected = net(torch.from_numpy(windows)).numpy()
-    (found,) = differences(run.outputs, [expected], run(windows), 0.5)
+        expected = load_network(folder / "peer.pt")[0](torch.from_numpy(windows)).numpy()
+    assert expected.max() > 0
+    (found,) = differences(["pattern"], [expected], GraphRun(model)(windows), 0.5)
     assert found.relative < 1e-5
+
+
+@pytest.mark.parametrize(("name", "scale"), [("compact-stsr", 20), ("compact-mtsr7", 6)])
+def test_one_and_seven_taps_are_exported_at_any_scale(tmp_path, name, scale):
+    frozen = some_frames(taps=7)
+    options = {"channels": 16, "blocks": 1}
+    path = save_checkpoint(tmp_path / "one.pt", build(name, scale, **options), name, **options)
+    assert f"x{scale}, not evaluated, the test set is of x10, parity" in export(path, tmp_path, frozen)
+    contract = ModelSession(tmp_path / "one.onnx").contract
+    assert contract.pattern_shape == (4 * scale, 4 * scale) and contract.taps == (7 if "7" in name else 1)
 
 
 def test_what_is_no_checkpoint_is_refused(folder, frozen, tmp_path):
@@ -261,27 +235,23 @@ def test_what_is_no_checkpoint_is_refused(folder, frozen, tmp_path):
     assert not list(tmp_path.glob("*.onnx"))
 
 
-def test_the_command_ends_in_one_line(frozen, tmp_path, monkeypatch):
+def test_the_command_writes_integers_and_says_what_they_cost(folder, frozen, tmp_path, traced, monkeypatch, capsys):
     frozen.save(tmp_path / "frozen.npz")
+    PRESSES.save(tmp_path / "taps.npz")
     monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
+    monkeypatch.setattr(to_onnx, "held_out", lambda split: None)
+    monkeypatch.setattr(to_onnx, "confidence_sets", lambda validation, scale: [frozen])
+    monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
+    with pytest.raises(
+        SystemExit, match=r"^export: quantisation costs too much in sure-int8\.onnx .*: use the float32 model"
+    ):
+        main([str(folder / "sure.pt"), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz")])
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("sure-int8.onnx: ") and "of 16 convolutions in int8" in line and "dB lost" in line
+    contract = ModelSession(tmp_path / "sure-int8.onnx").contract
+    assert contract.arithmetic == "int8" and set(contract.test_error) == {"1", "2"} == set(contract.confidence)
     with pytest.raises(SystemExit, match=r"^export: .*none\.pt"):
         main([str(tmp_path / "none.pt"), "--out", str(tmp_path)])
-
-
-def test_the_command_writes_integers_and_says_what_they_cost(frozen, tmp_path, monkeypatch, capsys):
-    frozen.save(tmp_path / "frozen.npz")
-    make_sequences(count=40).save(tmp_path / "taps.npz")
-    monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
-    monkeypatch.setattr(to_onnx, "held_out", lambda split: make_sequences(count=6, seed=2))
-    monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
-    path = save_untrained(tmp_path / "one.pt", "compact-mtsr2", 10, channels=16, blocks=1)
-    with pytest.raises(
-        SystemExit, match=r"^export: quantisation costs too much in one-int8\.onnx .*: use the float32 model"
-    ):
-        main([str(path), "--out", str(tmp_path), "--int8", str(tmp_path / "taps.npz")])
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("one-int8.onnx") and "convolutions in int8" in line
-    assert ModelSession(tmp_path / "one-int8.onnx").contract.arithmetic == "int8"
 
 
 @pytest.mark.parametrize("option", [["--all-integers"], ["--trust", "x"], ["--intervals", "x"]])
@@ -295,12 +265,6 @@ def test_a_folder_that_is_a_file_ends_in_one_line(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(SystemExit, match=r"^export: .*taken: File exists"):
         main(["one.pt", "--out", str(tmp_path / "taken")])
-
-
-def test_the_command_is_as_written(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["--help"])
-    assert end.value.code == 0 and "python -m export.to_onnx" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Every bundled model computes what its network computes, at every level, and in a second runtime."""
 
-from collections import Counter
 from dataclasses import replace
 from functools import cache
 
@@ -34,8 +33,6 @@ from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 
-passes: Counter[str] = Counter()
-"""Passes that were reported for each model in `rows`."""
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
 IN_INTEGERS = [name for name in MODELS if name.endswith("-int8")]
@@ -46,11 +43,18 @@ def frozen():
     return load_frozen_set(BUNDLE_DIR / "frozen.npz")
 
 
+IN_GATE = 3
+"""One frame in so many is compared; of float32, which is the same on each window, a third of these."""
+
+
 @cache
-def rows(name):
-    """Compare on the whole set what is rounded; float32 is the same on each window, and is compared on a third."""
-    judged = frozen() if name in IN_INTEGERS else frozen().thinned(3)
-    return list(verify(find_model(name), judged, on_pass=lambda: passes.update([name])))
+def rows(name, one_in):
+    """Compare a model with its network on one frame of so many of the frozen set."""
+    passes, whole = [], frozen()
+    judged = whole if one_in == 1 else whole.thinned(one_in)
+    found = list(verify(find_model(name), judged, on_pass=lambda: passes.append(name)))
+    assert len(passes) == PASSES > 3, "each pass over the windows is told for a bar, even where there is one model"
+    return found
 
 
 def graph_of(name):
@@ -70,22 +74,28 @@ def test_every_network_is_bundled_in_both_arithmetics():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_bundled_model_keeps_every_bound_at_every_level(name):
-    assert [row for row in rows(name) if row.broken] == []
-    assert {row.level for row in rows(name)} == set(LEVELS)
-    assert {"test set", "zeros", "denormals", "one hot taxel", "1000 x full range"} <= {
-        row.windows for row in rows(name)
-    }
+    found = rows(name, IN_GATE if name in IN_INTEGERS else 3 * IN_GATE)
+    assert [row for row in found if row.broken] == []
+    assert {row.level for row in found} == set(LEVELS)
+    assert {"test set", "zeros", "denormals", "one hot taxel", "1000 x full range"} <= {row.windows for row in found}
 
 
+@pytest.mark.parametrize("one_in", [IN_GATE, pytest.param(1, marks=pytest.mark.night)])
 @pytest.mark.parametrize("name", IN_INTEGERS)
-def test_integers_cost_no_more_than_they_may(name):
-    lost_db = [-row.psnr_change_db for row in rows(name) if row.psnr_change_db is not None]
+def test_integers_cost_no_more_than_they_may(name, one_in):
+    lost_db = [-row.psnr_change_db for row in rows(name, one_in) if row.psnr_change_db is not None]
     assert len(lost_db) == len(LEVELS) and min(lost_db) > -0.1 and max(lost_db) <= MOST_LOSS_DB
     session, in_float = (ModelSession(find_model(each)) for each in (name, name.removesuffix("-int8")))
     taps = str(session.contract.taps)
     said_db = in_float.contract.test_error[taps]["psnr_db"] - session.contract.test_error[taps]["psnr_db"]
-    assert said_db == pytest.approx(max(lost_db), abs=2e-3)
+    assert said_db == pytest.approx(max(lost_db), abs=2e-3 if one_in == 1 else 2e-2)
     assert (session.contract.arithmetic, in_float.contract.arithmetic) == ("int8", "float32")
+
+
+@pytest.mark.night
+@pytest.mark.parametrize("name", MODELS)
+def test_on_the_whole_set_as_well(name):
+    assert [row for row in rows(name, 1) if row.broken] == []
 
 
 @pytest.mark.parametrize("name", IN_INTEGERS)
@@ -129,10 +139,10 @@ def test_another_runtime_computes_the_same(name):
     ):
         assert difference.relative < accepted(difference.output, bound)
     if contract.arithmetic == "int8":
-        every = read_windows(frozen(), contract, None)
-        judged = judge_model(ModelSession(find_model(name)), frozen())["psnr_db"].mean()
-        patterns = np.concatenate([run(window)[0] for window in every])
-        error = np.mean((patterns - frozen().patterns()) ** 2, axis=(1, 2))
+        some = frozen().thinned(9)
+        judged = judge_model(ModelSession(find_model(name)), some)["psnr_db"].mean()
+        patterns = np.concatenate([run(window)[0] for window in read_windows(some, contract, None)])
+        error = np.mean((patterns - some.patterns()) ** 2, axis=(1, 2))
         # With poses onnxruntime loses .05 dB by int8 and OpenVINO, which rounds elsewhere, gains .07.
         most_db = 0.15 if contract.takes_poses else 0.05
         assert np.mean(10 * np.log10(frozen().full_scale_mm ** 2 / error)) == pytest.approx(judged, abs=most_db)
@@ -163,14 +173,10 @@ def spoiled(name, factor):
     return model
 
 
-def test_each_pass_over_the_windows_is_told_for_a_bar_even_where_there_is_one_model():
-    assert rows("stsr") and passes["stsr"] == PASSES > 3
-
-
 def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeypatch, capsys):
     path = save(spoiled("stsr", 1.01), tmp_path / "stsr.onnx")
     monkeypatch.setattr(verify_module, "network_of", lambda _: network_of(graph_of("stsr")[0]))
-    monkeypatch.setattr(verify_module, "load_frozen_set", lambda path: frozen().thinned(10))
+    monkeypatch.setattr(verify_module, "load_frozen_set", lambda path: frozen().thinned(30))
     with pytest.raises(SystemExit, match=r"verify: \d+ of \d+ comparisons break a bound"):
         main([str(path)])
     printed = capsys.readouterr().out
@@ -179,31 +185,23 @@ def test_a_model_that_computes_something_else_breaks_the_bound(tmp_path, monkeyp
 
 def test_integers_that_cost_too_much_break_the_bound(tmp_path, monkeypatch):
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", -1.0)
-    broken = [row for row in verify(find_model("stsr-small-int8"), frozen().thinned(10)) if row.broken]
+    broken = [row for row in verify(find_model("stsr-small-int8"), frozen().thinned(30)) if row.broken]
     assert len(broken) == len(LEVELS) and all("dB lost, more than -1.0" in row.broken for row in broken)
 
 
-def test_a_deviation_that_is_not_above_zero_breaks_the_bound(monkeypatch):
-    class Sure(GraphRun):
-        def __call__(self, windows):
-            pattern, deviation, traction = super().__call__(windows)
-            return [pattern, deviation * 0, traction]
-
-    monkeypatch.setattr(verify_module, "GraphRun", Sure)
-    assert any(
-        row.broken == "a deviation is not above zero" for row in verify(find_model("stsr-int8"), frozen().thinned(10))
-    )
-
-
-def test_integers_that_say_something_else_break_the_bound(monkeypatch):
+@pytest.mark.parametrize(
+    ("pattern_factor", "deviation_factor", "said"),
+    [(1.0, 0.0, "a deviation is not above zero"), (0.5, 1.0, "pattern differs by")],
+)
+def test_integers_that_say_something_else_break_the_bound(monkeypatch, pattern_factor, deviation_factor, said):
     class Other(GraphRun):
         def __call__(self, windows):
             pattern, deviation, traction = super().__call__(windows)
-            return [pattern * np.float32(0.5), deviation, traction]
+            return [pattern * np.float32(pattern_factor), deviation * np.float32(deviation_factor), traction]
 
     monkeypatch.setattr(verify_module, "GraphRun", Other)
     monkeypatch.setattr(verify_module, "MOST_LOSS_DB", 100)
-    assert any("pattern differs by" in row.broken for row in verify(find_model("stsr-int8"), frozen().thinned(10)))
+    assert any(said in row.broken for row in verify(find_model("stsr-small-int8"), frozen().thinned(30)))
 
 
 def test_a_network_of_another_training_is_refused(tmp_path):

@@ -18,7 +18,7 @@ from edge.inference.onnx_guard import read_model
 from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.recording import csv_reader
-from firmware_bridge.recording import formats as recording
+from firmware_bridge.recording import npz_recording as recording
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.npz_reader import read_npz

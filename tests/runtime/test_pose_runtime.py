@@ -262,8 +262,8 @@ def test_a_new_object_forgets_taps_and_keeps_poses():
     assert result.taps_used == 1 and result.pose.x_mm == 1
 
 
-def test_a_contract_of_before_poses_is_run_as_before():
-    model = FakeModel(make_contract(version=6))
+def test_a_model_without_poses_is_run_without():
+    model = FakeModel(make_contract())
     pad = Pad(make_runtime(model))
     pad.tap()
     result = pad.tap()

@@ -8,7 +8,7 @@ from edge_samples import make_contract, tiny_deviation, tiny_pattern, write_mode
 from onnx import TensorProto
 
 from edge.errors import ModelError, WindowError
-from edge.inference.contract import ANY_BATCH, KEY_PREFIX, Contract
+from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, KEY_PREFIX, Contract
 from edge.inference.onnx_session import ModelSession
 
 
@@ -203,17 +203,18 @@ def test_interval_levels_are_positive_factors_of_percentages(levels):
         Contract.from_metadata(metadata)
 
 
-def test_interval_levels_are_kept_and_none_in_earlier_versions():
+def test_interval_levels_are_kept():
     levels = {"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6, 1.6, 1.6, 1.6]}
     metadata = make_contract(interval_levels=levels).to_metadata()
     assert Contract.from_metadata(metadata).interval_levels == levels
-    assert Contract.from_metadata(make_contract(version=5).to_metadata()).interval_levels == {}
 
 
-def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path):
-    metadata = make_contract(version=1).to_metadata()
+@pytest.mark.parametrize("version", [1, CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
+def test_of_a_contract_of_another_version_the_version_is_named_not_what_it_lacks(tmp_path, version):
+    metadata = make_contract(version=version).to_metadata()
     del metadata[KEY_PREFIX + "interval_factor"]
-    with pytest.raises(ModelError, match=r"'version' is 1, expected 4 to 8: export the model again"):
+    expected = rf"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
+    with pytest.raises(ModelError, match=expected):
         ModelSession(write_model(tmp_path / "old.onnx", metadata=metadata))
 
 

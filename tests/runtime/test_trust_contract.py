@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from edge_samples import make_contract, make_pad_contract, write_model
+from edge_samples import make_pad_contract, write_model
 from trust_samples import CONSTANTS, make_trust, make_trusted_contract
 
 from edge.errors import ModelError
@@ -107,13 +107,7 @@ class TestContract:
         with pytest.raises(ModelError, match="contract key 'trust'"):
             Contract.from_metadata(make_trusted_contract(**changes).to_metadata())
 
-    @pytest.mark.parametrize("version", [4, 5])
-    def test_a_model_of_an_earlier_version_has_none(self, tmp_path, version):
-        contract = make_contract(version=4) if version == 4 else make_pad_contract(version=5)
-        model = ModelSession(write_model(tmp_path / "earlier.onnx", contract))
-        assert "tactile.trust" not in contract.to_metadata() and model.contract.read_trust() is None
-
-    def test_a_model_of_this_version_must_have_the_key(self):
+    def test_a_model_must_have_the_key(self):
         metadata = make_pad_contract(version=CONTRACT_VERSION).to_metadata()
         assert Contract.from_metadata(metadata).read_trust() is None
         del metadata["tactile.trust"]

@@ -1,10 +1,41 @@
 """Samples for the experiments' tests: one quick workbench, so that datasets and networks are made once a session."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from firmware_bridge.recording.csv_reader import CSV_HEADER
 from train.experiments.support.workbench import Workbench
 
 
 def quick_bench(tmp_path_factory: pytest.TempPathFactory) -> Workbench:
     folder = tmp_path_factory.getbasetemp() / "quick"
     return Workbench(folder / "data", folder / "checkpoints", quick=True)
+
+
+REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).reshape(4, 4)
+
+
+def save_recordings(folder: Path) -> None:
+    """Write two trials of two sensors: one grips all the time, the other lets go; its last rows are the rest level."""
+    for trial, released in (("trial-a", False), ("trial-b", True)):
+        for sensor in ("sensor1", "sensor2"):
+            _save_recording(folder / trial / f"xela_{sensor}.csv", REST + grip(released))
+
+
+def grip(released: bool) -> np.ndarray:
+    """Counts above rest, (60, 3, 4, 4): every row another, one in ten sent again."""
+    rng = np.random.default_rng(int(released))
+    pressed = 900 + rng.integers(-300, 300, (60, 3, 4, 4))
+    if released:
+        pressed[30:] = 0
+    pressed[10:30:10] = pressed[9:29:10]
+    return pressed
+
+
+def _save_recording(path: Path, counts: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    taxels_by_axes = counts.transpose(0, 2, 3, 1).reshape(len(counts), -1)
+    lines = [",".join(CSV_HEADER), *(",".join(f"{value}.0" for value in row) for row in taxels_by_axes)]
+    path.write_text("\n".join(lines) + "\n")

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from train.learning.interval_calibration import calibrate, half_width_mm, interval_coverage
+from train.learning.interval_fit import calibrate, interval_coverage
 
 LEVELS = [0.1, 0.5, 0.8, 0.9, 0.99]
 
@@ -18,13 +18,6 @@ def laplace(seed=0, shape=(60, 40, 40)):
 
 def test_intervals_of_a_laplace_density_cover_what_they_say():
     assert [interval_coverage(*laplace(), level) for level in LEVELS] == pytest.approx(LEVELS, abs=0.005)
-
-
-def test_half_widths_are_the_quantiles_of_the_density():
-    assert float(half_width_mm(1.0, 0.5)) == pytest.approx(math.log(2) / math.sqrt(2))
-    assert float(half_width_mm(2.0, 0.9)) == pytest.approx(2 * math.log(10) / math.sqrt(2))
-    gaussian = 1.6449
-    assert float(half_width_mm(1.0, 0.9)) == pytest.approx(gaussian, rel=0.02)
 
 
 @pytest.mark.parametrize("wrong", [0.2, 1.0, 7.0])
@@ -47,15 +40,6 @@ def test_the_level_is_met_whatever_the_density_and_holds_on_other_pixels():
     truth, pattern, deviation = uniform()
     assert interval_coverage(truth, pattern, factor * deviation) == pytest.approx(0.9, abs=0.01)
     assert interval_coverage(truth, pattern, factor * deviation, 0.5) < 0.4
-
-
-def test_no_error_is_covered_and_a_large_one_is_not():
-    truth = np.zeros((1, 2, 2))
-    deviation = np.full(truth.shape, 0.01)
-    assert interval_coverage(truth, truth, deviation) == 1
-    assert interval_coverage(truth, truth + 1, deviation) == 0
-    half = np.array([[[0.0, 0.0], [1.0, -1.0]]])
-    assert interval_coverage(truth, half, deviation) == 0.5
 
 
 def test_what_makes_no_sense_is_refused():

@@ -11,6 +11,8 @@ from edge.inference.onnx_session import ModelSession
 from train.data.frozen_presses import load_frozen_presses
 from train.learning.expected_error_table import BINS, doubts_and_errors, fit_confidence
 
+IN_INTEGERS = [path for path in bundled_models() if path.stem.endswith("-int8")]
+"""Those in float have the same patterns within a hundredth: see the tests of parity."""
 TABLE = {
     "1": {"doubt": [0.1, 0.3], "error": [0.2, 0.4], "gain": [0.0, 0.1]},
     "2": {"doubt": [0.1, 0.3], "error": [0.1, 0.3], "gain": []},
@@ -104,7 +106,7 @@ def expected_and_true(path, test_set):
     return np.interp(about, told["doubt"], told["error"]) * size, error
 
 
-@pytest.mark.parametrize("path", bundled_models(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", IN_INTEGERS, ids=lambda path: path.stem)
 def test_of_the_wide_test_set_the_expected_error_is_near_the_true_one(path):
     """The table is of other presses of the wide world; measured 1.05 to 1.09 of the true error, small ones 1.20.
 
@@ -118,10 +120,10 @@ def test_of_the_wide_test_set_the_expected_error_is_near_the_true_one(path):
         assert expected[part].mean() == pytest.approx(error[part].mean(), rel=of_quarter)
 
 
-@pytest.mark.parametrize("path", bundled_models(), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", IN_INTEGERS, ids=lambda path: path.stem)
 def test_of_the_figures_more_error_is_expected_than_there_is(path):
     """Figures on the middle pad are easier than presses of the wide world: measured 1.30 to 1.76 by quarters."""
-    expected, error = expected_and_true(path, load_frozen_set(BUNDLE_DIR / "frozen.npz"))
+    expected, error = expected_and_true(path, load_frozen_set(BUNDLE_DIR / "frozen.npz").thinned(4))
     for part in np.array_split(np.argsort(expected), 4):
         assert 1 < expected[part].mean() / error[part].mean() < 1.9
     assert np.corrcoef(expected, error)[0, 1] > 0.45

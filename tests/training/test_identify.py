@@ -7,8 +7,7 @@ from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from train import identify
 from train.data.real_grips import recording_paths, recordings_folder
 from train.errors import DatasetError
-from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z
-from train.learning.gain_estimate import learned, pad_of
+from train.learning.contact_mixture import CHANNELS, CONSTANTS, ContactMixture, Z, learned
 
 FOLDER = recordings_folder()
 
@@ -68,11 +67,6 @@ def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
     assert "not determined" in identify.table("4", found.contacts, pad)
 
 
-def test_more_contacts_leave_less_open(mixture):
-    few, many = (sensor(mixture, 5, count)[2] for count in (3, 100))
-    assert (many.deviations < few.deviations).all()
-
-
 def test_weak_and_clipped_contacts_are_not_used(mixture):
     read = contacts(mixture, 20, np.ones(CHANNELS), np.zeros(len(CONSTANTS)), 6)
     read[:5] *= 0.1
@@ -80,13 +74,6 @@ def test_weak_and_clipped_contacts_are_not_used(mixture):
     assert learned(read, mixture.model(), passes=1).contacts <= 14
     with pytest.raises(DatasetError, match="none of 5 contacts"):
         learned(read[:5], mixture.model())
-
-
-def test_the_pad_of_some_contacts_is_one_call(mixture):
-    gains, _, _ = sensor(mixture, 5)
-    read = contacts(mixture, 100, np.exp(gains), np.zeros(len(CONSTANTS)), 5)
-    pad = pad_of(read, mixture.model())
-    assert pad.gains_certainty > 0.4 and "in_plane_share" in pad.constants
 
 
 def test_a_held_grip_is_one_contact(mixture):

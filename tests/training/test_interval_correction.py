@@ -7,8 +7,7 @@ from press_samples import make_press_set
 
 from edge.inference.intervals import REGIONS, regions
 from train.learning import interval_fit
-from train.learning.interval_calibration import half_width_mm
-from train.learning.interval_fit import Readings, conform, fit_correction, readings_of_presses
+from train.learning.interval_fit import Readings, conform, fit_correction, half_width_mm, readings_of_presses
 from train.networks.compact import CompactNet
 from train.networks.interval_correction import LOG_RANGE
 from train.physics.pad_draws import KNOWN

@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,14 @@ from edge_samples import ROOT
 
 from train.data.batch import Batch
 from train.learning import training_loop as loop
-from train.learning.training_loop import DivergedError, NotResumableError, Recipe, learning_rate_share, train
+from train.learning.training_loop import (
+    DivergedError,
+    NotResumableError,
+    Recipe,
+    drawn_ahead,
+    learning_rate_share,
+    train,
+)
 from train.networks.blocks import PatternNet
 from train.networks.losses import RelativeError
 
@@ -155,13 +163,6 @@ def test_the_clock_ends_a_run_too(tmp_path):
     assert 0 < done.steps < 10**6
 
 
-def test_bfloat16_multiplies_coarsely_and_learns_all_the_same(tmp_path):
-    recipe = replace(RECIPE, steps=200)
-    (fine, _), (coarse, done) = trained(tmp_path, recipe), trained(tmp_path, replace(recipe, bf16=True))
-    assert coarse.matrix.weight.dtype == torch.float32 and not torch.equal(weights(fine), weights(coarse))
-    assert done.loss < 0.35
-
-
 def test_figures_go_to_tensorboard(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     trained(
@@ -194,6 +195,7 @@ leave_group()
 """
 
 
+@pytest.mark.night
 def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
     (tmp_path / "worker.py").write_text(WORKER)
     command = ["torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0", "--rdzv-backend", "c10d"]
@@ -242,6 +244,45 @@ def test_processes_keep_to_their_shares_of_the_cores(monkeypatch, cores, world, 
         monkeypatch.delattr(os, "sched_setaffinity")
         loop._keep_apart(rank, world)
         assert len(kept) == (share is not None), "a GPU computes, or the system has no such call"
+
+
+def test_every_number_once_in_order_and_none_beyond_the_end():
+    drawn = []
+
+    def batch(number):
+        drawn.append(number)
+        return -number
+
+    assert list(drawn_ahead(batch, 3, 7)) == [-3, -4, -5, -6]
+    assert drawn == [3, 4, 5, 6]
+    assert list(drawn_ahead(batch, 7, 7)) == []
+
+
+def test_the_next_is_drawn_while_one_is_used():
+    drawn = [threading.Event() for _ in range(3)]
+
+    def batch(number):
+        drawn[number].set()
+        return number
+
+    batches = drawn_ahead(batch, 0, 3)
+    assert next(batches) == 0
+    assert drawn[1].wait(20) and not drawn[2].is_set()
+    batches.close()
+    assert not drawn[2].is_set()
+
+
+def test_what_fails_fails_at_its_number_and_leaves_no_thread():
+    def batch(number):
+        if number == 2:
+            raise OSError("no such batch")
+        return number
+
+    batches = drawn_ahead(batch, 0, 4)
+    assert [next(batches), next(batches)] == [0, 1]
+    with pytest.raises(OSError, match="no such batch"):
+        next(batches)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("batches")]
 
 
 def _environment():

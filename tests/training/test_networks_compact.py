@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -126,8 +125,7 @@ def test_the_pattern_learns_as_if_there_were_no_deviation():
             assert torch.equal(both, one)
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
-def test_the_best_deviation_is_that_of_a_laplace_density_with_the_mean_error(beta):
+def test_the_best_deviation_is_that_of_a_laplace_density_with_the_mean_error():
     torch.manual_seed(6)
     errors = torch.distributions.Laplace(0.0, 0.02).sample((1, 100, 100))
     truth = torch.full_like(errors, 0.2)
@@ -135,7 +133,7 @@ def test_the_best_deviation_is_that_of_a_laplace_density_with_the_mean_error(bet
 
     def slope(deviation_mm):
         deviation = torch.full_like(truth, deviation_mm, requires_grad=True)
-        heteroscedastic_loss(truth + errors, deviation, truth, beta).backward()
+        heteroscedastic_loss(truth + errors, deviation, truth).backward()
         assert deviation.grad is not None
         return float(deviation.grad.sum())
 
@@ -168,6 +166,7 @@ def test_slopes_are_finite_and_no_steeper_than_the_error(deviation_mm, error_mm)
     assert slope.sum() >= -error_mm / size - 1e-6
 
 
+@pytest.mark.night
 def test_deviations_learn_where_errors_are():
     # Two kinds of windows: one determines its pattern, the other leaves a third of the pixels to chance.
     torch.manual_seed(3)
@@ -187,34 +186,6 @@ def test_deviations_learn_where_errors_are():
     assert deviation[1, :, :3].mean() > 3 * deviation[1, :, 4:].mean()
     assert deviation[1, :, :3].mean() > 3 * deviation[0].mean()
     assert 0.05 < deviation[1, :, :3].mean() < 0.2
-
-
-def test_low_precision_gives_nearly_the_same(net):
-    with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
-        low = net(window())
-    for coarse, fine in zip(low, net(window()), strict=True):
-        assert coarse.dtype == torch.float32
-        assert torch.allclose(coarse, fine, atol=0.05 * float(fine.detach().abs().max()))
-
-
-def test_the_graph_holds_all_outputs(net):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-    program = torch.onnx.export(
-        net,
-        (window(1),),
-        dynamo=True,
-        opset_version=18,
-        input_names=["window"],
-        output_names=["p", "d", "t"],
-        verbose=False,
-    )
-    assert program is not None
-    session = onnxruntime.InferenceSession(program.model_proto.SerializeToString())
-    got = session.run(["p", "d", "t"], {"window": window(1, seed=9).numpy()})
-    for output, expected in zip(got, net(window(1, seed=9)), strict=True):
-        true = expected.detach().numpy()
-        assert np.allclose(output, true, atol=1e-6 * max(1, np.abs(true).max()))
 
 
 @pytest.mark.parametrize("taps", [1, 2])

@@ -5,7 +5,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from edge.inference.contract import Contract
+from edge.inference.contract import CONTRACT_VERSION, Contract
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.scans.pad_constants import Pad as KnownPad
 from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
@@ -63,7 +63,7 @@ def test_known_numbers_are_values_flags_and_gains_and_zeros_where_nothing_is_kno
 def contract() -> Contract:
     """One that takes what the bundled networks take of a pad."""
     return Contract(
-        version=5,
+        version=CONTRACT_VERSION,
         batch=1,
         taps=1,
         scale=10,

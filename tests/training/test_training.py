@@ -5,34 +5,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from press_samples import make_press_set
 
 from edge.evaluation.metrics import psnr_db
-from train.data.generation_config import SEED, Generation, solve_all
+from train.data.frozen_presses import freeze_presses
+from train.data.generation_config import SEED
 from train.errors import CheckpointError
 from train.fit import BUNDLED, given_taps, main
-from train.freeze import freeze, held_out
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
-from train.learning.interval_calibration import interval_coverage
+from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
 from train.networks.registry import grown
 from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
 
-SMALL = {"channels": 16, "blocks": 1}
+SMALL = {"channels": 16, "blocks": 1, "known": KNOWN}
 TRAINING = Training(
-    "small", "compact-mtsr2", Recipe(steps=150, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
+    "small", "compact-mtsr2", Recipe(steps=50, batch=16, learning_rate=5e-3, given=(0.5, 0.5)), options=SMALL
 )
 
 
 @pytest.fixture(scope="module")
 def data():
-    return solve_all(Generation(surfaces=("O", "small square"), count=48, taps=2, seed=5))
+    return make_press_set(48, taps=2, seed=5)
 
 
 @pytest.fixture(scope="module")
 def validation():
-    return freeze(held_out("validation", ("O", "small square"), taps=2), Nuisances(), SEED)
+    return freeze_presses(make_press_set(24, taps=2, seed=6), SEED).as_frozen_set()
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +49,8 @@ def test_a_run_is_repeatable_and_its_configuration_lies_beside_the_weights(folde
     assert all(torch.equal(first[key], second[key]) for key in first)
     kept = json.loads((folder / "small.json").read_text())
     assert kept["training_sha256"] == report["training_sha256"] == TRAINING.sha256(data.sha256())
-    assert kept["config"]["recipe"]["steps"] == 150 and kept["config"]["draw"]["nuisances"]["noise_counts"] == 2.0
-    assert [point["step"] for point in kept["course"]] == [30, 60, 90, 120, 150]
+    assert kept["config"]["recipe"]["steps"] == 50 and kept["config"]["draw"]["nuisances"]["noise_counts"] == 2.0
+    assert [point["step"] for point in kept["course"]] == [10, 20, 30, 40, 50]
     assert kept["course"][-1]["validation PSNR dB"] == pytest.approx(kept["validation_psnr_db"])
     assert kept["device"]
     assert not (folder / "small.resume").exists()
@@ -94,7 +95,7 @@ def test_the_hash_tells_configurations_and_data_apart():
         {"scale": 8},
         {"start": "base"},
         {"options": {}},
-        {"recipe": replace(TRAINING.recipe, steps=151)},
+        {"recipe": replace(TRAINING.recipe, steps=51)},
         {"draw": replace(TRAINING.draw, nuisances=Nuisances.none())},
     ]
     hashes = {replace(TRAINING, **change).sha256("data") for change in [{}, *changes]} | {TRAINING.sha256("other")}
@@ -175,7 +176,8 @@ def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_know
 
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
-    options = ["--data", str(tmp_path / "data.npz"), "--network", "compact-mtsr2", "--name", "mine", "--steps", "2"]
+    files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
+    options = [*files, "--network", "compact-mtsr2", "--name", "mine", "--steps", "2"]
     main([str(tmp_path), *options, "--batch", "4", "--bf16"])
     assert capsys.readouterr().out.startswith("mine: validation ")
     assert load_network(tmp_path / "mine.pt")[1]["config"]["recipe"]["bf16"] is True
@@ -185,7 +187,7 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
     ("options", "told"),
     [
         (["--data", "absent.npz"], "no such file"),
-        (["--network", "compact-mtsr4"], "4 taps asked for"),
+        (["--network", "compact-mtsr4"], "no sequences of 4 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
         (["--network", "compact-stsr", "--scale", "7"], "scale is 7"),
         (["--network", "compact-stsr", "--start-from", "absent", "--keep", "1"], "keep is 1"),
@@ -195,5 +197,6 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
 def test_what_cannot_be_trained_is_said_in_one_line(data, tmp_path, options, told):
     data.save(tmp_path / "data.npz")
     given = [] if "--data" in options else ["--data", str(tmp_path / "data.npz")]
+    given += ["--validation", str(tmp_path / "data.npz")]
     with pytest.raises(SystemExit, match=rf"^fit: .*{told}[^\n]*$"):
         main([str(tmp_path), *given, *options, "--steps", "1"])

@@ -1,7 +1,6 @@
-"""Real grips, whole and with a taxel hidden, and linear methods that predict the hidden taxel."""
+"""Recordings of real grips, and the mean of a taxel's neighbours."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -9,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.classical_methods import fit_linear_map
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
@@ -122,22 +120,3 @@ def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
     row, col = np.divmod(np.arange(_TAXELS), USPA44.cols)
     beside = (np.abs(row[:, None] - row) + np.abs(col[:, None] - col)) == 1
     return z @ (beside / beside.sum(axis=0))
-
-
-def linear_from_others(fitted_on: NDArray[np.floating], z: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return each taxel of z (n, taxels) from the others, by least squares over the rows of `fitted_on` (m, taxels)."""
-    estimates = np.empty_like(z)
-    for taxel in range(_TAXELS):
-        others = np.arange(_TAXELS) != taxel
-        estimates[:, taxel] = z[:, others] @ fit_linear_map(fitted_on[:, others], fitted_on[:, [taxel]])[:, 0]
-    return estimates
-
-
-def from_other_trials(trials: Sequence[str], z: Sequence[NDArray[np.floating]]) -> list[NDArray[np.floating]]:
-    """Return `linear_from_others` of each set's z (n, taxels), fitted on the sets of all other trials."""
-    return [
-        linear_from_others(
-            np.concatenate([other for name, other in zip(trials, z, strict=True) if name != trial]), mine
-        )
-        for trial, mine in zip(trials, z, strict=True)
-    ]

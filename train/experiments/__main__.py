@@ -17,11 +17,10 @@ from train.errors import TrainError
 from train.experiments.support.workbench import Workbench
 
 EXPERIMENTS: Final = {
-    "families": "the shipped model on every family, next to baselines",
+    "families": "the shipped model and its intervals on every family, next to baselines",
     "pads": "the shipped model on pads that are off the nominal one",
     "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
-    "posed-taps": "taps from known poses: one to seven, by schedule, and with wrong poses",
-    "paper-schedule": "several taps over one in the paper's own comparison, on ten times its sequences",
+    "posed-taps": "taps from known poses: one to seven, by schedule, the paper's too, and with wrong poses",
     "table3": "all methods at x10 on the same targets",
     "table4": "STSR at five scales",
     "angle": "MTSR-2 by angle between its taps",
@@ -30,8 +29,6 @@ EXPERIMENTS: Final = {
     "force-recovery": "force through press, hold and release",
     "unseen": "surfaces that were not trained on",
     "real": "real grips: shape of faces, patterns against readings",
-    "dead": "dead taxels, detected and undetected",
-    "interval-coverage": "intervals by region and family, and the error of what is trusted most",
     "fig5": "alpha and beta against force",
     "fig7": "tPSF, PSF and depth against FEM",
 }
@@ -64,11 +61,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--models", type=Path, default=BUNDLE_DIR, help="folder of the shipped models (default: the bundled ones)"
     )
-    parser.add_argument(
-        "--before", type=Path, metavar="FILE", help="pads: model of an earlier release, to compare with the shipped one"
-    )
     options = parser.parse_args(arguments)
-    bench = Workbench(options.data, options.checkpoints, options.quick, options.models, options.before)
+    bench = Workbench(options.data, options.checkpoints, options.quick, options.models)
     try:
         names = list(EXPERIMENTS) if "all" in options.names else options.names
         for name in tracked(names, "experiments", "page"):

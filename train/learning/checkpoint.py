@@ -23,7 +23,7 @@ from train.data.posed_batches import PosedBatches
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
-from train.learning.interval_calibration import calibrate, interval_coverage
+from train.learning.interval_fit import calibrate, interval_coverage
 from train.learning.training_loop import (
     Objective,
     Recipe,
@@ -36,8 +36,8 @@ from train.learning.training_loop import (
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.losses import RelativeError
+from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
-from train.networks.srgan import SrganObjective, TactileSRGAN
 from train.physics.gripped import SCALE
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())

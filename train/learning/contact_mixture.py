@@ -40,6 +40,7 @@ _SCALES: Final = (
     (CONSTANTS[-1], Nuisances().cross_talk / 2, Nuisances().cross_talk / 2),
 )
 """Name, middle and half range of each."""
+PASSES: Final = 3
 _COMPONENTS: Final = 48
 _ROUNDS: Final = 12
 _RIDGE: Final = 1e-4
@@ -194,6 +195,26 @@ def _taught(model: ContactModel, contacts: NDArray[np.floating]) -> GainLearner:
     for contact in contacts:
         learner.learn(contact)
     learner.solve()
+    return learner
+
+
+def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = PASSES) -> GainLearner:
+    """Return the learner after several passes over contacts (n, 3, rows, cols), zeroed, each that differs once a pass.
+
+    Raises:
+        DatasetError: no contact is strong enough.
+    """
+    learner = GainLearner(model)
+    for number in range(passes):
+        if number:
+            learner = learner.again()
+        for contact in counts:
+            learner.learn(contact)
+        learner.solve()
+    if not learner.contacts:
+        raise DatasetError(
+            f"none of {len(counts)} contacts is strong and unclipped: press so that z exceeds 200 counts"
+        )
     return learner
 
 

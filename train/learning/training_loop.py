@@ -13,13 +13,14 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
@@ -30,7 +31,6 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
 from train.data.batch import Batch
 from train.errors import TrainError
-from train.learning.prefetch import drawn_ahead
 from train.networks.blocks import PatternNet
 
 Batches = Callable[[int], Batch]
@@ -256,6 +256,20 @@ def train(
             keeper.keep_now_and_then(step, clock.elapsed_s(), course)
     net.eval()
     return Trained(step, clock.elapsed_s(), loss, course)
+
+
+Drawn = TypeVar("Drawn")
+
+
+def drawn_ahead(batches: Callable[[int], Drawn], first: int, end: int) -> Generator[Drawn, None, None]:
+    """Yield the batches from number `first` to before `end`, each drawn in a thread while the one before is used."""
+    with ThreadPoolExecutor(1, "batches") as thread:
+        coming = thread.submit(batches, first)
+        for number in range(first, end):
+            batch = coming.result()
+            if number + 1 < end:
+                coming = thread.submit(batches, number + 1)
+            yield batch
 
 
 def _place(net: PatternNet, device: torch.device) -> PatternNet:

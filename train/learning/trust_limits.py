@@ -14,8 +14,7 @@ from edge.inference.trust import Trust
 from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.contact_check import contact_check
-from train.learning.posed_tap_check import posed_tap_check
-from train.learning.tap_check import tap_check
+from train.learning.tap_checks import posed_tap_check, tap_check
 from train.physics.pad_draws import INPUTS
 
 UNFAMILIAR: Final = 0.005

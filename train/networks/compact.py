@@ -70,7 +70,7 @@ class CompactNet(PatternNet):
 
     Attributes:
         deviation_scale: factor on the deviation, computed after training by
-            `train.learning.interval_calibration.calibrate`.
+            `train.learning.interval_fit.calibrate`.
         intervals: correction of the deviations by region; None until `add_intervals`.
 
     Raises:
@@ -318,20 +318,19 @@ class HeteroscedasticError:
         """Load nothing."""
 
 
-def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor, beta: float = 1.0) -> Tensor:
+def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> Tensor:
     """Return the relative error of the patterns plus the loss of the deviations; all inputs (n, H, W) in [mm].
 
     The deviation is trained by a Laplace likelihood, because errors have long tails: with the error e and b = deviation
-    / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b^beta. Its minimum is where b is the
-    mean error, whatever beta is. With 0, the likelihood alone, its slope over log b is unbounded, and pixels that are
-    accurate already have the largest weight; with 1 the slope is b - e, of the error's own size, and pixels in the
-    contact are covered as well as those around it. The error is a constant in this term, so a larger
-    uncertainty never allows a worse pattern.
+    / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b. Its minimum is where b is the mean
+    error. The slope over log b is b - e, of the error's own size, so pixels in the contact are covered as well as those
+    around it; the likelihood alone would weigh most the pixels that are accurate already. The error is a constant in
+    this term, so a larger uncertainty never allows a worse pattern.
 
-    Source: Seitzer et al. 2022, Eq. 5, for a Laplace density.
+    Source: Seitzer et al. 2022, Eq. 5 with beta 1, for a Laplace density.
     """
     size = truth_size(truth)
     error = (pattern.detach() - truth).abs() / size
     spread = deviation / sqrt(2) / size + _LEAST_SHARE
-    uncertainty_error = spread.detach().pow(beta) * (spread.log() + error / spread)
+    uncertainty_error = spread.detach() * (spread.log() + error / spread)
     return relative_rms_error(pattern, truth) + uncertainty_error.mean()

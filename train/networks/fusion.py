@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from edge.inference.pose_input import scheduled_rows
 from firmware_bridge.pad_geometry import USPA44
+from train.networks.blocks import PatternNet
 from train.networks.compact import QUIET_UNITS, CompactNet, Seen, tap_amplitude
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 from train.surfaces.poses import ANGLE_STEP_DEG
@@ -287,3 +288,28 @@ def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.flo
     )
     spread = np.stack([one, away])
     return here.astype(np.float32), course.reshape(len(course), -1).astype(np.float32), spread.astype(np.float32)
+
+
+class OneOrMoreNet(PatternNet):
+    """Network that gives windows of one tap to one network and all others to another, which takes poses.
+
+    Args:
+        one: of one tap.
+        more: of 2 to K taps.
+    """
+
+    takes_poses = True
+
+    def __init__(self, one: PatternNet, more: PatternNet) -> None:
+        super().__init__()
+        self.one, self.more = one, more
+        self.taps, self.scale, self.known = more.taps, more.scale, getattr(more, "known", 0)
+
+    def forward(
+        self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the outputs of the network for so many taps; arguments as `FusionNet.forward`."""
+        apart = window.ndim == _APART
+        if window.shape[1] == (1 if apart else 3):
+            return self.one(window[:, 0] if apart else window, pad)
+        return self.more(window, pad, poses)

@@ -6,9 +6,7 @@ from typing import Any, Final
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.fusion import FusionNet
-from train.networks.srcnn import TactileSRCNN
-from train.networks.srgan import TactileSRGAN
-from train.networks.wu_liu_2024 import MAX_TAPS, SeedNet
+from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRGAN
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 

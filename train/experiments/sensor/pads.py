@@ -20,7 +20,7 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED, one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
-from train.experiments.support.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
+from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.physics.gripped import GrippedPad
@@ -33,7 +33,6 @@ SHAPES_SEED: Final = 4711
 CONSTANTS: Final = (*INPUTS, "pitch_mm", "free_sides")
 PERCENT: Final = (5, 10, 20)
 _MOST_POISSON: Final = 0.499
-_BEFORE: Final = "model before"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +72,12 @@ def run(bench: Workbench, folder: Path) -> Path:
     model = load_shipped(bench.models)
     bench.use(bench.models / f"{model.name}.onnx")
     scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
-    if bench.before is not None:
-        scores[_BEFORE] = _psnr_db(ModelSession(bench.use(bench.before)), read, NOTHING)
-
     report = Report("pads", folder, __file__, bench.used, quick=bench.quick)
     plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}
     report.say(
-        f"`{model.name}` of contract version {model.contract.version} (training "
-        f"{model.contract.training_sha256[:12]}), one tap; {count} shapes, {count // 2} of the paper's surfaces and as "
-        "many random figures, each pressed alike on every pad and read with the same draws of all nuisances. All else "
-        "about a pad is nominal. PSNR on the nominal pad: "
+        f"`{model.name}` (training {model.contract.training_sha256[:12]}), one tap; {count} shapes, "
+        f"{count // 2} of the paper's surfaces and as many random figures, each pressed alike on every pad and read "
+        "with the same draws of all nuisances. All else about a pad is nominal. PSNR on the nominal pad: "
         + "; ".join(f"{name} {value} dB" for name, value in plain.items())
         + ". Known: the constants that the model takes, and the gains; pitch and free sides it cannot be given. Free "
         "sides are off by percent of what finite elements give, upwards alone; a Poisson's ratio 20 % up cannot be."

@@ -1,4 +1,4 @@
-"""Taps from known poses: one to seven, by schedule, next to a linear map of the same taps, and with wrong poses.
+"""Taps from known poses: one to seven, by schedule, with wrong poses, and by the paper's schedule without any.
 
 No choice depended on these presses: network and limits were settled on other pads and figures.
 """
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
+from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import NOT_OF_IT, PatternCheck
 from edge.terminal.progress_bar import tracked
@@ -21,19 +22,22 @@ from train.data.make_presses import make_presses
 from train.data.posed_batches import stated_poses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.experiments.support import linear_taps
-from train.experiments.support.linear_taps import LinearTaps, fit_linear_taps
-from train.experiments.support.shipped import ALL, NOTHING, infer, known_pads
+from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 
-MODEL: Final = "mtsr7-int8"
+MODEL: Final = POSED_MODEL
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
-LINEAR_ON: Final = World(count=40_000, taps=4, seed=3)
-"""Settings of data/taps4.npz in the Makefile, on which the linear map is fitted."""
+PAPER: Final = World(
+    count=720, taps=MAX_TAPS, schedule="turns", begun=0.0, families={"paper": 1.0}, spread=0.0, seed=2_000_029
+)
+"""The paper's own comparison: its figures, the nominal pad, turned by 5 degrees from tap to tap.
+
+Source: Wu and Liu 2024, Fig. 13."""
+_WAYS: Final = ((DEFAULT_MODEL, 1), ("mtsr4-int8", 4), (POSED_MODEL, 4), (POSED_MODEL, MAX_TAPS))
 _COUNT: Final = 420
 _SEED: Final = 2_000_003
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
@@ -46,9 +50,8 @@ _WINDOW: Final = 4
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses and write the report `posed-taps`."""
-    model = ModelSession(bench.use(bench.models / f"{MODEL}.onnx"))
-    fitted_on = bench.presses("taps4", LINEAR_ON, quick_taps=4)
-    linear = {name: fit_linear_taps(fitted_on, name) for name in linear_taps.SCHEDULES}
+    models = {name: ModelSession(bench.use(bench.models / f"{name}.onnx")) for name, _ in _WAYS}
+    model = models[MODEL]
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -57,14 +60,10 @@ def run(bench: Workbench, folder: Path) -> Path:
         + "; ".join(f"{name} {len(one)} (sha256 {one.presses.sha256()[:12]})" for name, one in sets.items())
         + f". All nuisances, gains N(1, .075); stated and true errors of the poses {PLACE_ERROR_MM} mm and "
         f"{TURN_ERROR_DEG:g} degree. PSNR in dB, full scale {MAX_INDENTATION_MM} mm; gains are over the same model "
-        "with the newest tap alone, paired, 95 % intervals by figure. The linear map knows the places of a schedule "
-        "alone. Run time of the model: median of a scan, one thread."
+        "with the newest tap alone, paired, 95 % intervals by figure. Run time of the model: median of a scan, one "
+        "thread."
     )
-    rows = [
-        row
-        for name, one in tracked(sets.items(), "taps", "set")
-        for row in _rows(model, name, one, NOTHING, linear=linear.get(name))
-    ]
+    rows = [row for name, one in tracked(sets.items(), "taps", "set") for row in _rows(model, name, one, NOTHING)]
     report.table(rows, "By schedule and number of taps, nothing known of pad and gains.", "schedules")
     known = [row for name in SCHEDULES[:3] for row in _rows(model, name, sets[name], ALL, (1, 4, 7))]
     report.table(known, "The same with the pad's constants and the gains known.", "known")
@@ -75,33 +74,45 @@ def run(bench: Workbench, folder: Path) -> Path:
         "all kinds.",
         "families",
     )
-    begun = {name: presses_of(bench, name, figures=True, begun=1.0) for name in SCHEDULES}
-    light = {name: freeze_presses(presses, SEED) for name, presses in begun.items()}
-    rows = [row for name, one in light.items() for row in _rows(model, name, one, NOTHING, (1, 4, 7))]
-    report.table(rows, "The newest press has only begun, at a fifth of the earlier ones' depth and more.", "begun")
     report.table(
         _wrong(model, sets["near"]),
         f"{_WINDOW} taps near the newest one, whose poses are all off by so much in a random direction; stated: the "
-        "model gets the size of the error; guarded: as in the runtime, taps are left out that do not belong by the "
-        "readings and the stated poses.",
+        "model gets the size of the error. As in the runtime, taps are left out that do not belong by the readings and "
+        "the stated poses.",
         "wrong-poses",
     )
+    paper = freeze_presses(bench.presses("paper", PAPER, quick_taps=MAX_TAPS), SEED)
+    text = f"Several taps over one in the paper's own comparison ({len(paper)} sequences), no poses stated."
+    report.table(paper_rows(models, paper), text, "paper")
     return report.write()
 
 
-def presses_of(bench: Workbench, schedule: str, *, figures: bool, begun: float = 0.0) -> PressSet:
+def paper_rows(models: dict[str, ModelSession], frozen: FrozenPresses) -> list[Row]:
+    """Return a row for each model and number of taps, with its gain over the default with one tap."""
+    each, alone, rows = np.arange(len(frozen)), None, list[Row]()
+    for name, taps in _WAYS:
+        done = infer(models[name], frozen.windows(taps), [None] * len(frozen))
+        found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
+        alone = found if alone is None else alone
+        row: Row = {"model": name, "taps": taps, "PSNR dB": with_interval(found, each)}
+        row["over one tap"] = with_interval(found - alone, each) if taps > 1 else None
+        rows.append(row | {"run time us": round(done.run_time_us)})
+    return rows
+
+
+def presses_of(bench: Workbench, schedule: str, *, figures: bool) -> PressSet:
     """Return the presses of a schedule, of unseen figures or of every family, that these reports evaluate on."""
     families = dict.fromkeys(FIGURES[1:] if figures else SHARES, 1.0)
     world = World(
         count=_COUNT,
         taps=MAX_TAPS,
         schedule=schedule,
-        begun=begun,
+        begun=0.0,
         per_pad=10,
         families=families,
         seed=_SEED + (not figures),
     )
-    name = f"test-{schedule}" + ("-begun" if begun else "")
+    name = f"test-{schedule}"
     if bench.quick:
         name, world = f"quick-{name}", replace(world, count=8, per_pad=4)
     bench.data_folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +125,6 @@ def _rows(
     frozen: FrozenPresses,
     known: str,
     numbers: tuple[int, ...] = _SHOWN,
-    linear: LinearTaps | None = None,
 ) -> list[Row]:
     """Return a row for each number of taps."""
     poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, USUAL)
@@ -124,9 +134,6 @@ def _rows(
         found, run_time_us = _psnr(model, frozen, poses[:, :taps], known)
         row: Row = {"schedule": schedule, "taps": taps, "model dB": with_interval(found, each)}
         row["over one tap"] = None if taps == 1 else with_interval(found - alone, each)
-        if linear is not None and taps in linear.matrices:
-            mapped = linear(frozen.windows(taps), poses[:, :taps])
-            row["linear map dB"] = round(float(psnr_db(mapped, frozen.patterns(), MAX_INDENTATION_MM).mean()), 2)
         rows.append(row | {"run time us": round(run_time_us)})
     return rows
 
@@ -139,16 +146,11 @@ def _wrong(model: ModelSession, frozen: FrozenPresses) -> list[Row]:
         row: Row = {"off mm": error_mm, "off deg": error_deg}
         for name, stated in (("stated", (error_mm, error_deg)), ("not stated", USUAL)):
             poses = _off(true, (error_mm, error_deg), stated)
-            found, run_time_us = _psnr(model, frozen, poses, NOTHING)
-            row |= {f"over one tap, {name}": with_interval(found - alone, each), "run time us": round(run_time_us)}
-            if stated is USUAL:
-                windows, left_out = _guarded(model, frozen.windows(_WINDOW), poses)
-                done = infer(model, windows, known_pads(frozen, NOTHING), np.where(left_out[..., None], 0, poses))
-                found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
-                row |= {
-                    "over one tap, not stated, guarded": with_interval(found - alone, each),
-                    "left out %": round(100 * float(left_out[:, 1:].mean()), 1),
-                }
+            windows, left_out = _guarded(model, frozen.windows(_WINDOW), poses)
+            done = infer(model, windows, known_pads(frozen, NOTHING), np.where(left_out[..., None], 0, poses))
+            found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
+            row[f"over one tap, {name}"] = with_interval(found - alone, each)
+            row[f"left out %, {name}"] = round(100 * float(left_out[:, 1:].mean()), 1)
         rows.append(row)
     return rows
 

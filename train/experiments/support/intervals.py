@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import FrozenSet
 from train.errors import CheckpointError
 from train.learning.checkpoint import infer
-from train.learning.interval_calibration import LEVEL, half_width_mm
+from train.learning.interval_fit import LEVEL, half_width_mm
 from train.networks.blocks import PatternNet
 from train.report import Row, with_interval
 

@@ -52,7 +52,6 @@ class Workbench:
         checkpoints: trained networks, by name.
         quick: everything tiny, to check that it runs.
         models: folder of the shipped models.
-        before: file of a model of an earlier release, to be compared with.
         used: files of models and frozen sets that the experiments of this run have used.
     """
 
@@ -60,7 +59,6 @@ class Workbench:
     checkpoints: Path = Path("checkpoints")
     quick: bool = False
     models: Path = BUNDLE_DIR
-    before: Path | None = None
     used: set[Path] = field(default_factory=set)
 
     def use(self, path: Path) -> Path:

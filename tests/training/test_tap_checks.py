@@ -10,8 +10,8 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
 from train.data.posed_batches import stated_poses
 from train.data.presses import PressSet
-from train.learning import posed_tap_check
-from train.learning.posed_tap_check import features, fit_posed_tap_network, relative
+from train.learning import tap_checks
+from train.learning.tap_checks import fit_posed_tap_network, posed_pair_features, posed_tap_check, relative
 
 TAPS = 4
 WIDE_MM = 4.0
@@ -50,13 +50,13 @@ def network():
 
 def shares_caught(network, presses, spoil):
     """Return the share of earlier taps that a check at a share of false alarms catches, after `spoil` of a pair."""
-    check = posed_tap_check.posed_tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
+    check = posed_tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
     rng = np.random.default_rng(5)
-    readings, poses = posed_tap_check._strong(rng, presses, 5, mirror=False)
+    readings, poses = tap_checks._strong(rng, presses, 5, mirror=False)
     pose = poses[:, 1]
     stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), (0.2, 1.0))
     pair, stated = spoil(readings[:, :2], stated)
-    return float((np.array(network(features(pair, stated))) > check.limit).mean())
+    return float((np.array(network(posed_pair_features(pair, stated))) > check.limit).mean())
 
 
 def test_right_taps_are_seldom_dropped_and_wrong_ones_mostly(network):
@@ -75,11 +75,11 @@ def test_the_limit_is_the_score_that_the_share_of_false_alarms_exceeds(network):
     presses = bumps(200, 4)
     shares = []
     for wanted in (0.02, 0.2):
-        check = posed_tap_check.posed_tap_check(network, presses, wanted, seed=6)
+        check = posed_tap_check(network, presses, wanted, seed=6)
         rng = np.random.default_rng([6, 8])
-        readings, poses = posed_tap_check._strong(rng, presses, 6, mirror=False)
+        readings, poses = tap_checks._strong(rng, presses, 6, mirror=False)
         rows = [
-            features(
+            posed_pair_features(
                 readings[:, [0, earlier]],
                 stated_poses(rng, np.stack([0 * poses[:, earlier], poses[:, earlier]], 1), (0.2, 1.0)),
             )

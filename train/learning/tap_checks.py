@@ -1,28 +1,33 @@
-"""Check that separates earlier taps with their poses from taps of another contact, and from taps at another pose."""
+"""Checks that separate earlier taps of a contact from taps of another one or at another pose, with poses or without."""
 
-from itertools import permutations
+from dataclasses import replace
+from itertools import combinations, permutations
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.familiarity import Check, pair_width, pose_tap_features
+from edge.inference.familiarity import Check, pair_width, pose_tap_features, tap_features
 from edge.inference.small_network import SmallNetwork
 from edge.perception.pattern_check import LEAST_COUNTS
 from train.data.batches import COUNTS_PER_UNIT
 from train.data.posed_batches import stated_poses
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.learning.contact_check import limit_of
-from train.learning.small_classifier import fit_classifier
+from train.learning.contact_check import fit_classifier, limit_of, moved
 from train.physics.sensor_noise import Nuisances
 
-_ROUNDS: Final = 3
+_ROUNDS: Final = 4
+"""Readings of each sequence, and of its mirror image, each by another sensor."""
+_WEIGHT_DECAY: Final = 0.3
+"""So much, because sequences of several taps are few: with a hundredth of it limits rose to seven and more."""
+_DEPTHS: Final = (0.85, 1.15)
+_POSED_ROUNDS: Final = 3
 """Readings of each sequence, each by another sensor, and half of them of mirror images."""
 _PAIRS: Final = 6
 """Pairs of taps of each reading of a sequence."""
 _WIDTHS: Final = (192, 96)
-_WEIGHT_DECAY: Final = 0.1
+_POSED_WEIGHT_DECAY: Final = 0.1
 _OFF_MM: Final = (1.5, 6.0)
 _OFF_DEG: Final = (10.0, 90.0)
 """Bounds of the errors of a pose that is wrong, or a tap that is there although the pad did not move."""
@@ -32,6 +37,66 @@ _USUAL: Final = (0.2, 1.0)
 _UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 _MIRROR: Final = np.array([-1, 1, -1], dtype=np.float32)
 _FLIPPED: Final = np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
+
+
+def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
+    """Fit the network to taps turned as the schedule states, and to others.
+
+    Args:
+        presses: sequences of several taps.
+        seed: of nuisances, draws and weights.
+        steps: of the optimizer.
+    """
+    rng = np.random.default_rng([seed, 5])
+    both = presses, seen_in_a_mirror(presses)
+    right, wrong = [], []
+    for number in range(2 * _ROUNDS):
+        # Turns keep the direction of the schedule, mirror images alone would not.
+        windows = moved(rng, read_twice(both[number % 2], seed + number), mirror=False)
+        taps = presses.taps
+        for newest, earlier in combinations(range(taps), 2):
+            pair, claimed = (windows[:, newest], windows[:, earlier]), earlier - newest
+            right.append(pair_features(*pair, claimed))
+            wrong.append(pair_features(pair[0], pair[1][rng.permutation(len(windows))], claimed))
+            wrong.append(pair_features(pair[1], pair[0], claimed))  # turned back
+        for claimed in range(1, taps):
+            wrong.append(pair_features(windows[:, 0], windows[:, taps], claimed))  # not turned
+        for claimed, true in permutations(range(1, taps), 2):
+            if abs(claimed - true) > 1 or claimed == 1:
+                wrong.append(pair_features(windows[:, 0], windows[:, true], claimed))
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
+
+
+def seen_in_a_mirror(presses: PressSet) -> PressSet:
+    """Return the readings of the sequences' mirror images, the last tap first: so they turn as the schedule does."""
+    signs = np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
+    counts = np.ascontiguousarray(presses.counts[:, ::-1, :, :, ::-1] * signs)
+    return replace(presses, counts=counts, angle_deg=-presses.angle_deg[:, ::-1])
+
+
+def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
+    """Return windows (n, K + 1, 3, rows, cols) in counts; the last tap is the newest again, at another depth.
+
+    Only sequences whose taps are all strong enough are kept.
+    """
+    depth = np.random.default_rng([seed, 6]).uniform(*_DEPTHS, (len(presses), 1, 1, 1)).astype(np.float32)
+    counts = np.concatenate([presses.counts, (presses.counts[:, 0] * depth)[:, None]], axis=1)
+    angles = np.concatenate([presses.angle_deg, presses.angle_deg[:, :1]], axis=1)
+    windows = read_presses(replace(presses, counts=counts, angle_deg=angles), Nuisances(), seed)
+    return windows[(windows[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS).all(axis=1)]
+
+
+def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
+    """Return the features (n, inputs) of pairs of taps, both (n, 3, rows, cols) in counts."""
+    pairs = np.stack([newest, earlier], axis=1) / _UNIT
+    return np.concatenate([tap_features(pair, (steps,)) for pair in pairs])
+
+
+def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+    """Return the check whose limit a share of the earlier taps of these presses exceeds."""
+    windows = read_twice(presses, seed)
+    rows = [pair_features(windows[:, 0], windows[:, steps], steps) for steps in range(1, presses.taps)]
+    return Check(network, limit_of(np.array(network(np.concatenate(rows))), false_alarms))
 
 
 def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
@@ -44,7 +109,7 @@ def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetw
     """
     rng = np.random.default_rng([seed, 7])
     right, wrong = [], []
-    for number in range(_ROUNDS):
+    for number in range(_POSED_ROUNDS):
         readings, poses = _strong(rng, presses, seed + number, mirror=number % 2 == 1)
         for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:_PAIRS]:
             there = readings[:, [newest, earlier]].any(axis=(2, 3, 4)).min(axis=1)
@@ -53,9 +118,9 @@ def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetw
             stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1))
             # What is astray in the network's training is wrong here.
             near = _near(stated[:, 1], pose)
-            right.append(features(pair[near], stated[near]))
-            wrong += [features(*one) for one in _wrong(rng, pair, pose, stated)]
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
+            right.append(posed_pair_features(pair[near], stated[near]))
+            wrong += [posed_pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _POSED_WEIGHT_DECAY)
 
 
 def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
@@ -66,11 +131,11 @@ def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: floa
     for earlier in range(1, presses.taps):
         there = readings[:, earlier].any(axis=(1, 2, 3))
         pair, pose = readings[there][:, [0, earlier]], poses[there][:, earlier]
-        rows.append(features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
+        rows.append(posed_pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
     return Check(network, limit_of(np.array(network(np.concatenate(rows))), false_alarms))
 
 
-def features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
+def posed_pair_features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps (n, 2, 3, rows, cols) in counts, with poses (n, 2, 5)."""
     rows = [pose_tap_features(*one) for one in zip(pairs / _UNIT, poses, strict=True)]
     return (
@@ -121,7 +186,7 @@ def _wrong(
     shifted[:, 1, 0] += np.where(which[:, 0], far_mm * np.cos(way), 0)
     shifted[:, 1, 1] += np.where(which[:, 0], far_mm * np.sin(way), 0)
     shifted[:, 1, 2] += np.where(which[:, 1], far_deg * sign, 0)
-    depth = rng.uniform(0.85, 1.15, (len(pair), 1, 1, 1)).astype(np.float32)
+    depth = rng.uniform(*_DEPTHS, (len(pair), 1, 1, 1)).astype(np.float32)
     moved = (np.hypot(*pose[:, :2].T) > np.maximum(_OFF_MM[0], _FAR * stated[:, 1, 3])) | (
         np.abs(pose[:, 2]) > np.maximum(_OFF_DEG[0], _FAR * stated[:, 1, 4])
     )

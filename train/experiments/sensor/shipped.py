@@ -13,10 +13,12 @@ from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses
+from train.experiments.support.workbench import Figures
+from train.report import Row, with_interval
 
-NOTHING, FORCE, PAD, ALL = KNOWN = ("nothing", "counts per newton", "pad", "pad and gains")
-"""Levels of knowledge about a sensor: nothing, one constant of its pad, all constants, and these with taxel gains."""
-SHORT: Final = {NOTHING: "model", FORCE: "model, counts/N known", PAD: "model, pad known", ALL: "model, all known"}
+NOTHING, ALL = "nothing", "pad and gains"
+"""Levels of knowledge about a sensor: nothing, or all constants of its pad with the taxels' gains."""
+SHORT: Final = {NOTHING: "model", ALL: "model, all known"}
 """Names of the levels in tables."""
 
 
@@ -26,12 +28,12 @@ class Inferred:
 
     Attributes:
         patterns: (n, H, W) in [mm].
-        traction_kpa: (n, 3, h, w), or None if the model has no traction output.
+        deviations: (n, H, W) in [mm]; zeros if the model gives none.
         run_time_us: median of a window on one thread, scaling included, in [us].
     """
 
     patterns: NDArray[np.float32]
-    traction_kpa: NDArray[np.float32] | None
+    deviations: NDArray[np.float32]
     run_time_us: float
 
 
@@ -45,11 +47,8 @@ def load_shipped(folder: Path) -> ModelSession:
 
 
 def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:
-    """Return the constants of each press's sensor that a level of KNOWN provides."""
-    if known == NOTHING:
-        return [None] * len(frozen)
-    pads = [frozen.pad(index, gains=known == ALL) for index in range(len(frozen))]
-    return [Pad(counts_per_newton=pad.counts_per_newton) for pad in pads] if known == FORCE else [*pads]
+    """Return what a level of knowledge provides of each press's sensor."""
+    return [frozen.pad(index, gains=True) if known == ALL else None for index in range(len(frozen))]
 
 
 def infer(
@@ -67,7 +66,7 @@ def infer(
         poses: (n, taps, 5) of the taps, for a model that takes them; None for the paper's schedule.
     """
     contract = model.contract
-    patterns, tractions, times_s = [], [], []
+    patterns, deviations, times_s = [], [], []
     for number, (window, pad) in enumerate(zip(windows, pads, strict=True)):
         gains = None
         if contract.takes_gains and pad is not None and pad.gains is not None:
@@ -77,14 +76,20 @@ def infer(
         pattern = model.run(contract.scale_window(window, gains), row, None if poses is None else poses[number])
         times_s.append(time.perf_counter() - started_s)
         patterns.append(pattern.copy())
-        tractions.append(None if model.traction is None else model.traction.copy())
-    return Inferred(
-        np.stack(patterns),
-        None if any(one is None for one in tractions) else np.stack(tractions),
-        1e6 * float(np.median(times_s)),
-    )
+        deviations.append(np.zeros_like(pattern) if model.deviation is None else model.deviation.copy())
+    return Inferred(np.stack(patterns), np.stack(deviations), 1e6 * float(np.median(times_s)))
 
 
 def infer_presses(model: ModelSession, frozen: FrozenPresses, known: str) -> Inferred:
-    """Run a model on frozen presses with the constants that a level of KNOWN provides."""
+    """Run a model on frozen presses with what a level of knowledge provides."""
     return infer(model, frozen.windows(model.contract.taps), known_pads(frozen, known))
+
+
+def pattern_cells(figures: Figures, groups: NDArray[np.integer]) -> Row:
+    """Return errors of patterns as cells of a row, with the interval by group."""
+    return {
+        "PSNR dB": with_interval(figures["psnr_db"], groups),
+        "IoU": round(float(figures["contact_iou"].mean()), 3),
+        "edge mm": round(float(figures["boundary_mm"].mean()), 3),
+        "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
+    }

@@ -1,4 +1,4 @@
-"""Verdicts of the runtime on contacts of simulated sensors, and the rows of tables that they make."""
+"""Verdicts of the runtime on contacts: of sensors with a fault, and beside how far each pattern is off."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from edge.perception.contact_options import ON_COUNTS
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Model
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses
-from train.experiments.support.pushed import PushedSensor
+from train.experiments.sensor.pushed import PushedSensor
 from train.report import Row, bootstrap_interval
 
 AFTER: Final = (1, 3, 5, 10)
@@ -21,6 +21,9 @@ CONTACTS: Final = max(AFTER) + 1
 """Contacts of each sensor; the evidence of one is weighed when the next begins."""
 _OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
 """Reasons that a scan gives by itself."""
+RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
+"""RMS error of a pattern over the RMS of the truth: below the first it is right, above the others wrong and far off."""
+_LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +52,39 @@ class Verdicts:
         row: Row = {"contacts": len(self.sensor)}
         if not len(self.sensor):
             return row
-        row["too light"] = int((~self.checked).sum())
-        row["flagged %"] = share(self.flagged, self.sensor)
+        row |= {"too light": int((~self.checked).sum()), "flagged %": share(self.flagged, self.sensor)}
         row |= {f"{reason} %": round(100 * float((self.reason == reason).mean()), 1) for reason in _OWN[1:]}
         return row | {
             f"sensor, after {number} %": share(sensors) for number, sensors in self.suspected.items() if len(sensors)
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Contacts of n sensors, one each, which the runtime checked.
+
+    Attributes:
+        index: (n,) places among the presses.
+        off: (n,) RMS error of the pattern over the RMS of the truth.
+        believed: (n,).
+        light: (n,) summed z between the counts that end a contact and those that begin one.
+    """
+
+    index: NDArray[np.int64]
+    off: NDArray[np.float64]
+    believed: NDArray[np.bool_]
+    light: NDArray[np.bool_]
+
+    def cells(self, here: NDArray[np.bool_]) -> Row:
+        """Return the shares of those `here` (n,) that are not believed as cells of a row."""
+        right = ~self.believed[here & (self.off < RIGHT)]
+        row: Row = {"contacts": int(here.sum())}
+        row[f"of those < {RIGHT:.0%} off, not believed %"] = share(right) if len(right) else None
+        for least in (WRONG, FAR_OFF):
+            found = ~self.believed[here & (self.off > least)]
+            row[f"> {least:.0%} off"] = len(found)
+            row[f"> {least:.0%} off, not believed %"] = share(found) if len(found) else None
+        return row
 
 
 def share(hits: NDArray[np.bool_], groups: NDArray[np.integer] | None = None) -> str:
@@ -112,3 +142,20 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
         np.array([row[2] for row in rows], dtype=bool),
         {number: np.array(sensors) for number, sensors in suspected.items()},
     )
+
+
+def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
+    """Return the verdicts on the newest taps of presses, each of a sensor of its own, with what its file holds."""
+    truths = presses.patterns()
+    rows: list[tuple[int, float, bool, bool]] = []
+    for number, (counts, pad) in enumerate(zip(presses.presses.counts[:, 0], pads, strict=True)):
+        sum_z = float(counts[2].sum())
+        if sum_z < OFF_COUNTS:
+            continue
+        result = PushedSensor(model, pad, seed=number, options=_LIGHT).touch(counts)
+        if result.pattern is None or result.trusted is None:
+            continue
+        truth = truths[number]
+        off = float(np.sqrt(np.mean((result.pattern - truth) ** 2) / np.mean(truth**2)))
+        rows.append((number, off, result.trusted, sum_z < ON_COUNTS))
+    return Judged(*map(np.array, zip(*rows, strict=True)))

@@ -1,0 +1,123 @@
+"""Small networks as training leaves them, and their models, each made once in a run of the tests."""
+
+import fcntl
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import pytest
+import torch
+from press_samples import make_press_set
+
+from edge.evaluation.test_set import FrozenSet
+from edge.inference.contract import ANY_BATCH
+from export.graphs.intervals import IntervalData
+from export.to_onnx import export
+from train.data.frozen_presses import freeze_presses
+from train.data.presses import PressSet
+from train.learning import interval_fit
+from train.learning.checkpoint import Training, fit_network, load_network
+from train.learning.training_loop import Recipe
+from train.networks.blocks import PatternNet
+from train.networks.fusion import FusionNet
+from train.networks.registry import build
+from train.physics.pad_draws import KNOWN
+
+OPTIONS: Final = {"channels": 16, "blocks": 1, "known": KNOWN}
+PRESSES: Final = make_press_set(count=64, taps=2)
+TAPS: Final = 4
+POSED_PRESSES: Final = make_press_set(64, taps=TAPS)
+SURE: Final = Training("sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options=OPTIONS)
+FUSED: Final = Training("fused", "fusion-mtsr4", Recipe(3, batch=8, given=(0.25,) * TAPS), options=OPTIONS)
+
+
+def some_frames(taps: int = TAPS) -> FrozenSet:
+    """Return a few presses, which are not those of any training."""
+    return freeze_presses(make_press_set(24, taps=taps, seed=1), 1).as_frozen_set()
+
+
+def made_once(tmp_path_factory: pytest.TempPathFactory, make: Callable[[Path], object]) -> Path:
+    """Return a folder that `make` has filled once in this run, by whichever process of it came first."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if root.name.startswith("popen-") else root
+    folder = root / make.__name__
+    with (root / f"{make.__name__}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            draft = root / f"{make.__name__}.draft"
+            draft.mkdir()
+            make(draft)
+            draft.rename(folder)
+    return folder
+
+
+def small_models(folder: Path) -> None:
+    """Write sure.pt, sure.onnx with intervals, for any batch, and plain/sure.onnx without, for one window."""
+    fit_network(SURE, PRESSES, some_frames(), folder)
+    net, _ = load_network(folder / "sure.pt")
+    with torch.no_grad():
+        # The exporter folds weights of 0, and without a lift most patterns would be zero everywhere.
+        for weight in net.get_submodule("context").parameters():
+            torch.nn.init.normal_(weight, 0, 0.05)
+        net.get_parameter("leave.2.bias_free").add_(0.02)
+    torch.save(net.state_dict(), folder / "sure.pt")
+    (folder / "plain").mkdir()
+    export(folder / "sure.pt", folder / "plain", some_frames())
+    export_with_intervals(folder / "sure.pt", folder)
+
+
+def export_with_intervals(checkpoint: Path, folder: Path, calibration: PressSet | None = None) -> None:
+    """Write NAME.onnx, or NAME-int8.onnx, for any batch."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interval_fit, "_STEPS", 50)
+        export(
+            checkpoint,
+            folder,
+            some_frames(),
+            batch=ANY_BATCH,
+            validation=[some_frames(2)],
+            intervals=IntervalData(PRESSES, PRESSES),
+            calibration=calibration,
+        )
+
+
+def published_model(folder: Path) -> None:
+    """Write peer.onnx: a network with batch normalisation, of another scale than the frames'."""
+    torch.manual_seed(0)
+    net = build("srcnn", 2)
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.get_buffer("running_mean"), -1, 1)
+            torch.nn.init.uniform_(module.get_buffer("running_var"), 0.5, 2)
+    with torch.no_grad():
+        list(net.parameters())[-1].abs_()  # or no pattern would be above zero
+    save_checkpoint(folder / "peer.pt", net, "srcnn")
+    export(folder / "peer.pt", folder, some_frames())
+
+
+def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> Path:
+    """Write weights as they are, which is enough to be exported."""
+    torch.save(net.state_dict(), path)
+    report = {"network": name, "scale": net.scale, "options": options}
+    path.with_suffix(".json").write_text(json.dumps(report | {"contact_level": 0.5, "training_sha256": "ab" * 32}))
+    return path
+
+
+def posed_models(folder: Path) -> None:
+    """Write fused.onnx, which takes poses, and one.onnx, by which it infers single taps."""
+    validation = freeze_presses(POSED_PRESSES, 1).as_frozen_set()
+    fit_network(FUSED, POSED_PRESSES, validation, folder)
+    fit_network(Training("one", "compact-stsr", Recipe(3, batch=8), options=OPTIONS), POSED_PRESSES, validation, folder)
+    net, _ = load_network(folder / "fused.pt")
+    torch.manual_seed(0)
+    assert isinstance(net, FusionNet)
+    for part in (net.receive, net.revise):  # three steps are too few for earlier taps to matter
+        for free in part.parameters():
+            torch.nn.init.normal_(free, 0, 0.1)
+    torch.save(net.state_dict(), folder / "fused.pt")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interval_fit, "_STEPS", 50)
+        intervals = IntervalData(POSED_PRESSES, POSED_PRESSES)
+        for name in ("one", "fused"):
+            export(folder / f"{name}.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals, one_tap="one")
