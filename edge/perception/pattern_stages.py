@@ -10,8 +10,8 @@ from edge.inference.expected_error import expect
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
+from edge.perception.gain_following import SensorPad
 from edge.perception.pattern_check import SAME_STRENGTH, PatternCheck, strangers
-from edge.perception.sensor_pad import SensorPad
 from edge.perception.step import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch

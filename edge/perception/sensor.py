@@ -13,16 +13,14 @@ from edge.perception.change_gate import LastReading
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Note, Untimed, age_notes
-from edge.perception.gain_following import GainFollower, Learn
+from edge.perception.gain_following import GainFollower, Learn, SensorPad
 from edge.perception.gain_learning import ContactModel
-from edge.perception.health import Health
 from edge.perception.pattern_check import PatternCheck
 from edge.perception.pattern_stages import Check, Describe
-from edge.perception.sensor_pad import SensorPad
 from edge.perception.step import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
-from edge.perception.taxel_health import TaxelWatch
+from edge.perception.taxel_health import Health, TaxelWatch
 from edge.perception.zeroing import Zeroing
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.poses.pose_track import PoseTrack

@@ -40,9 +40,9 @@ class PosedRuntime(Runtime):
         self.seen.append(TimedPose(pose, time_ns, sensor, holds))
         return super().pose(pose, time_ns, sensor, holds=holds)
 
-    def take(self, scan):
+    def take(self, scan, clock_ns=None):
         self.seen.append(scan.time_ns)
-        return super().take(scan)
+        return super().take(scan, clock_ns)
 
 
 def make_scans(count=6):

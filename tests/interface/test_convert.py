@@ -235,7 +235,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     where = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
     with subprocess.Popen(command, cwd=tmp_path, env=where, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        while not list(tmp_path.glob(".new.mcap.*")) and process.poll() is None:
+        while not list(tmp_path.glob(".new.mcap.*/new.mcap")) and process.poll() is None:
             pass
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)

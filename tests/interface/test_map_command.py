@@ -74,7 +74,7 @@ def test_what_cannot_become_a_map_is_refused_before_anything_is_opened(files, tm
 
 
 def test_a_recording_with_poses_becomes_a_map(files, tmp_path):
-    posed = tmp_path / "posed.npz"
+    posed = tmp_path / "posed.mcap"
     with start("record", posed, *base_options(files), "--source", f"replay:{files / 'taps.npz'}",
                stdin=subprocess.PIPE) as process:  # fmt: skip
         assert process.stdin is not None

@@ -13,10 +13,9 @@ from edge.cli import main as cli
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower, Learn
+from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower, Learn, SensorPad
 from edge.perception.gain_learning import BOUND, REMEMBERED, SOLVE_EVERY, ContactModel, GainLearner, load_contact_model
 from edge.perception.pattern_check import PatternCheck
-from edge.perception.sensor_pad import SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source

@@ -11,10 +11,10 @@ from mcap_samples import arrays_of
 from pose_samples import PosedModel, make_posed_contract
 
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.next_tap import TapAdvice, next_shift_mm
 from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
 from edge.perception.tap_tracker import TapPeak, TapState
+from edge.perception.taps import TapAdvice, next_shift_mm
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import open_sink
 from firmware_bridge.pad_geometry import USPA44

@@ -5,7 +5,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from edge_samples import make_contract, write_model
+from edge_samples import write_model
 from pose_samples import make_posed_contract, posed_pattern, write_posed_model
 
 from edge.errors import ModelError, WindowError
@@ -123,17 +123,12 @@ def test_arrays_are_kept_for_so_many_shapes_and_no_more(session):
     assert len(session._runs) == MOST_RUNS
 
 
-def test_the_keys_come_back_and_earlier_versions_lack_them():
+def test_the_keys_come_back():
     contract = make_posed_contract()
     metadata = contract.to_metadata()
     assert Contract.from_metadata(metadata) == contract
     assert contract.window_shape == ("any", "taps", 3, 4, 4)
     assert contract.input_shapes == {"window": ("any", "taps", 3, 4, 4), "poses": ("any", "taps", 5)}
-    for version in (4, 5, 6):
-        old = make_contract(version=version)
-        assert not {f"{KEY_PREFIX}takes_poses", f"{KEY_PREFIX}reach_mm"} & set(old.to_metadata())
-        again = Contract.from_metadata(old.to_metadata())
-        assert again == old and not again.takes_poses and again.window_shape == (1, 12, 4, 4)
 
 
 @pytest.mark.parametrize("reach_mm", [0, -1, None, "10", True])
