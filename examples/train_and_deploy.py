@@ -27,8 +27,8 @@ import torch
 
 from edge.api import BridgeError, EdgeError, NoDeviceError, Stream, load_model, open_runtime, open_source
 from export.to_onnx import main as export
+from train.data.make_presses import main as make_presses
 from train.fit import main as fit
-from train.generate import main as generate
 from train.networks.registry import build
 
 NETWORK = "compact-stsr"
@@ -47,7 +47,7 @@ def tried(mesh: Path) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         for name in ("first", "second"):  # the first one also loads what is loaded once
             start_s = time.monotonic()
-            taps(Path(folder) / f"{name}.npz", ["--mesh", str(mesh)], TRIED, 1)
+            taps(Path(folder) / f"{name}.npz", ["--families", "none", "--mesh", str(mesh)], TRIED, 1)
             seconds.append(time.monotonic() - start_s)
     press_s = min(seconds) / TRIED / len(os.sched_getaffinity(0))
     net, window, seconds = build(NETWORK, 10), torch.randn(BATCH, 3, 4, 4), []
@@ -71,10 +71,9 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
     """Train a model from a mesh, and return its file; each call is also a command of its own."""
     out.mkdir(parents=True, exist_ok=True)
     name, checkpoints = out.resolve().name, out / "checkpoints"
-    data = [taps(out / "object.npz", ["--mesh", str(mesh)], sequences, seed)]
+    data = [taps(out / "object.npz", ["--families", "none", "--mesh", str(mesh)], sequences, seed)]
     if figures > 0:
-        kinds = ["--glyphs", str(figures // 2), "--polygons", str(figures - figures // 2)]
-        data.append(taps(out / "figures.npz", kinds, figures, seed + 1))
+        data.append(taps(out / "figures.npz", ["--families", "glyph,polygon"], figures, seed + 1))
     # python -m train.fit ...
     network = ["--network", NETWORK, "--name", name, "--steps", str(steps), "--seed", str(seed)]
     fit([str(checkpoints), "--data", *data, *network])
@@ -85,10 +84,8 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
 
 
 def taps(out: Path, surfaces: list[str], count: int, seed: int) -> str:
-    """Simulate taps: python -m train.generate ..."""
-    code = generate(
-        [str(out), "--surfaces", "none", *surfaces, "--count", str(count), "--taps", "1", "--seed", str(seed)]
-    )
+    """Simulate taps: python -m train.data.make_presses ..."""
+    code = make_presses([str(out), *surfaces, "--count", str(count), "--seed", str(seed)])
     if code != 0:
         sys.exit(code)  # it has printed the reason
     return str(out)

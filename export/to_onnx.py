@@ -1,7 +1,7 @@
 """Checkpoints to ONNX: one file a model, fixed shapes, the contract inside, parity checked before it is written.
 
 python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr4.pt --out edge/models
-python -m export.to_onnx checkpoints/stsr.pt --int8 data/seen.npz data/figures.npz --out edge/models
+python -m export.to_onnx checkpoints/stsr.pt --int8 data/gripped.npz --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 
 With validation presses, deviations are corrected by region, so that their intervals hold; with --intervals, by window.
@@ -31,13 +31,11 @@ from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.data.batches import COUNTS_PER_UNIT
-from train.data.dataset import Sequences
-from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
+from train.data.paper_taps import paper_taps
 from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
-from train.freeze import held_out
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_fit import half_width_mm
@@ -107,7 +105,7 @@ def export(
     frozen: FrozenSet,
     geometry: SensorGeometry = USPA44,
     batch: int | str = 1,
-    calibration: Sequences | PressSet | None = None,
+    calibration: PressSet | None = None,
     *,
     every: bool = False,
     validation: Sequence[FrozenSet] = (),
@@ -232,10 +230,10 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-        taps = None if options.int8 is None else load_taps(options.int8)
+        taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
         trust = intervals = None
         if options.validation is None:
-            validation = confidence_sets(held_out("validation"), frozen.scale)
+            validation = confidence_sets(paper_taps("validation"), frozen.scale)
         else:
             presses = load_presses(options.validation)
             validation = [freeze_presses(presses, SEED).as_frozen_set()]

@@ -17,12 +17,14 @@ from shapely.geometry.base import BaseGeometry
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from train.data.dataset import between_frames
 from train.data.generation_config import SEED
+from train.data.paper_taps import between_frames, tap
+from train.families.catalogue import heights_of
+from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
 from train.physics.magnets import Magnet, dipole_mt
+from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
-from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor, Taps
 from train.physics.slides import FIGURE_MM, Slide, scaled, slide
 from train.surfaces.depth_image import Pose
 from train.surfaces.paper_figures import figure
@@ -75,12 +77,12 @@ def demo_recording() -> dict[str, NDArray]:
     is tapped meanwhile, and leaves; then the pad slides over a long letter. Arrays `option_...` are of taps that may
     take the place of those after the first.
     """
-    sensor = SimulatedSensor()
+    pad = GrippedPad(NOMINAL)
     angles_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1 - TAPS, 1)]
-    taps = _tap(sensor, [SURFACE] * TAPS, angles_deg)
+    taps = _tap(pad, [SURFACE] * TAPS, angles_deg)
     pressed = _read(taps, angles_deg)
     later_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1, TAPS + 1)]
-    later = _read(_tap(sensor, [FOREIGN, SURFACE, SURFACE, SURFACE], later_deg), later_deg)
+    later = _read(_tap(pad, [FOREIGN, SURFACE, SURFACE, SURFACE], later_deg), later_deg)
     magnet = _magnet()
     magnet[MAGNET_FRAMES + MAGNET_ALONE_FRAMES :][:TAP_FRAMES] += later[2]
     rng = np.random.default_rng([SEED, 2])
@@ -119,7 +121,7 @@ def demo_recording() -> dict[str, NDArray]:
         "tap_pose": np.array(tapped[:TAPS]),
         "scene": scene,
         **_poses(tapped, slid, begins),
-        **_options(sensor, rest),
+        **_options(pad, rest),
         "letter": letter,
         "letter_px_per_mm": np.array(LETTER_PX_PER_MM),
         "letter_centre_mm": np.array((0.0, LETTER_Y_MM)),
@@ -145,12 +147,12 @@ def _poses(tapped: Sequence[tuple[float, ...]], slid: Slide, begins: NDArray[np.
     }
 
 
-def _options(sensor: SimulatedSensor, rest: NDArray[np.float32]) -> dict[str, NDArray]:
+def _options(pad: GrippedPad, rest: NDArray[np.float32]) -> dict[str, NDArray]:
     """Return the taps that may be proposed; the pad is where the robot states, but for the usual error."""
     first = Pose(*position_mm(TEST_POSITION), ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
     wanted = [over_surface(first, float(x_mm), float(y_mm), 0.0) for x_mm, y_mm in OPTIONS_MM]
     poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted, Nuisances())
-    taps = sensor.tap([SURFACE] * len(poses), poses, FORCE_N)
+    taps = tap(pad, SURFACE, poses, FORCE_N)
     course = _course()[:-GAP_FRAMES]
     counts = between_frames(taps.counts, np.tile(course, (len(poses), 1)))
     tap_s = len(course) / RATE_HZ
@@ -178,12 +180,13 @@ def _slide() -> tuple[Slide, NDArray[np.bool_]]:
 
 def _unit_patterns(taps: Taps) -> NDArray[np.float16]:
     """Return the truth per indentation, (n, H, W)."""
-    fine = taps.patterns[:, 0] / taps.indentation_mm[:, -1, None, None]
-    return resample(fine, FINE_SCALE, SCALE).astype(np.float16)
+    return resample(taps.unit_patterns, FINE_SCALE, SCALE).astype(np.float16)
 
 
-def _tap(sensor: SimulatedSensor, surfaces: list[str], angles_deg: Sequence[float]) -> Taps:
-    return sensor.tap(surfaces, [Pose(*position_mm(TEST_POSITION), angle) for angle in angles_deg], FORCE_N)
+def _tap(pad: GrippedPad, surfaces: list[str], angles_deg: Sequence[float]) -> Taps:
+    poses = [Pose(*position_mm(TEST_POSITION), angle) for angle in angles_deg]
+    heights = [heights_of(surface, pose, pad) for surface, pose in zip(surfaces, poses, strict=True)]
+    return pad.tap(np.stack(heights), FORCE_N)
 
 
 def _course() -> NDArray[np.float64]:

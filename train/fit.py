@@ -2,7 +2,7 @@
 
     python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
-    python -m train.fit checkpoints --data data/seen.npz --network mtsr2 --start-from seed-stsr --steps 5000
+    python -m train.fit checkpoints --data data/nominal4.npz --network mtsr2 --start-from seed-stsr --steps 5000
 
 The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older taps
 and the pads' constants are dropped at random in training, so that a network works with fewer taps than it takes and
@@ -17,13 +17,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from train.data.dataset import Sequences
-from train.data.files import load_taps
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
-from train.data.presses import PressSet, load_presses
+from train.data.paper_taps import paper_taps
+from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
-from train.freeze import freeze, held_out
+from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
@@ -100,16 +99,16 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     started_s = time.monotonic()
     try:
-        data = load_taps(options.data)
+        data = join_presses([*map(load_presses, options.data)])
         validation = None if options.validation is None else load_presses(options.validation)
         if options.network is None:
-            if not isinstance(data, PressSet) or validation is None:
-                raise ValueError("the bundled networks are trained on presses: give --data and --validation such files")
+            if validation is None:
+                raise ValueError("the bundled networks are calibrated on presses: give --validation")
             fit_bundled(data, validation, options.folder, options.shorten)
         else:
-            training = _training(options, data)
+            training = _training(options)
             if validation is None:
-                frozen = freeze(held_out("validation"), Nuisances(), SEED, scale=training.scale)
+                frozen = freeze(paper_taps("validation"), Nuisances(), SEED, scale=training.scale)
             else:
                 frozen = freeze_presses(validation, SEED).as_frozen_set()
             _say(_line(fit_network(training, data, frozen, options.folder)))
@@ -121,7 +120,7 @@ def main(arguments: list[str] | None = None) -> None:
     leave_group()
 
 
-def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Training:
+def _training(options: argparse.Namespace) -> Training:
     *_, taps = options.network.rpartition("mtsr")
     recipe = Recipe(
         steps=options.steps,
@@ -139,7 +138,7 @@ def _training(options: argparse.Namespace, data: Sequences | PressSet) -> Traini
         options.scale,
         options.start_from,
         seed=options.seed,
-        options=_KNOWN if compact and isinstance(data, PressSet) else {},
+        options=_KNOWN if compact else {},
         keep=options.keep,
     )
 
@@ -152,9 +151,7 @@ def _name(network: str) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.fit", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="folder for the checkpoints")
-    parser.add_argument(
-        "--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses, or of train.generate"
-    )
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     parser.add_argument("--validation", type=Path, help="presses of the validation set, not used for training")
     parser.add_argument("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
     one = parser.add_argument_group("one network instead of the bundled ones")

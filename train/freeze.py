@@ -18,23 +18,18 @@ from numpy.typing import NDArray
 from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.perception.dead_taxel_fill import load_estimator
-from edge.terminal.progress_bar import tracked
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
-from train.data.batches import Draw, WindowBatches
 from train.data.contact_kinds import fit_kinds
-from train.data.dataset import Sequences, quarter_turns
-from train.data.files import load_taps
-from train.data.generation_config import SEED, Generation, solve_all
+from train.data.generation_config import SEED
+from train.data.paper_taps import PaperTaps, between_frames, paper_taps
 from train.data.press_batches import read_presses
-from train.data.presses import PressSet
+from train.data.presses import PressSet, join_presses, load_presses
 from train.demo import demo_recording
 from train.errors import TrainError
+from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances, apply_nuisances
-from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
-from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import MAX_TAPS, Split
 
 SCALE: Final = 10
 TEST_FORCE_N: Final = 5.0
@@ -44,36 +39,34 @@ FIRST_FRAME: Final = 6
 """Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
 
 
-def held_out(split: Split, surfaces: tuple[str, ...] = SURFACES, taps: int = MAX_TAPS) -> Sequences:
-    """Return the sequences of a held-out position, truth at x20: every surface at the four test angles."""
-    return solve_all(Generation(surfaces=surfaces, poses="paper", split=split, taps=taps, seed=SEED))
-
-
 def freeze(
-    sequences: Sequences, nuisances: Nuisances, seed: int, force_n: float = TEST_FORCE_N, scale: int = SCALE
+    sequences: PaperTaps, nuisances: Nuisances, seed: int, force_n: float = TEST_FORCE_N, scale: int = SCALE
 ) -> FrozenSet:
-    """Return the frames of flat sequences, with a different sensor for each sequence."""
+    """Return the frames of sequences of the paper's protocol, with a different sensor for each sequence."""
     flat = sequences.at_scale(scale)
     index = np.arange(len(flat))
     share = flat.share_at_force(index, force_n)
-    presses = flat.presses(index, share, FIRST_FRAME + FRAMES)
+    course = np.arange(1, FIRST_FRAME + FRAMES + 1) / (FIRST_FRAME + FRAMES)
+    every = share.reshape(-1, 1) * course
+    clean = between_frames(flat.counts.reshape(-1, *flat.counts.shape[2:]), every)
+    presses = clean.reshape(*share.shape, *clean.shape[1:])
     readings = apply_nuisances(presses, nuisances, seed, angle_deg=flat.poses[..., 2])
-    moments = share[:, :1] * np.arange(FIRST_FRAME + 1, FIRST_FRAME + FRAMES + 1) / (FIRST_FRAME + FRAMES)
+    moments = share[:, :1] * course[FIRST_FRAME:]
     return FrozenSet(
         newest=readings[:, 0, FIRST_FRAME:].reshape(-1, *readings.shape[3:]).astype(np.int16),
         earlier=readings[:, 1:, -1].astype(np.int16),
         tap=np.repeat(index, FRAMES).astype(np.int16),
-        indentation_mm=flat.indentation_at(index, moments).ravel(),
-        force_n=flat.force_at(index, moments).ravel(),
-        unit_patterns=flat.unit_patterns[:, 0],
-        touched=flat.touching[:, 0],
+        indentation_mm=(flat.indentation_mm[:, 0, -1:] * moments).ravel().astype(np.float32),
+        force_n=flat.force_at(index, moments).ravel().astype(np.float32),
+        unit_patterns=flat.unit_patterns.astype(np.float16),
+        touched=flat.touching,
         surface=flat.surfaces,
         angle_deg=flat.poses[:, 0, 2].astype(np.float32),
         full_scale_mm=MAX_INDENTATION_MM,
     )
 
 
-def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+def fit_classical(taps: PressSet, windows: int = CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Return the gains of bilinear and bicubic interpolation, in mm per count, and the linear map (48, pixels)."""
     newest, patterns = drawn(taps, windows)
     matrix = fit_linear_map(newest.reshape(len(newest), -1), patterns.reshape(len(patterns), -1))
@@ -84,25 +77,28 @@ def fit_classical(taps: PressSet | Sequences, windows: int = CLASSICAL_WINDOWS) 
     }
 
 
-def fit_taxels(taps: PressSet | Sequences, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
+def fit_taxels(taps: PressSet, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Return covariances (kinds, 48, 48) of healthy taxels' readings, all x first, with the pad in all four turns."""
-    newest, patterns = drawn(taps, windows)
-    turned = [quarter_turns(newest[:, None], patterns, turns)[0][:, 0] for turns in range(4)]
+    turned = [drawn(taps, windows)[0]]
+    while len(turned) < 4:
+        turned.append(quarter_turned(turned[-1]))
     return {"covariances": fit_kinds(np.concatenate(turned))}
 
 
-def drawn(taps: PressSet | Sequences, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def drawn(taps: PressSet, windows: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return readings (n, 3, rows, cols) of newest taps in zeroed counts, with a different sensor each, and patterns.
 
     No taxel is dead, because the fits are to learn the readings of healthy ones. Patterns are (n, H, W) in [mm].
     """
-    if isinstance(taps, PressSet):
-        index = np.random.default_rng(SEED).permutation(len(taps))[np.arange(windows) % len(taps)]
-        newest = taps.with_taps(1).pick(index)
-        return read_presses(newest, Nuisances(), SEED)[:, 0], newest.patterns.astype(np.float32)
-    batches = WindowBatches(taps.at_scale(SCALE), Draw(nuisances=Nuisances()), given=(1.0,), batch=100, seed=SEED)
-    parts = [batches.draw(number) for number in tracked(range(windows // 100), "reading", "batch")]
-    return np.concatenate([readings[:, 0] for readings, _ in parts]), np.concatenate([truth for _, truth in parts])
+    index = np.random.default_rng(SEED).permutation(len(taps))[np.arange(windows) % len(taps)]
+    newest = taps.with_taps(1).pick(index)
+    return read_presses(newest, Nuisances(), SEED)[:, 0], newest.patterns.astype(np.float32)
+
+
+def quarter_turned(readings: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the same contacts on a pad turned clockwise: maps (n, 3, rows, cols) turn, and the shear with them."""
+    x, y, z = np.moveaxis(np.rot90(readings, 1, axes=(-2, -1)), -3, 0)
+    return np.stack([y, -x, z], axis=-3)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -119,12 +115,12 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     folder: Path = options.folder
     try:
-        taps = load_taps(options.data)
+        taps = join_presses([*map(load_presses, options.data)])
     except TrainError as error:
         sys.exit(f"freeze: {error}")
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "frozen.npz").exists():
-        freeze(held_out("test"), Nuisances(), SEED).save(folder / "frozen.npz")
+        freeze(paper_taps("test"), Nuisances(), SEED).save(folder / "frozen.npz")
     frozen = load_frozen_set(folder / "frozen.npz")
     _save(folder / "classical.npz", fit_classical(taps), lambda draft: fitted_methods(draft, frozen.scale))
     grid = (USPA44.rows, USPA44.cols)

@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from firmware_bridge.in_place import write_in_place
-from train.data.files import load_taps
-from train.data.presses import PressSet
+from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
 from train.learning.forward_operator import fit_forward_model
@@ -59,9 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     try:
-        data = load_taps(options.data)
-        if not isinstance(data, PressSet):
-            raise DatasetError("files of train.generate, expected presses of train.data.make_presses")
+        data = join_presses([*map(load_presses, options.data)])
         text = json.dumps(fit_trust(data, options.seed, options.shorten)) + "\n"
         options.out.parent.mkdir(parents=True, exist_ok=True)
         write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))

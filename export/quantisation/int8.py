@@ -29,9 +29,7 @@ from export.errors import ExportError
 from export.graphs.joined import branches
 from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
 from firmware_bridge.pad_geometry import AXES
-from train.data.batch import Batch
-from train.data.batches import Draw
-from train.data.dataset import Sequences
+from train.data.batches import Batch
 from train.data.presses import PressSet
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
@@ -47,11 +45,9 @@ _WIDEST: Final = np.float32(1.3)
 MOST_VALUE: Final = 255
 _CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
-_SET_FORCE_N: Final = (0.3, 8.0)
-"""Force of the taps from which ranges are measured, in [N], so that light taps weigh as much as firm ones."""
 
 
-def calibration_batch(taps: Sequences | PressSet, contract: Contract) -> Batch:
+def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
     """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
     Raises:
@@ -64,8 +60,7 @@ def calibration_batch(taps: Sequences | PressSet, contract: Contract) -> Batch:
     if contract.takes_poses:  # its batches have one number of taps each: all, of which some are left out below
         given = (*[0.0] * (contract.taps - 1), 1.0)
     recipe = Recipe(1, batch=min(len(taps), _CALIBRATED_ON), given=given)
-    draw = Draw(set_force_n=_SET_FORCE_N)
-    batch = batches_of(taps, contract.scale, recipe, 0, draw, posed=contract.takes_poses)(0)
+    batch = batches_of(taps, contract.scale, recipe, 0, posed=contract.takes_poses)(0)
     if contract.takes_poses:
         there = torch.arange(contract.taps) <= torch.arange(len(batch.window))[:, None] % contract.taps
         batch = replace(batch, window=batch.window * there.repeat_interleave(len(AXES), dim=1)[:, :, None, None])

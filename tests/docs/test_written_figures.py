@@ -22,7 +22,7 @@ from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import save_baselines
-from train.data import dataset
+from train.data import presses
 
 FORMATS = (ROOT / "docs" / "formats.md").read_text()
 MEASURED = "reports/bench.md"
@@ -66,7 +66,7 @@ def test_keys_of_a_record(tmp_path):
 
 def test_keys_of_the_contract_and_of_datasets():
     assert {field.name for field in fields(Contract)} == told("The contract in a model")
-    assert set(dataset._AXES) == told("Datasets")
+    assert set(presses._AXES) == told("Datasets")
     stated = {one.key: one.value for one in onnx.load(find_model("stsr")).metadata_props}
     assert {f"{KEY_PREFIX}{name}" for name in told("The contract in a model")} <= set(stated)
 

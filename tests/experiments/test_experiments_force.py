@@ -6,8 +6,8 @@ from experiment_samples import quick_bench
 
 from train.errors import TrainError
 from train.experiments.paper import force
-from train.experiments.support.methods import Method, classical_methods
-from train.experiments.support.trainings import mixed
+from train.experiments.paper.methods import Method, classical_methods
+from train.experiments.paper.trainings import mixed
 
 
 @pytest.fixture(scope="module")

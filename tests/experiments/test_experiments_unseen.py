@@ -7,8 +7,8 @@ from experiment_samples import quick_bench
 from edge.evaluation.test_set import FrozenSet
 from train.errors import CheckpointError
 from train.experiments.paper import unseen
-from train.experiments.support.intervals import Intervals, intervals
-from train.experiments.support.trainings import FIGURES
+from train.experiments.paper.intervals import Intervals, intervals
+from train.experiments.paper.trainings import FIGURES
 from train.networks.registry import build
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from dataset_samples import make_sequences
-from export_samples import FUSED, POSED_PRESSES, TAPS, made_once, posed_models, some_frames
+from export_samples import POSED_PRESSES, TAPS, made_once, posed_models, some_frames
 
 from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
@@ -19,8 +18,6 @@ from export.graphs.reference import contract_in, network_of
 from export.quantisation.int8 import convolutions
 from export.to_onnx import export
 from export.verify import verify
-from train.errors import DatasetError
-from train.learning.checkpoint import fit_network
 from train.networks.fusion import OneOrMoreNet
 from train.physics.pad_draws import KNOWN
 from train.surfaces.tap_schedules import REACH_MM
@@ -135,7 +132,3 @@ def test_a_model_that_does_not_stand_for_a_single_tap_is_refused(folder):
     with pytest.raises(ExportError, match=r"two.onnx: No such file or directory: export the model for single taps"):
         export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, one_tap="two")
 
-
-def test_a_network_with_poses_is_not_trained_on_sequences_without(tmp_path):
-    with pytest.raises(DatasetError, match="a network that takes poses is trained on presses"):
-        fit_network(FUSED, make_sequences(taps=TAPS), some_frames(), tmp_path)

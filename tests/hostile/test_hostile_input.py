@@ -23,7 +23,7 @@ from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.npz_reader import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
-from train.data.dataset import load_sequences
+from train.data.presses import load_presses
 from train.errors import CheckpointError, DatasetError
 from train.learning.checkpoint import load_network
 
@@ -54,7 +54,7 @@ class TestPickles:
     def readers(self):
         yield "finger.npz", load_recording, RecordingError
         yield "frozen.npz", load_frozen_set, EdgeError
-        yield "taps.npz", load_sequences, DatasetError
+        yield "presses.npz", load_presses, DatasetError
 
     @pytest.mark.parametrize("how", ["pickle", "array of objects", "npy"])
     def test_no_reader_of_arrays_runs_what_is_pickled(self, tmp_path, how):

@@ -220,7 +220,7 @@ def test_the_second_wheel_adds_models_and_bench(both, tmp_path):
     assert any(line.startswith("stsr ") for line in listed)
     assert "--sensors" in run([str(both / "edge-sr"), "bench", "--help"])
     done = subprocess.run(
-        [str(both / "python"), "-m", "train.generate", "x.npz"],
+        [str(both / "python"), "-m", "train.data.make_presses", "x.npz"],
         cwd=tmp_path,
         env=without_checkout(),
         capture_output=True,

@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+from press_samples import make_press_set
 
 from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
@@ -10,19 +11,23 @@ from edge.inference.bundled import BUNDLE_DIR
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
 from train.data.contact_kinds import KINDS, fit_kinds
-from train.data.dataset import Sequences
-from train.data.generation_config import SEED, Generation, solve_all
+from train.data.generation_config import SEED
+from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.world import World, solve_pad
 from train.demo import demo_recording
-from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, held_out, main
+from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, main
+from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances
-from train.physics.simulated_sensor import FRAMES, MAX_INDENTATION_MM
 from train.surfaces.tap_schedules import HALF_PITCH_MM
 
 
 @pytest.fixture(scope="module")
-def sequences() -> Sequences:
-    return held_out("test", ("O", "small circle"), taps=3)
+def sequences() -> PaperTaps:
+    return paper_taps("test", ("O", "small circle"), taps=3)
+
+
+def figures_alone(count: int) -> World:
+    return World(count=count, per_pad=count, families={"O": 1.0, "small circle": 1.0}, spread=0.0, seed=9)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +75,7 @@ def test_another_scale_is_the_same_tap(sequences, frozen):
 
 
 def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
-    data = solve_all(Generation(surfaces=("O", "small circle"), count=96, taps=1, seed=9))
+    data = solve_pad(figures_alone(96), 0)
     np.savez(tmp_path / "classical.npz", allow_pickle=False, **fit_classical(data, windows=2000))
     methods = fitted_methods(tmp_path / "classical.npz", frozen.scale)
     newest = frozen.newest.astype(np.float32)
@@ -114,7 +119,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
 
 def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeypatch, frozen):
     bundled = {name: dict(np.load(BUNDLE_DIR / f"{name}.npz")) for name in ("classical", "taxels", "demo")}
-    made = {"load_taps": None, "freeze": frozen, "demo_recording": bundled["demo"]}
+    made = {"load_presses": make_press_set(4), "freeze": frozen, "demo_recording": bundled["demo"]}
     made |= {"fit_classical": bundled["classical"], "fit_taxels": bundled["taxels"]}
     for name, value in made.items():
         monkeypatch.setattr(f"train.freeze.{name}", lambda *_, value=value: value)
@@ -162,12 +167,13 @@ def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
     np.testing.assert_allclose(sorted(angles, reverse=True), np.eye(2), atol=0.15)
 
 
-def test_taxels_covary_as_their_readings_do(sequences):
-    covariances = fit_taxels(sequences, windows=400)["covariances"]
+def test_taxels_covary_as_their_readings_do():
+    presses = solve_pad(figures_alone(48), 0)
+    covariances = fit_taxels(presses, windows=400)["covariances"]
     assert covariances.shape == (KINDS, 48, 48) and covariances.dtype == np.float32
     np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-4, atol=1e-6)
     # The press is in z, and of one strength in all of them.
     traces = np.trace(covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, 48, rtol=0.01)
     assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.7 * traces).all()
-    np.testing.assert_array_equal(covariances, fit_taxels(sequences, windows=400)["covariances"])
+    np.testing.assert_array_equal(covariances, fit_taxels(presses, windows=400)["covariances"])

@@ -5,15 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from edge.evaluation.metrics import contact_iou
 from firmware_bridge.pad_geometry import USPA44
 from train.families.shape import NOWHERE_MM
 from train.physics.covers import BARE, Cover
 from train.physics.elastic_layer import surface_compliance
-from train.physics.gripped import MOST_FORCE_N, SAMPLES, SCALE, TRACTION_SCALE, GrippedPad, PressError
+from train.physics.gripped import (
+    FINE_SCALE,
+    FRAMES,
+    MAX_INDENTATION_MM,
+    MOST_FORCE_N,
+    SAMPLES,
+    SCALE,
+    TRACTION_SCALE,
+    GrippedPad,
+    PressError,
+)
 from train.physics.pad_draws import NOMINAL
-from train.physics.resample import resample
-from train.physics.simulated_sensor import FINE_SCALE, SimulatedSensor
+from train.physics.resample import resample, resample_touching
 from train.surfaces.depth_image import Pose, Relief, footprints
 from train.surfaces.named_surfaces import surface_mesh
 
@@ -101,21 +109,23 @@ def test_what_is_dragged_holds_with_the_pressure_times_friction_at_most(pad):
 
 
 @pytest.mark.parametrize("name", ["C", "small square", "O"])
-def test_a_rigid_figure_gives_what_a_flat_tap_gives(pad, name):
+def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
     pose = Pose(1.0, -0.5, 30.0)
-    tap = SimulatedSensor().tap([name], [pose], 5.0)
-    depth_mm = float(tap.indentation_mm[0, -1])
-    done = press(pad, figure(pad, name, pose), depth_mm)
-    # The same solver, cells and skin; measured 1.5e-6.
-    assert np.abs(done.counts[0] - tap.counts[0, -1]).max() < 1e-4 * np.abs(tap.counts[0, -1]).max()
-    assert done.force_n[0, 2] == pytest.approx(tap.force_n[0, -1], rel=1e-4)
-    # Truth is made of places a quarter of a cell apart here, of the outline there. Measured over 30 figures: RMS
-    # .015 in the mean and .026 at most, volume within .7 %.
-    true = resample(tap.patterns[:, 0], FINE_SCALE, SCALE)
-    assert np.sqrt(np.mean((done.patterns - true) ** 2)) < 0.03 * depth_mm
-    assert abs(done.patterns.sum() / true.sum() - 1) < 0.01
-    touched = resample(tap.touching[:, 0], FINE_SCALE, SCALE) >= 0.5
-    assert contact_iou(done.touching.astype(np.float32), touched, 0.5)[0] > 0.93
+    heights = figure(pad, name, pose)
+    tap = pad.tap(heights, 5.0)
+    assert tap.indentation_mm[0] == pytest.approx(tap.indentation_mm[0, -1] * np.arange(1, FRAMES + 1) / FRAMES)
+    reached = tap.force_n[0, -1] == pytest.approx(5.0, rel=1e-3)
+    assert reached or tap.indentation_mm[0, -1] == pytest.approx(MAX_INDENTATION_MM)
+    for frame in (4, -1):
+        depth_mm = float(tap.indentation_mm[0, frame])
+        done = press(pad, heights, depth_mm)
+        assert np.abs(done.counts[0] - tap.counts[0, frame]).max() < 1e-3 * np.abs(tap.counts[0, -1]).max()
+        assert done.force_n[0, 2] == pytest.approx(tap.force_n[0, frame], rel=1e-4)
+        true = resample(tap.unit_patterns, FINE_SCALE, SCALE) * depth_mm
+        assert np.abs(done.patterns - true).max() < 1e-3 * depth_mm
+        assert np.array_equal(done.touching, resample_touching(tap.touching, FINE_SCALE, SCALE))
+    fine = press(pad, heights, 0.2, scale=FINE_SCALE)
+    assert fine.patterns.shape == tap.unit_patterns.shape and np.array_equal(fine.touching, tap.touching)
 
 
 @pytest.mark.parametrize("cover", [Cover(soft_mpa=1e6), Cover(cloth_mm=1e-6, cloth_mpa=1e6)])

@@ -10,7 +10,7 @@ import pytest
 import torch
 from edge_samples import ROOT
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 from train.learning import training_loop as loop
 from train.learning.training_loop import (
     DivergedError,

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
 from train.networks.losses import relative_rms_error
 

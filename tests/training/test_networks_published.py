@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 from train.networks.cost import macs, parameters_count
 from train.networks.losses import relative_error
 from train.networks.published import SeedNet, SrganObjective

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from train.data.dataset import turns_of
 
 from edge import api
 from edge.evaluation.test_set import FrozenSet
@@ -11,15 +12,14 @@ from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44, USPA46
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.zeroing.baseline import Baseline
-from train.data.dataset import turns_of
 from train.data.generation_config import Generation, solve_all
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
+from train.physics.gripped import SimulatedSensor
 from train.physics.sensor_noise import Nuisances
-from train.physics.simulated_sensor import SimulatedSensor
 from train.physics.taxel_response import on_pad
 from train.surfaces.depth_image import Pose
 

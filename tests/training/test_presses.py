@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from press_samples import make_press_set
 
-from train.data.files import load_taps
 from train.data.presses import join_presses, load_presses
 from train.errors import DatasetError
 from train.learning.checkpoint import batches_of
@@ -107,27 +106,15 @@ def test_sets_are_joined_with_their_pads_apart():
         join_presses([])
 
 
-def test_files_of_two_kinds_do_not_mix(tmp_path):
-    from dataset_samples import make_sequences
-
-    make_press_set(taps=1).save(tmp_path / "presses.npz")
-    make_press_set(taps=2).save(tmp_path / "more.npz")
-    make_sequences(count=3).save(tmp_path / "taps.npz")
-    presses, more, taps = (tmp_path / f"{name}.npz" for name in ("presses", "more", "taps"))
-    assert len(load_taps([presses, more])) == 24
-    assert load_taps([taps]).seed == 0
-    with pytest.raises(DatasetError, match=r"taps\.npz: made by train\.generate, the others are presses"):
-        load_taps([presses, taps])
-
-
 def test_only_sequences_with_all_taps_are_trained_on_and_none_is_said():
     joined = join_presses([make_press_set(taps=1), make_press_set(count=6, taps=2, seed=1)])
     batch = batches_of(joined, 10, Recipe(1, batch=64, given=(0.0, 1.0)), seed=0)(0)
     assert len(batch.window) == 6 and (batch.window[:, 3:].abs().amax(dim=(1, 2, 3)) > 0).all()
     with pytest.raises(DatasetError, match="no sequences of 3 taps: make some with"):
         batches_of(joined, 10, Recipe(1, given=(0.5, 0.0, 0.5)), seed=0)
-    with pytest.raises(DatasetError, match="patterns at x8 asked for, presses have them at x10"):
+    with pytest.raises(DatasetError, match="patterns at x8 asked for, these presses have them at x10"):
         batches_of(joined, 8, Recipe(1), seed=0)
+    assert batches_of(joined.at_scale(8), 8, Recipe(1, batch=4), seed=0)(0).pattern.shape == (4, 32, 32)
 
 
 def test_the_file_is_a_plain_npz(tmp_path):

@@ -18,9 +18,9 @@ from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet, load_presses
 from train.errors import TrainError
+from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.pad_draws import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
 """Frozen set of every family on pads of its own; nothing is selected by it."""

@@ -26,6 +26,7 @@ from train.data.workers import quiet_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
+from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.tap_schedules import SCHEDULES
 
@@ -129,6 +130,7 @@ def _world(options: argparse.Namespace) -> World:
         families=families,
         spread=options.spread,
         seed=options.seed,
+        scale=options.scale,
     )
 
 
@@ -140,7 +142,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--count", type=int, default=24_000, help="number of sequences (24000)")
     parser.add_argument("--taps", type=int, default=1, help="presses in each sequence (1)")
     parser.add_argument(
-        "--schedule", default="mixed", help=f"poses of a sequence's presses: {', '.join(SCHEDULES)} (mixed)"
+        "--schedule",
+        default="mixed",
+        help=f"poses of a sequence's presses: {', '.join(SCHEDULES)}, or turns:DEGREES (mixed)",
     )
     parser.add_argument(
         "--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)"
@@ -149,7 +153,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--families",
         default="all",
-        help=f"all; even (equally many of each); figures; none; or names with commas: {', '.join(SHARES)} (all)",
+        help=f"all; even (equally many of each); figures; none; or names with commas: {', '.join(SHARES)}, or of "
+        "figures of the paper (all)",
     )
     parser.add_argument(
         "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
@@ -162,6 +167,7 @@ def _parser() -> argparse.ArgumentParser:
         "--spread", type=float, default=1.0, help="spread of the pads' constants; 0: the nominal pad (1)"
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
+    parser.add_argument("--scale", type=int, default=SCALE, help=f"pattern pixels per taxel pitch ({SCALE})")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
     parser.add_argument("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.data.batch import Batch
-from train.data.batches import network_input
+from train.data.batches import Batch, network_input
 from train.data.press_batches import known_of_pads, read_by_many
 from train.data.presses import PressSet
 from train.errors import DatasetError

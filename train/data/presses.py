@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from firmware_bridge.recording.npz_reader import read_npz
 from train.data.array_file import MOST_FACTS_BYTES, Axes, arrays_sha256, check_axes, write_arrays
 from train.errors import DatasetError
+from train.physics.resample import resample, resample_touching
 
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
@@ -78,6 +79,11 @@ class PressSet:
         """Number of presses in a sequence, K."""
         return self.counts.shape[1]
 
+    @property
+    def scale(self) -> int:
+        """Pattern pixels per taxel pitch."""
+        return self.patterns.shape[-1] // self.counts.shape[-1]
+
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PressSet":
         """Return the sequences at the indices."""
         return replace(self, **{name: getattr(self, name)[index] for name in _AXES})
@@ -91,6 +97,16 @@ class PressSet:
             counts=counts,
             angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]),
             poses=np.pad(self.poses[:, :taps], [(0, 0), (0, more), (0, 0)]),
+        )
+
+    def at_scale(self, scale: int) -> "PressSet":
+        """Return the sequences with the truth at another scale, in pattern pixels per taxel pitch."""
+        if scale == self.scale:
+            return self
+        return replace(
+            self,
+            patterns=resample(self.patterns, self.scale, scale).astype(np.float16),
+            touching=resample_touching(self.touching, self.scale, scale),
         )
 
     def only_turned(self) -> "PressSet":

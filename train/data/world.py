@@ -12,12 +12,12 @@ from train.data.generation_config import mesh_sha256, one_thread
 from train.data.presses import VERSION, PressSet, join_presses
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
-from train.physics.gripped import GrippedPad
+from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
 from train.surfaces.meshes import MESH
-from train.surfaces.named_surfaces import surface_mesh
+from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS
-from train.surfaces.tap_schedules import SCHEDULES
+from train.surfaces.tap_schedules import schedule_of
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
@@ -43,12 +43,13 @@ class World:
         count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out, or drawn again
             where they are of a user's mesh.
         taps: presses in each sequence.
-        schedule: of the taps' poses, one of train.surfaces.tap_schedules.SCHEDULES.
+        schedule: of the taps' poses, see train.surfaces.tap_schedules.schedule_of.
         begun: share of sequences whose newest tap has only begun, while the earlier ones are as at their ends.
         per_pad: sequences of one pad.
-        families: relative frequency of each family.
+        families: relative frequency of each family, or figure of the paper.
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
         seed: of all draws.
+        scale: pattern pixels per taxel pitch.
     """
 
     count: int = 24_000
@@ -59,6 +60,7 @@ class World:
     families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
     spread: float = 1.0
     seed: int = 1
+    scale: int = SCALE
 
     def __post_init__(self) -> None:
         for name in ("count", "taps", "per_pad"):
@@ -66,14 +68,19 @@ class World:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 1 or more")
         if self.taps > MAX_TAPS:
             raise DatasetError(f"taps is {self.taps}, expected 1 to {MAX_TAPS}")
-        if self.schedule not in SCHEDULES:
-            raise DatasetError(f"no schedule {self.schedule!r}: expected one of {', '.join(SCHEDULES)}")
+        try:
+            schedule_of(self.schedule)
+        except ValueError as error:
+            raise DatasetError(str(error)) from error
+        if not 1 <= self.scale <= FINE_SCALE:
+            raise DatasetError(f"scale is {self.scale}, expected 1 to {FINE_SCALE}")
         for name in ("spread", "begun"):
             if not 0 <= getattr(self, name) <= 1:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 0 to 1")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
-        unknown = [name for name in self.families if name not in SHARES and not name.startswith(MESH)]
+        known = {*SHARES, *SURFACES}
+        unknown = [name for name in self.families if name not in known and not name.startswith(MESH)]
         if unknown or not self.families:
             named = ", ".join(map(repr, unknown)) if unknown else "named"
             raise DatasetError(f"no family {named}: expected some of {', '.join(SHARES)}, or a mesh")
@@ -98,6 +105,8 @@ class World:
             "inputs": list(INPUTS),
             "version": VERSION,
         }
+        if self.scale == SCALE:
+            del facts["scale"]  # what was made before there was a choice keeps its name
         meshes = {name: mesh_sha256(name) for name in self.families if name.startswith(MESH)}
         return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
 
@@ -114,11 +123,11 @@ def solve_pad(world: World, number: int) -> PressSet:
     order = np.random.default_rng([world.seed, 0, 1]).permutation(world.count)[number * world.per_pad :][:count]
     at = (order + 0.5) / world.count
     family = np.array(list(world.families))[np.searchsorted(np.cumsum(shares / shares.sum()), at)]
-    schedule = SCHEDULES[world.schedule]
+    schedule = schedule_of(world.schedule)
     kept: list[PressSet] = []
     for _ in range(MOST_DRAWS):
         tapped = [draw_shape(rng, str(name), gripped, schedule(rng, world.taps)) for name in family]
-        made = press_shapes(rng, gripped, family, tapped, number, world.begun)
+        made = press_shapes(rng, gripped, family, tapped, number, world.begun, world.scale)
         right = (made.force_n[:, 2] > LEAST_FORCE_N) & made.touching.any(axis=(1, 2))
         kept.append(made.pick(right))
         family = family[~right & np.char.startswith(family, MESH)]
@@ -135,6 +144,7 @@ def press_shapes(
     tapped: list[Tapped],
     number: int,
     begun: float = 0.0,
+    scale: int = SCALE,
 ) -> PressSet:
     """Press shapes onto pad `number` with drawn depths, drags and friction; light presses are kept.
 
@@ -158,6 +168,7 @@ def press_shapes(
         twist,
         rng.uniform(*_FRICTION, n * taps),
         [one.cover for one in tapped for _ in range(taps)],
+        scale=scale,
     )
     newest = slice(0, None, taps)
     return PressSet(

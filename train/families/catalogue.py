@@ -13,7 +13,7 @@ from train.families import faces, rounds, solids
 from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.depth_image import Relief, footprints
+from train.surfaces.depth_image import Pose, Relief, footprints
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import over_surface, random_targets
@@ -80,7 +80,7 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
 
     Args:
         rng: draws the shape and where it lies.
-        family: a key of SHARES, or `mesh:PATH`, a user's surface.
+        family: a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
         pad: the pad that taps.
         poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
 
@@ -88,7 +88,7 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
         SurfaceError: nothing of a user's mesh lies under the pad.
         MeshError: the user's mesh cannot be used.
     """
-    if family in FIGURES or family.startswith(MESH):
+    if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
     if family == "soft":
         inner = draw_shape(rng, _another(rng), pad, poses)
@@ -166,12 +166,12 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
         name = str(rng.choice(SURFACES))
     elif family in FIGURES:
         name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
-    newest, relief = random_targets(rng, 1, [name]).poses[0], _relief(name)
+    newest = random_targets(rng, 1, [name]).poses[0]
 
     def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
         over = over_surface(newest, *pose.tolist())
         try:
-            return -footprints([relief], [over], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm[0]
+            return heights_of(name, over, pad)
         except ValueError as error:  # a user's mesh is a ring, or smaller than the poses' reach
             if pose[:2].any():
                 return np.full((pad.size * SAMPLES,) * 2, NOWHERE_MM, dtype=np.float32)
@@ -183,6 +183,15 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
         slope = rng.uniform(-_FIGURE_SLOPE, _FIGURE_SLOPE, 2).astype(np.float32)
         heights = heights + slope[0] * pad.places_mm[0] + slope[1] * pad.places_mm[1]
     return Tapped(heights, BARE, met, newest.angle_deg - met[:, 2])
+
+
+def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
+    """Return the heights (m, m) of a surface at the places of a pad at a pose over it.
+
+    Raises:
+        ValueError: nothing of it lies under the pad.
+    """
+    return -footprints([_relief(surface)], [pose], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm[0]
 
 
 @lru_cache(maxsize=64)

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
-from train.data.batch import Batch
-from train.data.batches import Draw, WindowBatches, network_input
-from train.data.dataset import Sequences
+from train.data.batches import Batch, network_input
 from train.data.posed_batches import PosedBatches
 from train.data.press_batches import PressBatches
 from train.data.presses import PressSet
@@ -38,7 +36,6 @@ from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.losses import RelativeError
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
-from train.physics.gripped import SCALE
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
 _INFERRED_AT_ONCE: Final = 128
@@ -54,7 +51,6 @@ class Training:
         recipe: hyperparameters of the training.
         scale: pattern pixels per taxel pitch.
         start: checkpoint whose weights it starts from, or None.
-        draw: settings by which windows are drawn.
         seed: of weights and draws.
         options: further arguments of the network's class.
         keep: share of the weights it starts from in the final ones, from 0 to 1: what the training forgets of other
@@ -66,7 +62,6 @@ class Training:
     recipe: Recipe
     scale: int = 10
     start: str | None = None
-    draw: Draw = field(default_factory=Draw)
     seed: int = 1
     options: dict[str, Any] = field(default_factory=dict)
     keep: float = 0.0
@@ -80,14 +75,12 @@ class Training:
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
         config = asdict(self)
-        if self.draw.figure_share is None:
-            del config["draw"]["figure_share"]  # keeps the hash of networks that were trained before the option existed
         if not self.keep:
-            del config["keep"]  # as well
+            del config["keep"]  # keeps the hash of networks that were trained before the option existed
         return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
 
 
-def fit_network(training: Training, data: Sequences | PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
+def fit_network(training: Training, data: PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
     """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
 
     A checkpoint of the same training that already exists is left as it is.
@@ -117,7 +110,7 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
-    batches = batches_of(data, training.scale, recipe, seed, training.draw, posed=net.takes_poses)
+    batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses)
     done = train(
         net,
         _objective(net, device, seed),
@@ -163,11 +156,10 @@ def fit_network(training: Training, data: Sequences | PressSet, validation: Froz
 
 
 def batches_of(
-    data: Sequences | PressSet,
+    data: PressSet,
     scale: int,
     recipe: Recipe,
     seed: int,
-    draw: Draw | None = None,
     *,
     posed: bool = False,
 ) -> Callable[[int], Batch]:
@@ -178,20 +170,15 @@ def batches_of(
         scale: pattern pixels per taxel pitch.
         recipe: hyperparameters.
         seed: of all draws.
-        draw: settings by which windows are drawn from sequences of whole taps.
         posed: with the poses of the taps, for a network that takes them.
 
     Raises:
-        DatasetError: no sequence has as many taps, the scale is not that of the presses, or sequences have no poses.
+        DatasetError: no sequence has as many taps, or the scale is not that of the presses.
     """
-    if isinstance(data, Sequences):
-        if posed:
-            raise DatasetError(
-                "a network that takes poses is trained on presses: make some with train.data.make_presses"
-            )
-        return WindowBatches(data.at_scale(scale), draw or Draw(), recipe.given, recipe.batch, seed)
-    if scale != SCALE:
-        raise DatasetError(f"patterns at x{scale} asked for, presses have them at x{SCALE}: take 'train.generate'")
+    if scale != data.scale:
+        raise DatasetError(
+            f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others with --scale"
+        )
     if posed:
         return PosedBatches(data, recipe.given, recipe.batch, seed)
     return PressBatches(data.only_turned() if len(recipe.given) > 1 else data, recipe.given, recipe.batch, seed)

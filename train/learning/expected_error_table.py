@@ -11,8 +11,8 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.expected_error import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from train.data.dataset import Sequences
 from train.data.generation_config import SEED
+from train.data.paper_taps import PaperTaps
 from train.freeze import freeze
 from train.physics.sensor_noise import Nuisances
 
@@ -21,8 +21,8 @@ _SET_FORCES_N: Final = (5.0, 2.0, 1.0)
 """Set forces of the taps, in [N]: as on the frozen test set, and lighter ones, which carry less information."""
 
 
-def confidence_sets(validation: Sequences, scale: int) -> list[FrozenSet]:
-    """Return the sets to fit confidence on, at a network's scale, from flat sequences that it was not trained on."""
+def confidence_sets(validation: PaperTaps, scale: int) -> list[FrozenSet]:
+    """Return the sets to fit confidence on, at a network's scale, from sequences that it was not trained on."""
     return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in _SET_FORCES_N]
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 from train.networks.blocks import PatternNet
 from train.networks.interval_correction import IntervalCorrection
 from train.networks.losses import relative_rms_error, truth_size

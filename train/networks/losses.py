@@ -4,7 +4,7 @@ from typing import Any, Final
 
 from torch import Tensor, nn
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 
 _LEAST_TRUTH_MM: Final = 1e-4
 """Least RMS of a truth, in [mm]; smaller ones count as this, because a micrometre deep is no contact."""

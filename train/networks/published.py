@@ -20,7 +20,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, distributed, nn
 
-from train.data.batch import Batch
+from train.data.batches import Batch
 from train.networks.blocks import (
     MultiScaleResidual,
     PatternNet,

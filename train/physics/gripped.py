@@ -1,8 +1,8 @@
 """Presses of any shape onto one pad, at one moment: pressure, traction, readings, and truth.
 
-A tap of `train.physics.simulated_sensor` follows a press from first contact to its end; here each press is one
-moment, with its own pad, tilt, tangential load and twist. Shapes are heights at any place (`train.families`), sampled
-on a grid of SAMPLES x SAMPLES places a cell, which give each cell's depth and covered share.
+Each press is one moment, with its own pad, tilt, tangential load and twist. Shapes are heights at any place
+(`train.families`), sampled on a grid of SAMPLES x SAMPLES places a cell, which give each cell's depth and covered
+share. The paper's taps are followed from first contact to their end (`GrippedPad.tap`).
 
 A soft object deforms like a thick layer; a cloth or glove on the pad deforms and spreads the load. Friction is solved
 after the pressure, which it leaves unchanged (Goodman 1962).
@@ -24,10 +24,15 @@ from train.physics.curved_patterns import heights_pattern
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.physics.taxel_response import Skin
 from train.physics.touched import carrying, pressed_in, which_of
 
+MAX_INDENTATION_MM: Final = 0.5
+"""Largest indentation, in [mm]: beyond a tenth of its thickness the layer is not linear."""
+FRAMES: Final = 16
+"""Frames of a whole tap; frame i is at (i + 1) / FRAMES of its last indentation."""
+FINE_SCALE: Final = 20
+"""Pattern pixels per pitch at which truth is computed."""
 SAMPLES: Final = 4
 """Places along a cell's side at which a shape is sampled."""
 MOST_FORCE_N: Final = 40.0
@@ -51,7 +56,7 @@ class Presses:
 
     Attributes:
         counts: (n, 3, rows, cols), zeroed and clean.
-        patterns: (n, H, W) at SCALE, in [mm].
+        patterns: (n, H, W), SCALE pixels per pitch unless asked otherwise, in [mm].
         touching: (n, H, W), contact area on the pad.
         traction_kpa: (n, 3, h, w) at TRACTION_SCALE, x to the right, y down the rows, z into the pad, in [kPa].
         force_n: (n, 3), in [N].
@@ -66,6 +71,25 @@ class Presses:
     force_n: NDArray[np.float32]
     twist_nmm: NDArray[np.float32]
     indentation_mm: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Taps:
+    """n whole taps of flat figures, FRAMES frames each, in even steps of the indentation.
+
+    Attributes:
+        counts: (n, FRAMES, 3, rows, cols), zeroed and clean.
+        force_n: (n, FRAMES), normal, in [N].
+        indentation_mm: (n, FRAMES), in [mm].
+        unit_patterns: (n, H, W) at FINE_SCALE, deformation per indentation.
+        touching: (n, H, W) at FINE_SCALE, contact area on the pad.
+    """
+
+    counts: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    indentation_mm: NDArray[np.float32]
+    unit_patterns: NDArray[np.float32]
+    touching: NDArray[np.bool_]
 
 
 class GrippedPad:
@@ -111,6 +135,7 @@ class GrippedPad:
         friction: NDArray[np.floating],
         covers: Sequence[Cover] | None = None,
         most_force_n: float = MOST_FORCE_N,
+        scale: int = SCALE,
     ) -> Presses:
         """Press shapes onto the pad; a press that would exceed the largest force is made less deep.
 
@@ -122,6 +147,7 @@ class GrippedPad:
             friction: (n,), Coulomb's coefficient.
             covers: one for each press; all bare if None.
             most_force_n: largest normal force, in [N].
+            scale: pattern pixels per taxel pitch.
 
         Raises:
             PressError: an indentation is outside the layer's linear range, or nothing lies under the pad.
@@ -133,20 +159,60 @@ class GrippedPad:
                 "beyond a tenth of its thickness the pad is not linear; press less deep"
             )
         covers = [BARE] * len(heights_mm) if covers is None else covers
-        depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm
-        if not (heights_mm.max(axis=(1, 2)) > -100).all():
-            raise PressError("nothing lies under the pad: expected a shape that reaches it")
-        depth_mm = depth_mm + self._uneven_mm
-        depth_mm -= depth_mm.min(axis=(1, 2), keepdims=True)
-        parts_mm, share = carrying(depth_mm, self.size)
-        cells_mm = parts_mm.astype(np.float32)
+        depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
         pressure = np.zeros(cells_mm.shape, dtype=np.float32)
         for cover, which in which_of(covers):
             pressure[which], depth[which] = self._pressed(
                 cover, cells_mm[which], share[which], depth[which], most_force_n
             )
-        return self._result(covers, depth_mm, cells_mm, pressure, depth, slide_mm, twist_rad, friction)
+        return self._result(covers, depth_mm, cells_mm, pressure, depth, slide_mm, twist_rad, friction, scale)
+
+    def tap(self, heights_mm: NDArray[np.float32], force_n: NDArray[np.floating] | float) -> Taps:
+        """Press flat figures straight down until the set force or MAX_INDENTATION_MM, whichever comes first.
+
+        On a flat figure the pressure is in proportion to the indentation: one solution serves all frames of a tap.
+
+        Args:
+            heights_mm: (n, m, m) as in `press`, of figures on a plate that the pad does not reach.
+            force_n: set force, one for all or (n,), in [N].
+
+        Raises:
+            PressError: nothing lies under the pad.
+        """
+        depth_mm, cells_mm, share = self._under(heights_mm)
+        most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)
+        pressure, _ = self._pressed(BARE, cells_mm, share, most_mm.copy(), np.inf)
+        most_n = pressure.sum(axis=(1, 2)) * self.cell_mm**2
+        end = np.minimum(force_n / most_n, 1.0)[:, None] * (np.arange(FRAMES) + 1) / FRAMES
+        pressed = most_mm.astype(np.float32)
+        covers, solvers = [BARE] * len(heights_mm), {BARE: self._solver(BARE)}
+        fine_mm, touching = pressed_in(
+            solvers, covers, depth_mm, cells_mm, pressure, pressure, pressed, self._pattern_cells
+        )
+        patterns = heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2)
+        return Taps(
+            counts=self.skin.flat_frames(pressure / MAX_INDENTATION_MM, end * MAX_INDENTATION_MM),
+            force_n=(most_n[:, None] * end).astype(np.float32),
+            indentation_mm=(end * MAX_INDENTATION_MM).astype(np.float32),
+            unit_patterns=patterns / np.float32(MAX_INDENTATION_MM),
+            touching=touching,
+        )
+
+    def _under(
+        self, heights_mm: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
+
+        Raises:
+            PressError: nothing lies under the pad.
+        """
+        if not (heights_mm.max(axis=(1, 2)) > -100).all():
+            raise PressError("nothing lies under the pad: expected a shape that reaches it")
+        depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm + self._uneven_mm
+        depth_mm -= depth_mm.min(axis=(1, 2), keepdims=True)
+        parts_mm, share = carrying(depth_mm, self.size)
+        return depth_mm, parts_mm.astype(np.float32), share
 
     def _pressed(
         self,
@@ -183,6 +249,7 @@ class GrippedPad:
         slide_mm: NDArray[np.floating],
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
+        scale: int,
     ) -> Presses:
         on_pad = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
         sideways = self._friction.solve(on_pad, slide_mm, twist_rad, friction).traction_mpa
@@ -199,8 +266,8 @@ class GrippedPad:
         twist = (loads[:, 1] * across[None, :] - loads[:, 0] * across[:, None]).sum(axis=(1, 2)) * self.cell_mm**2
         return Presses(
             counts=counts,
-            patterns=resample(patterns, 2 * SCALE, SCALE),
-            touching=resample_touching(touching, 2 * SCALE, SCALE),
+            patterns=resample(patterns, FINE_SCALE, scale),
+            touching=resample_touching(touching, FINE_SCALE, scale),
             traction_kpa=self._coarse(loads) * 1e3,
             force_n=force,
             twist_nmm=twist.astype(np.float32),

@@ -71,6 +71,22 @@ def mixed(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
     return kinds[int(rng.choice(len(kinds), p=(0.2, 0.25, 0.3, 0.1, 0.15)))](rng, taps)
 
 
+def schedule_of(name: str) -> Schedule:
+    """Return a schedule by its name; `turns:30` turns by 30 degrees from tap to tap.
+
+    Raises:
+        ValueError: there is no schedule of that name.
+    """
+    if name.startswith("turns:"):
+        step = float(name.partition(":")[2]) / ANGLE_STEP_DEG
+        if not 0 <= step * ANGLE_STEP_DEG <= 180:
+            raise ValueError(f"{name}: expected a turn of 0 to 180 degrees")
+        return lambda rng, taps: turns(rng, taps) * step
+    if name not in SCHEDULES:
+        raise ValueError(f"no schedule {name!r}: expected one of {', '.join(SCHEDULES)}, or turns:DEGREES")
+    return SCHEDULES[name]
+
+
 SCHEDULES: Final[Mapping[str, Schedule]] = {
     "turns": turns,
     "half-pitch": half_pitch,

@@ -7,7 +7,7 @@ import numpy as np
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.trainings import at_angle, by_angle, compact, mixed, trained
+from train.experiments.paper.trainings import at_angle, by_angle, compact, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
 from train.report import Report, Row, bootstrap_interval

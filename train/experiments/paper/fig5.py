@@ -17,9 +17,11 @@ from torch import Tensor
 
 from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
+from train.families.catalogue import heights_of
 from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
+from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
+from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
-from train.physics.simulated_sensor import FINE_SCALE, FRAMES, SimulatedSensor, Taps
 from train.report import Report, Row
 from train.surfaces.poses import random_targets
 
@@ -97,13 +99,15 @@ def run(bench: Workbench, folder: Path) -> Path:
 def _tap(poses: int) -> tuple[list[str], Taps]:
     """Tap both surfaces at random poses, alternating."""
     targets = random_targets(np.random.default_rng(5), poses * len(SURFACES), SURFACES)
-    return targets.surfaces, SimulatedSensor().tap(targets.surfaces, targets.poses, _FORCE_N)
+    pad = GrippedPad(NOMINAL)
+    heights = [heights_of(name, pose, pad) for name, pose in zip(targets.surfaces, targets.poses, strict=True)]
+    return targets.surfaces, pad.tap(np.stack(heights), _FORCE_N)
 
 
 def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return all frames of some taps: counts (n, 3, rows, cols), and depth images (n, H, W) in 0..1."""
     counts = taps.counts[which]
-    depth = resample(taps.touching[which, 0], FINE_SCALE, _SCALE)
+    depth = resample(taps.touching[which], FINE_SCALE, _SCALE)
     return counts.reshape(-1, *USPA44.scan_shape), np.repeat(depth, counts.shape[1], axis=0)
 
 

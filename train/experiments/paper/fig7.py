@@ -22,7 +22,7 @@ from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, Verdict, press_or_recall, relief
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
 from train.surfaces.depth_image import depth_image

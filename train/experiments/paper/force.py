@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
-from train.data.dataset import Sequences, windows
 from train.data.generation_config import SEED
-from train.experiments.support.methods import Method, classical_methods, compact_methods
-from train.experiments.support.trainings import mixed
+from train.data.paper_taps import PaperTaps, windows
+from train.experiments.paper.methods import Method, classical_methods, compact_methods
+from train.experiments.paper.trainings import mixed
 from train.experiments.support.workbench import Figures, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
+from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, bootstrap_interval, with_interval
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
@@ -90,7 +90,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def scans_between(sequences: Sequences, force_n: tuple[float, float], draws: int, seed: Sequence[int]) -> Bin | None:
+def scans_between(sequences: PaperTaps, force_n: tuple[float, float], draws: int, seed: Sequence[int]) -> Bin | None:
     """Return scans of sequences that reach such forces, drawn log-uniformly; None if no sequence does."""
     rng = np.random.default_rng([*seed, 0])
     index = np.repeat(np.arange(len(sequences)), draws)
@@ -102,9 +102,8 @@ def scans_between(sequences: Sequences, force_n: tuple[float, float], draws: int
     index, wanted_n = index[reached], wanted_n[reached]
     taps_n = np.full((len(index), sequences.taps), TEST_FORCE_N)
     taps_n[:, 0] = wanted_n
-    readings, patterns = windows(sequences, index, 1.0, taps_n, Nuisances(), [*seed, 1])
-    share = sequences.share_at_force(index, taps_n)[:, 0]
-    return Bin(force_n, readings, patterns, sequences.touching_at(index, share), index)
+    readings, patterns = windows(sequences, index, taps_n, Nuisances(), [*seed, 1])
+    return Bin(force_n, readings, patterns, sequences.touching[index], index)
 
 
 def errors(method: Method, scans: Bin) -> Figures:

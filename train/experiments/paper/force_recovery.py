@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.contact_options import ON_COUNTS
 from edge.terminal.progress_bar import tracked
-from train.data.dataset import Sequences, windows
 from train.data.generation_config import SEED
-from train.experiments.support.course import (
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet
+from train.experiments.paper.course import (
     CLAIM_N,
     HOLD_S,
     PRESS_S,
@@ -34,8 +35,8 @@ from train.experiments.support.course import (
     pressed,
     volume_mm3,
 )
-from train.experiments.support.methods import Method, compact_methods
-from train.experiments.support.trainings import mixed
+from train.experiments.paper.methods import Method, compact_methods
+from train.experiments.paper.trainings import mixed
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances
@@ -48,7 +49,6 @@ _TAPS: Final = 4
 _ANGLE: Final = 1
 """Index of the test angle at which each surface is pressed: 30 degrees, the paper's target."""
 _FIT_PRESSES: Final = 600
-_FIT_FORCE_N: Final = (0.3, 8.0)
 _ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
 CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
 
@@ -122,16 +122,11 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def training_presses(data: Sequences, presses: int) -> Scans:
-    """Return the ends of training presses at evenly drawn forces, read by sensors that were just zeroed."""
-    data = data.newest(_TAPS)
-    rng = np.random.default_rng([SEED, 1])
-    index = rng.integers(len(data), size=presses)
-    wanted_n = np.full((presses, _TAPS), TEST_FORCE_N)
-    wanted_n[:, 0] = rng.uniform(*_FIT_FORCE_N, presses)
-    readings, patterns = windows(data, index, 1.0, wanted_n, _ZEROED, [SEED, 2])
-    share = data.share_at_force(index, wanted_n)[:, :1]
-    return Scans(readings, data.force_at(index, share)[:, 0], volume_mm3(patterns, data.scale))
+def training_presses(data: PressSet, presses: int) -> Scans:
+    """Return training presses, read by sensors that were just zeroed."""
+    picked = data.pick(np.random.default_rng([SEED, 1]).integers(len(data), size=presses)).with_taps(_TAPS)
+    readings = read_presses(picked, _ZEROED, SEED)
+    return Scans(readings, picked.force_n[:, 2], volume_mm3(picked.patterns.astype(np.float32), data.scale))
 
 
 def _gauges(networks: list[Method]) -> list[Gauge]:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
-from train.data.dataset import Sequences
-from train.experiments.support.methods import classical_methods
-from train.experiments.support.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
+from train.data.presses import PressSet
+from train.experiments.paper.methods import classical_methods
+from train.experiments.paper.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
 from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
 from train.report import Report, Row, bootstrap_interval
@@ -73,14 +73,14 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def _classical(bench: Workbench, data: Sequences, evaluated: Sets) -> Iterator[tuple[Row, Figures]]:
+def _classical(bench: Workbench, data: PressSet, evaluated: Sets) -> Iterator[tuple[Row, Figures]]:
     for method in classical_methods(bench, data, CLASSICAL):
         patterns = {split: method.patterns(frozen.windows(1)) for split, frozen in evaluated.items()}
         yield _row(method.name, method.name, evaluated, patterns, method.contact_level, method.cost)
 
 
 def _networks(
-    bench: Workbench, data: Sequences, validation: FrozenSet, evaluated: Sets
+    bench: Workbench, data: PressSet, validation: FrozenSet, evaluated: Sets
 ) -> Iterator[tuple[Row, Figures]]:
     seed_networks = [seed_size(name) for name in (SEED_NETWORKS[1:4] if bench.quick else SEED_NETWORKS)]
     networks = [

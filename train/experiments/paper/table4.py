@@ -5,9 +5,10 @@ from typing import Final
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.trainings import at_scale, mixed, trained
+from train.experiments.paper.trainings import at_scale, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
+from train.physics.gripped import SCALE
 from train.report import Report, Row
 
 PAPER: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
@@ -16,14 +17,13 @@ PAPER: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: 
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Train absent networks, evaluate each scale against the truth at that scale, and write table and plot."""
-    data = mixed(bench)
     rows: list[Row] = []
     means = []
     for scale, (paper_db, paper_ssim) in tracked(PAPER.items(), "scales", "scale"):
         validation, test = (bench.frozen(split, scale=scale) for split in ("validation", "test"))
-        if scale != 10:  # the base is evaluated at its own scale
-            trained(bench, at_scale(10), data, bench.frozen("validation"))
-        net, facts = bench.network(at_scale(scale), data, validation)
+        if scale != SCALE:  # the base is evaluated at its own scale
+            trained(bench, at_scale(SCALE), mixed(bench), bench.frozen("validation"))
+        net, facts = bench.network(at_scale(scale), mixed(bench, scale), validation)
         row: Row = {"scale": f"x{scale}", "pattern": "{} x {}".format(*test.unit_patterns.shape[1:])}
         for split, frozen in (("validation", validation), ("test", test)):
             figures = judge(infer(net, frozen.windows(1))[0], frozen, facts["contact_level"])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.evaluate import judge
 from edge.terminal.progress_bar import tracked
-from train.experiments.support.trainings import alike, mixed, trained
+from train.experiments.paper.trainings import alike, mixed, trained
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
 from train.report import Report, Row, bootstrap_interval

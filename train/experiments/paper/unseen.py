@@ -3,7 +3,7 @@
 Three of the 18 surfaces are held out; tested glyphs and polygons are of another seed than the trained ones. All
 networks are identical; the training set differs. All figures make as many windows as all surfaces do, so training on
 surfaces alone runs once for as long and once for as many windows of the surfaces. Figures reduce the accuracy on seen
-surfaces, so some networks see fewer of them: few figures, or all of them rarely.
+surfaces, so one network sees fewer of them.
 
 Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
 """
@@ -19,20 +19,17 @@ from numpy.typing import NDArray
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
-from train.data.dataset import Sequences, join
 from train.data.generation_config import random_figures
-from train.experiments.support.intervals import intervals
-from train.experiments.support.trainings import FIGURES, SEEN
+from train.data.presses import PressSet, join_presses
+from train.experiments.paper.intervals import intervals
+from train.experiments.paper.trainings import HELD_OUT, KNOWN, SETS, presses
 from train.experiments.support.workbench import Workbench, cost_cells, error_cells
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.report import Report, Row, bootstrap_interval, with_interval
-from train.surfaces.named_surfaces import SURFACES
 
-HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
-KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
 TEST_SEED: Final = 999
 TEST_FIGURES: Final = 24
 GIVEN: Final = (1, 4)
@@ -42,11 +39,10 @@ MOST_LOSS_DB: Final = 0.3
 """Largest PSNR loss accepted on the other surfaces, in [dB]."""
 
 _ALONE, _ALONE_HALF, _ALL_BOTH = "15", "15, half as long", "18 + figures"
-_FEW, _RARE, _BOTH = "15 + 833 figures", "15 + figures, 1 in 25", "15 + figures"
+_FEW, _BOTH = "15 + 833 figures", "15 + figures"
 _FEW_FIGURES: Final = 833
 """Number of figures that make a tenth of the windows."""
-_RARE_SHARE: Final = 0.04
-_PAIRS: Final = ((_RARE, _ALONE), (_FEW, _ALONE), (_BOTH, _ALONE), (_BOTH, _ALONE_HALF))
+_PAIRS: Final = ((_FEW, _ALONE), (_BOTH, _ALONE), (_BOTH, _ALONE_HALF))
 """Pairs of training sets that are compared."""
 _OLD, _NEW, _GLYPHS, _POLYGONS = "15 seen", "3 held out", "glyphs", "polygons"
 _UNSEEN: Final = (_NEW, _GLYPHS, _POLYGONS)
@@ -56,7 +52,6 @@ TRAININGS: Final[Mapping[str, Training]] = {
     _ALONE: replace(BASE, name="unseen-alone"),
     _ALONE_HALF: replace(BASE, name="unseen-alone-half", recipe=replace(BASE.recipe, steps=BASE.recipe.steps // 2)),
     _FEW: replace(BASE, name="unseen-few"),
-    _RARE: replace(BASE, name="unseen-rare", draw=replace(BASE.draw, figure_share=_RARE_SHARE)),
     _BOTH: replace(BASE, name="unseen-both"),
     _ALL_BOTH: BASE,
 }
@@ -97,7 +92,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     report = Report("unseen", folder, __file__, bench.used, quick=bench.quick)
     report.say(
-        f"Held out: {', '.join(HELD_OUT)}. Figures are random glyphs and polygons, {len(FIGURES.surfaces)} to train on "
+        f"Held out: {', '.join(HELD_OUT)}. Figures are random glyphs and polygons, {SETS['figures'].count} to train on "
         f"and {TEST_FIGURES} of each kind, of another seed, to test. All tests are made at the test position, though "
         f"pose errors bring some training taps near it. Every network is `{BASE.network}` at x{BASE.scale}, "
         f"{BASE.recipe.steps} steps (or half as many) of {BASE.recipe.batch} windows; contact levels and deviations "
@@ -120,17 +115,16 @@ def test_sets(bench: Workbench) -> dict[str, FrozenSet]:
     return {name: bench.frozen("test", these) for name, these in surfaces.items()}
 
 
-def training_sets(bench: Workbench) -> dict[str, Sequences]:
+def training_sets(bench: Workbench) -> dict[str, PressSet]:
     """Return the training sets, by name; all but the last are without the held-out surfaces."""
-    every, figures = bench.data("seen", SEEN), bench.data("figures", FIGURES)
-    known = every.pick(~np.isin(every.surfaces, HELD_OUT))
+    known, held_out, figures = (presses(bench, name).at_scale(BASE.scale) for name in SETS)
+    few = figures.pick(np.arange(min(_FEW_FIGURES, len(figures))))  # both kinds alternate
     return {
         _ALONE: known,
         _ALONE_HALF: known,
-        _RARE: join([known, figures]),
-        _FEW: join([known, _evenly(figures, _FEW_FIGURES)]),
-        _BOTH: join([known, figures]),
-        _ALL_BOTH: join([every, figures]),
+        _FEW: join_presses([known, few]),
+        _BOTH: join_presses([known, figures]),
+        _ALL_BOTH: join_presses([known, held_out, figures]),
     }
 
 
@@ -169,11 +163,6 @@ def _lift_db(
         taps.append(tap + first)
         first += int(tap.max()) + 1
     return np.concatenate(lifts), np.concatenate(taps)
-
-
-def _evenly(figures: Sequences, count: int) -> Sequences:
-    """Return `count` of the figures, glyphs and polygons in equal shares."""
-    return figures.pick(np.unique(np.linspace(0, len(figures) - 1, min(count, len(figures))).round().astype(int)))
 
 
 def _networks(bench: Workbench) -> dict[str, tuple[PatternNet, dict[str, Any]]]:

@@ -29,9 +29,8 @@ from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infe
 from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.learning.checkpoint import best_contact_level
-from train.physics.gripped import SCALE
+from train.physics.gripped import MAX_INDENTATION_MM, SCALE
 from train.physics.sensor_noise import Nuisances
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 
 TRAINING: Final = World(count=100_000, seed=1)

@@ -23,9 +23,8 @@ from train.data.world import press_shapes
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
-from train.physics.gripped import GrippedPad
+from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
 from train.physics.pad_draws import INPUTS, NOMINAL, Pad
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 
 SHAPES: Final = 40

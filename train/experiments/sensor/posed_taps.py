@@ -25,7 +25,7 @@ from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import FIGURES, SHARES
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 

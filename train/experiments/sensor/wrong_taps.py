@@ -16,7 +16,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses
 from train.experiments.sensor.contact_verdicts import share
 from train.experiments.sensor.pushed import PushedSensor
-from train.physics.simulated_sensor import MAX_INDENTATION_MM
+from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Row, bootstrap_interval
 
 _DEPTHS: Final = (0.85, 1.15)

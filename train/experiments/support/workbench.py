@@ -1,7 +1,5 @@
 """Workbench of the experiments: datasets and networks made once and kept, and errors and cost of networks."""
 
-import hashlib
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -16,27 +14,25 @@ from numpy.typing import NDArray
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.pad_geometry import USPA44
-from train.data.dataset import Sequences
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.generation_config import SEED, Generation
+from train.data.generation_config import SEED
 from train.data.make_presses import make_presses
+from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import PressSet
 from train.data.world import World
 from train.freeze import freeze
-from train.generate import generate
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
 from train.networks.cost import macs, parameters_count
+from train.physics.gripped import FRAMES
 from train.physics.sensor_noise import Nuisances
-from train.physics.simulated_sensor import FRAMES
 from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import MAX_TAPS, Split
+from train.surfaces.poses import ANGLE_STEP_DEG, Split
 
 _TIMED_RUNS: Final = 30
 _TIMED_MS: Final = 2000.0
 _QUICK_STEPS: Final = 1
-_QUICK_SEQUENCES: Final = 36
 _QUICK_SURFACES: Final = 2
 _QUICK_PRESSES: Final = 42
 _QUICK_ONE_IN: Final = 12
@@ -60,6 +56,7 @@ class Workbench:
     quick: bool = False
     models: Path = BUNDLE_DIR
     used: set[Path] = field(default_factory=set)
+    _tapped: dict[tuple[Split, tuple[str, ...], float], PaperTaps] = field(default_factory=dict)
 
     def use(self, path: Path) -> Path:
         """Return the path, which the head of the report is to name with its hash."""
@@ -81,13 +78,7 @@ class Workbench:
         wide = load_frozen_presses(self.use(WIDE_TEST))
         return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
-    def data(self, name: str, config: Generation) -> Sequences:
-        """Return a dataset, read if it exists, else made."""
-        if self.quick:
-            name, config = f"quick-{name}", replace(config, count=_QUICK_SEQUENCES, surfaces=config.surfaces[:18])
-        return self._made(name, config)
-
-    def network(self, training: Training, data: Sequences, validation: FrozenSet) -> tuple[PatternNet, dict[str, Any]]:
+    def network(self, training: Training, data: PressSet, validation: FrozenSet) -> tuple[PatternNet, dict[str, Any]]:
         """Return a trained network and its report, read if the same training on these data exists, else trained."""
         if self.quick:
             training = _quick(training)
@@ -107,11 +98,14 @@ class Workbench:
             steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
         return {"steps": steps, "training min": round(elapsed_s / 60, 1)}
 
-    def held_out(self, split: Split, surfaces: Sequence[str] = SURFACES, **options: Any) -> Sequences:
-        """Return clean sequences at a held-out position, read if they exist, else made."""
+    def held_out(
+        self, split: Split, surfaces: Sequence[str] = SURFACES, angle_step_deg: float = ANGLE_STEP_DEG
+    ) -> PaperTaps:
+        """Return clean sequences of the paper's protocol at a held-out position."""
         names = tuple(surfaces[:_QUICK_SURFACES] if self.quick else surfaces)
-        config = Generation(surfaces=names, poses="paper", split=split, taps=MAX_TAPS, seed=SEED, **options)
-        return self._made(f"{split}-{_short_hash(config)}", config)
+        if (split, names, angle_step_deg) not in self._tapped:
+            self._tapped[split, names, angle_step_deg] = paper_taps(split, names, angle_step_deg=angle_step_deg)
+        return self._tapped[split, names, angle_step_deg]
 
     def frozen(
         self,
@@ -119,15 +113,11 @@ class Workbench:
         surfaces: Sequence[str] = SURFACES,
         nuisances: Nuisances | None = None,
         scale: int = 10,
-        **options: Any,
+        angle_step_deg: float = ANGLE_STEP_DEG,
     ) -> FrozenSet:
-        """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or options if passed."""
-        frozen = freeze(self.held_out(split, surfaces, **options), nuisances or Nuisances(), SEED, scale=scale)
+        """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or angle."""
+        frozen = freeze(self.held_out(split, surfaces, angle_step_deg), nuisances or Nuisances(), SEED, scale=scale)
         return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
-
-    def _made(self, name: str, config: Generation) -> Sequences:
-        self.data_folder.mkdir(parents=True, exist_ok=True)
-        return generate(config, self.data_folder / f"{name}.npz")
 
 
 Figures = dict[str, NDArray[np.float64]]
@@ -171,7 +161,3 @@ def _quick(training: Training) -> Training:
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
-
-
-def _short_hash(config: Generation) -> str:
-    return hashlib.sha256(json.dumps(config.facts(), sort_keys=True).encode()).hexdigest()[:10]

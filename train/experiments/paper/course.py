@@ -10,8 +10,8 @@ from edge.evaluation import metrics
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.tap_tracker import TapTracker
 from firmware_bridge.pad_geometry import USPA44
-from train.data.dataset import Sequences, between_frames
 from train.data.generation_config import SEED
+from train.data.paper_taps import PaperTaps, between_frames
 from train.freeze import TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 
@@ -61,7 +61,7 @@ class Scans:
     volume_mm3: NDArray[np.floating]
 
 
-def pressed(sequences: Sequences, number: int, course: Course, nuisances: Nuisances) -> Scans:
+def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisances) -> Scans:
     """Return the scans of a sequence's newest tap along a course.
 
     One sensor reads all taps of the sequence; the earlier taps are read at their ends.

@@ -4,19 +4,27 @@ from dataclasses import replace
 from typing import Any, Final
 
 from edge.evaluation.test_set import FrozenSet
-from train.data.dataset import Sequences, join
-from train.data.generation_config import Generation, random_figures
+from train.data.presses import PressSet, join_presses
+from train.data.world import World
 from train.experiments.support.workbench import Workbench
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
+from train.physics.gripped import FINE_SCALE, SCALE
+from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
-SEEN: Final = Generation(taps=MAX_TAPS, seed=1)
-"""Sequences of the 18 surfaces."""
-FIGURES: Final = Generation(surfaces=random_figures(4500, 4500, seed=2), taps=MAX_TAPS, seed=2)
-"""Sequences of random figures, each figure once."""
+HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
+"""Surfaces that Fig. 16 leaves out of a training."""
+KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
+_SET: Final = World(taps=MAX_TAPS, schedule="turns", spread=0.0, scale=FINE_SCALE)
+SETS: Final = {
+    "known": replace(_SET, families=dict.fromkeys(KNOWN, 1.0), count=7500, seed=1),
+    "held-out": replace(_SET, families=dict.fromkeys(HELD_OUT, 1.0), count=1500, seed=2),
+    "figures": replace(_SET, families={"glyph": 1.0, "polygon": 1.0}, count=9000, seed=3),
+}
+"""Presses by the nominal pad, turned from tap to tap: of the 15 other surfaces, of those three, of random figures."""
 
 _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
 """Training time of the paper's networks, in [min]: the STSR as long as the compact one; srgan on top of srcnn."""
@@ -27,25 +35,31 @@ _SEED_RATE: Final = 5e-4
 _SEED_DECAY: Final = 1e-2
 _ENDLESS: Final = 1_000_000
 BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
-"""Compact STSR trained on whole taps of the paper's protocol without pad constants; bundled models train on presses."""
+"""Compact STSR trained on the paper's figures and random ones, without pad constants."""
 _STAGE_STEPS: Final = 2000
 _STAGE_RATE: Final = 1e-3
 _SCALE_STEPS: Final = 2500
 _ANGLE_STEPS: Final = 1500
 
 
-def mixed(bench: Workbench) -> Sequences:
-    """Return the mixed data, the 18 surfaces and as many random figures."""
-    return join([bench.data("seen", SEEN), bench.data("figures", FIGURES)])
+def presses(bench: Workbench, name: str) -> PressSet:
+    """Return one of SETS, with the truth at x20."""
+    return bench.presses(f"paper-{name}", SETS[name], MAX_TAPS)
 
 
-def by_angle(bench: Workbench, angle_step_deg: float) -> Sequences:
+def mixed(bench: Workbench, scale: int = SCALE) -> PressSet:
+    """Return the mixed data, the 18 surfaces and as many random figures, with the truth at a scale."""
+    return join_presses([presses(bench, name) for name in SETS]).at_scale(scale)
+
+
+def by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
     """Return the mixed data with two taps that are turned by another angle."""
     if angle_step_deg == ANGLE_STEP_DEG:
         return mixed(bench)
-    parts = {"seen": SEEN, "figures": FIGURES}
-    turned = {name: replace(config, taps=2, angle_step_deg=angle_step_deg) for name, config in parts.items()}
-    return join([bench.data(f"{name}-{angle_step_deg:g}-deg", config) for name, config in turned.items()])
+    schedule = f"turns:{angle_step_deg:g}"
+    turned = {name: replace(world, taps=2, schedule=schedule, scale=SCALE) for name, world in SETS.items()}
+    parts = [bench.presses(f"paper-{name}-{angle_step_deg:g}-deg", world, 2) for name, world in turned.items()]
+    return join_presses(parts)
 
 
 def compact(name: str) -> Training:
@@ -105,7 +119,7 @@ SEED_STSR_LONGER: Final = replace(
 
 
 def trained(
-    bench: Workbench, training: Training, data: Sequences, validation: FrozenSet
+    bench: Workbench, training: Training, data: PressSet, validation: FrozenSet
 ) -> tuple[PatternNet, dict[str, Any]]:
     """Return a trained network and its report; the network that it starts from is trained first."""
     if training.start:

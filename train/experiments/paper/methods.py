@@ -13,9 +13,9 @@ from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, met
 from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.pad_geometry import USPA44
-from train.data.dataset import Sequences
+from train.data.presses import PressSet
 from train.errors import TrainError
-from train.experiments.support.trainings import compact, trained
+from train.experiments.paper.trainings import compact, trained
 from train.experiments.support.workbench import Figures, Workbench, cost_cells
 from train.freeze import CLASSICAL_WINDOWS, SCALE, fit_classical
 from train.learning.checkpoint import infer
@@ -53,7 +53,7 @@ class Method:
         return judge(self.patterns(frozen.windows(self.taps)), frozen, self.contact_level)
 
 
-def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -> list[Method]:
+def compact_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
     """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
     validation = bench.frozen("validation")
     methods: list[Method] = []
@@ -64,7 +64,7 @@ def compact_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -
     return methods
 
 
-def classical_methods(bench: Workbench, data: Sequences, names: tuple[str, ...]) -> list[Method]:
+def classical_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
     """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
     if not path.exists():

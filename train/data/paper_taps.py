@@ -1,0 +1,178 @@
+"""The paper's protocol in the simulated world: its figures, whole taps from first contact to full force, one pad.
+
+A sequence is K taps of one figure by the nominal pad, each turned by a step from the one before; the newest is the
+target. Every figure has 36: nine places and four turns, of which one place is for validation and one for the test.
+Each tap has FRAMES frames, so that readings and truth are available at any lower force: frame i lies at
+(i + 1) / FRAMES of the press, readings at 0 are zero, and values between frames are interpolated linearly.
+
+Networks of the paper are trained on presses of the same pad and schedule:
+
+    python -m train.data.make_presses data/paper.npz --families paper --schedule turns --spread 0 --taps 7
+
+Source: Wu and Liu 2024, Sec. V and Table II.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edge.terminal.progress_bar import tracked
+from train.data.generation_config import SEED, one_thread
+from train.errors import DatasetError
+from train.families.catalogue import heights_of
+from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
+from train.physics.pad_draws import NOMINAL
+from train.physics.resample import resample, resample_touching
+from train.physics.sensor_noise import Nuisances, Seed, jitter_poses, read_windows
+from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, Split, as_poses, paper_targets, positions_of, turned_back
+
+FORCE_N: Final = 9.2
+"""Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
+_AT_ONCE: Final = 48
+"""Sequences whose pose errors are drawn at once: so the bundled frozen set has its poses."""
+_PER_TAP: Final = ("poses", "counts", "force_n", "indentation_mm")
+_ARRAYS: Final = ("surfaces", *_PER_TAP, "unit_patterns", "touching")
+
+
+@dataclass(frozen=True, slots=True)
+class PaperTaps:
+    """n sequences of K clean whole taps, newest first.
+
+    Attributes:
+        surfaces: (n,) names.
+        poses: (n, K, 3), true poses of the pad: x, y in [mm], angle in [deg].
+        counts: (n, K, FRAMES, 3, rows, cols), zeroed, without nuisances.
+        force_n: (n, K, FRAMES), in [N].
+        indentation_mm: (n, K, FRAMES), in [mm], even steps.
+        unit_patterns: (n, H, W) of the newest tap, deformation per indentation.
+        touching: (n, H, W), pixels that the surface touches.
+        scale: pattern pixels per taxel pitch.
+    """
+
+    surfaces: NDArray[np.str_]
+    poses: NDArray[np.float64]
+    counts: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    indentation_mm: NDArray[np.float32]
+    unit_patterns: NDArray[np.float32]
+    touching: NDArray[np.bool_]
+    scale: int = FINE_SCALE
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    @property
+    def taps(self) -> int:
+        """Number of taps in a sequence, K."""
+        return self.counts.shape[1]
+
+    def newest(self, taps: int) -> "PaperTaps":
+        """Return the sequences with only their newest `taps` taps.
+
+        Raises:
+            DatasetError: the sequences have fewer taps.
+        """
+        if not 1 <= taps <= self.taps:
+            raise DatasetError(f"{taps} taps asked for, but these sequences have {self.taps}")
+        return replace(self, **{name: getattr(self, name)[:, :taps] for name in _PER_TAP})
+
+    def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PaperTaps":
+        """Return the sequences at the indices."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
+
+    def at_scale(self, scale: int) -> "PaperTaps":
+        """Return the sequences with the truth at another scale."""
+        return replace(
+            self,
+            unit_patterns=resample(self.unit_patterns, self.scale, scale),
+            touching=resample_touching(self.touching, self.scale, scale),
+            scale=scale,
+        )
+
+    def share_at_force(self, index: NDArray[np.integer], force_n: ArrayLike) -> NDArray[np.float64]:
+        """Return the shares (B, K) of the presses at which they reach their set forces; 1 if a press ends before.
+
+        Args:
+            index: (B,) sequences.
+            force_n: broadcast to (B, K), above 0, in [N].
+        """
+        return np.minimum(np.asarray(force_n, dtype=np.float64) / self.force_n[index, :, -1], 1.0)
+
+    def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
+        return self.force_n[index, 0, -1:] * share
+
+    def patterns_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
+        depth_mm = (self.indentation_mm[index, 0, -1] * share).astype(np.float32)
+        return self.unit_patterns[index] * depth_mm[:, None, None]
+
+
+@one_thread()
+def paper_taps(
+    split: Split,
+    surfaces: Sequence[str] = SURFACES,
+    taps: int = MAX_TAPS,
+    angle_step_deg: float = ANGLE_STEP_DEG,
+) -> PaperTaps:
+    """Tap each flat surface at the places of a split, in four turns; poses are off by a robot's error, as is the truth.
+
+    Raises:
+        ValueError: taps or angle_step_deg out of bounds.
+    """
+    pad = GrippedPad(NOMINAL)
+    targets = paper_targets(positions_of(split), surfaces)
+    sent = as_poses(turned_back(targets, taps, angle_step_deg))
+    poses: list[Pose] = []
+    while part := sent[len(poses) :][: _AT_ONCE * taps]:
+        rng = np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)])
+        poses += jitter_poses(rng, part, Nuisances())
+    numbers = tracked(range(len(targets)), "tapping", "sequence")
+    solved = [tap(pad, targets.surfaces[at], poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
+    return PaperTaps(
+        surfaces=np.array(targets.surfaces),
+        poses=np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in poses]).reshape(-1, taps, 3),
+        counts=np.stack([one.counts for one in solved]),
+        force_n=np.stack([one.force_n for one in solved]),
+        indentation_mm=np.stack([one.indentation_mm for one in solved]),
+        unit_patterns=np.stack([one.unit_patterns[0] for one in solved]),
+        touching=np.stack([one.touching[0] for one in solved]),
+    )
+
+
+def tap(pad: GrippedPad, surface: str, poses: Sequence[Pose], force_n: float) -> Taps:
+    """Return whole taps of a flat surface from poses over it."""
+    return pad.tap(np.stack([heights_of(surface, pose, pad) for pose in poses]), force_n)
+
+
+def windows(
+    sequences: PaperTaps,
+    index: NDArray[np.integer],
+    force_n: ArrayLike,
+    nuisances: Nuisances,
+    seed: Seed,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return windows (B, K, 3, rows, cols) in whole zeroed counts, and the newest taps' truth (B, H, W) in [mm].
+
+    Args:
+        sequences: with the truth at the required scale.
+        index: (B,) sequences.
+        force_n: at which every tap is read, broadcast to (B, K), in [N].
+        nuisances: of the B sensors.
+        seed: of the nuisances.
+    """
+    share = sequences.share_at_force(index, force_n)
+    readings = read_windows(sequences.counts[index], share, nuisances, seed, None, sequences.poses[index, :, 2])
+    return readings, sequences.patterns_at(index, share[:, 0])
+
+
+def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return values (b, m, ...) at shares (b, m) of presses, between frames (b, FRAMES, ...) and 0 at the start."""
+    away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))
+    weights = np.maximum(1 - away, 0).astype(np.float32)
+    return (weights @ frames.reshape(*frames.shape[:2], -1)).reshape(*share.shape, *frames.shape[2:])
