@@ -84,12 +84,6 @@ data/nominal4.npz: $(VENV)/.dev  ## the same as the paper has it: one pad, turne
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001
 
-data/seen.npz: $(VENV)/.dev  ## whole taps of the paper's protocol on its 18 surfaces, for experiments
-	$(BIN)/python -m train.generate $@ --taps 7 --seed 1
-
-data/figures.npz: $(VENV)/.dev  ## the same on random figures
-	$(BIN)/python -m train.generate $@ --surfaces none --glyphs 4500 --polygons 4500 --taps 7 --seed 2
-
 data/test.npz: $(VENV)/.dev  ## the same on yet other pads, by which nothing is set
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 1260 --per-pad 10 --taps 4 --schedule turns --begun 0 --seed 2000001
 

@@ -239,7 +239,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(folder, frozen, tmp
     frozen.save(tmp_path / "frozen.npz")
     PRESSES.save(tmp_path / "taps.npz")
     monkeypatch.setattr(to_onnx, "BUNDLE_DIR", tmp_path)
-    monkeypatch.setattr(to_onnx, "held_out", lambda split: None)
+    monkeypatch.setattr(to_onnx, "paper_taps", lambda split: None)
     monkeypatch.setattr(to_onnx, "confidence_sets", lambda validation, scale: [frozen])
     monkeypatch.setattr(to_onnx, "MOST_LOSS_DB", -100.0)
     with pytest.raises(

@@ -131,4 +131,3 @@ def test_a_model_that_does_not_stand_for_a_single_tap_is_refused(folder):
         with_one_tap(fused, replace(one, batch=1))
     with pytest.raises(ExportError, match=r"two.onnx: No such file or directory: export the model for single taps"):
         export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, one_tap="two")
-

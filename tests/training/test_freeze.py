@@ -172,8 +172,8 @@ def test_taxels_covary_as_their_readings_do():
     covariances = fit_taxels(presses, windows=400)["covariances"]
     assert covariances.shape == (KINDS, 48, 48) and covariances.dtype == np.float32
     np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-4, atol=1e-6)
-    # The press is in z, and of one strength in all of them.
+    # The press is mostly in z, since some are dragged, and of one strength in all of them.
     traces = np.trace(covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, 48, rtol=0.01)
-    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.7 * traces).all()
+    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.5 * traces).all()
     np.testing.assert_array_equal(covariances, fit_taxels(presses, windows=400)["covariances"])

@@ -21,6 +21,7 @@ from typing import Final, cast
 import joblib
 
 from edge.terminal.progress_bar import Progress
+from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.workers import quiet_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
@@ -131,6 +132,7 @@ def _world(options: argparse.Namespace) -> World:
         spread=options.spread,
         seed=options.seed,
         scale=options.scale,
+        pad=options.pad,
     )
 
 
@@ -168,6 +170,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
     parser.add_argument("--scale", type=int, default=SCALE, help=f"pattern pixels per taxel pitch ({SCALE})")
+    models = ", ".join(pad.name for pad in PADS)
+    parser.add_argument("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
     parser.add_argument("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser

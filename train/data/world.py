@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.generation_config import mesh_sha256, one_thread
 from train.data.presses import VERSION, PressSet, join_presses
 from train.errors import DatasetError
@@ -50,6 +51,7 @@ class World:
         spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
         seed: of all draws.
         scale: pattern pixels per taxel pitch.
+        pad: name of the pads' model, see firmware_bridge.pad_geometry.PADS.
     """
 
     count: int = 24_000
@@ -61,6 +63,7 @@ class World:
     spread: float = 1.0
     seed: int = 1
     scale: int = SCALE
+    pad: str = USPA44.name
 
     def __post_init__(self) -> None:
         for name in ("count", "taps", "per_pad"):
@@ -77,6 +80,8 @@ class World:
         for name in ("spread", "begun"):
             if not 0 <= getattr(self, name) <= 1:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected 0 to 1")
+        if self.pad not in {pad.name for pad in PADS}:
+            raise DatasetError(f"pad is {self.pad!r}, expected one of {', '.join(pad.name for pad in PADS)}")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
         known = {*SHARES, *SURFACES}
@@ -107,6 +112,8 @@ class World:
         }
         if self.scale == SCALE:
             del facts["scale"]  # what was made before there was a choice keeps its name
+        if self.pad == USPA44.name:
+            del facts["pad"]
         meshes = {name: mesh_sha256(name) for name in self.families if name.startswith(MESH)}
         return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
 
@@ -116,7 +123,7 @@ def solve_pad(world: World, number: int) -> PressSet:
     """Solve all sequences of one pad; the result does not depend on other pads."""
     rng = np.random.default_rng([world.seed, number])
     pad = draw_pad(rng, world.spread) if world.spread else Pad()
-    gripped = GrippedPad(pad)
+    gripped = GrippedPad(replace(pad, model=world.pad))
     count = min(world.per_pad, world.count - number * world.per_pad)
     shares = np.array(list(world.families.values()), dtype=float)
     # Families alternate over the pads, so that a small set has all of them.

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.errors import SurfaceError
+from train.errors import MeshError, SurfaceError
 from train.families import faces, rounds, solids
 from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
@@ -172,6 +172,8 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
         over = over_surface(newest, *pose.tolist())
         try:
             return heights_of(name, over, pad)
+        except MeshError:
+            raise
         except ValueError as error:  # a user's mesh is a ring, or smaller than the poses' reach
             if pose[:2].any():
                 return np.full((pad.size * SAMPLES,) * 2, NOWHERE_MM, dtype=np.float32)

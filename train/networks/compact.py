@@ -163,7 +163,7 @@ class CompactNet(PatternNet):
 
         Args:
             window: (n, 3K, rows, cols) in network units.
-            pad: (n, known), constants of the pads; None for no constants.
+            pad: (n, known), constants of the pads; None for no constants. A network that takes none ignores them.
         """
         return self.finished(self.see(window, pad))
 
@@ -190,7 +190,7 @@ class CompactNet(PatternNet):
     def about(self, newest: Tensor, pad: Tensor | None) -> Tensor:
         """Return (n, known + 1): what is known of the pad, and a bounded number of an amplitude (n, 1, 1)."""
         size = (newest / (newest + 1))[:, :, 0]
-        if pad is None:
+        if pad is None or not self.known:
             return F.pad(size, (self.known, 0))
         return torch.cat([pad, size], dim=1)
 

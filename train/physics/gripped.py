@@ -11,12 +11,11 @@ after the pressure, which it leaves unchanged (Goodman 1962).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.contact import ContactSolver
 from train.physics.covers import BARE, Cover
@@ -24,8 +23,9 @@ from train.physics.curved_patterns import heights_pattern
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
-from train.physics.taxel_response import Skin
+from train.physics.taxel_response import Skin, on_pad
 from train.physics.touched import carrying, pressed_in, which_of
+from train.surfaces.depth_image import NOTHING_MM
 
 MAX_INDENTATION_MM: Final = 0.5
 """Largest indentation, in [mm]: beyond a tenth of its thickness the layer is not linear."""
@@ -44,6 +44,9 @@ _CELLS_PER_PITCH: Final = 10
 _LIGHTER: Final = 0.9
 """Power of the force's excess by which depth is lowered; force grows faster than depth."""
 _MOST_TRIES: Final = 6
+
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 class PressError(TrainError, ValueError):
@@ -104,10 +107,14 @@ class GrippedPad:
 
     def __init__(self, pad: Pad) -> None:
         self.pad = pad
-        geometry = USPA44
+        geometry = pad.grid
         self.cell_mm = geometry.pixel_pitch_mm(_CELLS_PER_PITCH)
-        self._pattern_cells = geometry.rows * _CELLS_PER_PITCH
-        self.size = self._pattern_cells + 2 * int((geometry.width_mm / self.cell_mm - self._pattern_cells) // 2)
+        # Solved on a square as wide as the longer side; where the pad ends before, nothing touches.
+        self._side = max(geometry.rows, geometry.cols)
+        self._pattern_cells = self._side * _CELLS_PER_PITCH
+        side_mm = max(geometry.width_mm, geometry.height_mm)
+        self.size = self._pattern_cells + 2 * int((side_mm / self.cell_mm - self._pattern_cells) // 2)
+        self._beside = ~on_pad(geometry, self.size * SAMPLES, self.cell_mm / SAMPLES)
         self._solvers: dict[Cover, ContactSolver] = {}
         self._friction = FrictionSolver(pad.layer, self.size, self.cell_mm)
         self.skin = Skin(
@@ -190,14 +197,19 @@ class GrippedPad:
         fine_mm, touching = pressed_in(
             solvers, covers, depth_mm, cells_mm, pressure, pressure, pressed, self._pattern_cells
         )
-        patterns = heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2)
+        patterns = self._cut(heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2), FINE_SCALE)
         return Taps(
             counts=self.skin.flat_frames(pressure / MAX_INDENTATION_MM, end * MAX_INDENTATION_MM),
             force_n=(most_n[:, None] * end).astype(np.float32),
             indentation_mm=(end * MAX_INDENTATION_MM).astype(np.float32),
             unit_patterns=patterns / np.float32(MAX_INDENTATION_MM),
-            touching=touching,
+            touching=self._cut(touching, FINE_SCALE),
         )
+
+    def _cut(self, maps: NDArray[_Kind], scale: int) -> NDArray[_Kind]:
+        """Return the part of square maps (n, side, side), so many pixels a pitch, that lies over the taxels."""
+        away = (self._side - np.array([self.pad.grid.rows, self.pad.grid.cols])) * scale // 2
+        return maps[..., away[0] : self._side * scale - away[0], away[1] : self._side * scale - away[1]]
 
     def _under(
         self, heights_mm: NDArray[np.float32]
@@ -207,6 +219,8 @@ class GrippedPad:
         Raises:
             PressError: nothing lies under the pad.
         """
+        if self._beside.any():
+            heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)
         if not (heights_mm.max(axis=(1, 2)) > -100).all():
             raise PressError("nothing lies under the pad: expected a shape that reaches it")
         depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm + self._uneven_mm
@@ -259,7 +273,7 @@ class GrippedPad:
         fine_mm, touching = pressed_in(
             solvers, covers, depth_mm, cells_mm, pressure, on_pad, pressed, self._pattern_cells
         )
-        patterns = heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2)
+        patterns = self._cut(heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2), FINE_SCALE)
         loads = np.concatenate([sideways, on_pad[:, None]], axis=1)
         force = loads.sum(axis=(2, 3)) * np.float32(self.cell_mm**2)
         across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
@@ -267,8 +281,8 @@ class GrippedPad:
         return Presses(
             counts=counts,
             patterns=resample(patterns, FINE_SCALE, scale),
-            touching=resample_touching(touching, FINE_SCALE, scale),
-            traction_kpa=self._coarse(loads) * 1e3,
+            touching=resample_touching(self._cut(touching, FINE_SCALE), FINE_SCALE, scale),
+            traction_kpa=self._cut(self._coarse(loads) * 1e3, TRACTION_SCALE),
             force_n=force,
             twist_nmm=twist.astype(np.float32),
             indentation_mm=pressed,
@@ -276,7 +290,7 @@ class GrippedPad:
 
     def _coarse(self, loads: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return means of loads (n, 3, size, size) on the traction's grid, whose outer pixels include loads outside."""
-        count = USPA44.rows * TRACTION_SCALE
+        count = self._side * TRACTION_SCALE
         side = self._pattern_cells // count
         owner = np.clip((np.arange(self.size) - (self.size - self._pattern_cells) // 2) // side, 0, count - 1)
         gather = (owner == np.arange(count)[:, None]).astype(np.float32) / side

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import PADS, USPA44, SensorGeometry
 from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 from train.physics.side_correction import FreeSides
@@ -38,10 +38,11 @@ class Pad:
         in_plane_share: factor on the in-plane movement that pressure alone gives the magnets.
         magnet_height_mm: of the magnets' centres above the board.
         counts_per_newton: summed z under an even load.
-        pitch_mm: distance of neighbouring taxels.
+        pitch_mm: distance of neighbouring taxels, of another model in proportion to its own.
         free_sides: compliance of the pad's free sides, 0 for an infinite layer, 1 for the finite elements' pad.
         uneven_mm: RMS of the pad's own unevenness.
         seed: of the unevenness and of the differences between magnets; None for a perfect pad.
+        model: name of its grid, see firmware_bridge.pad_geometry.PADS.
     """
 
     thickness_mm: float = 4.5
@@ -54,6 +55,12 @@ class Pad:
     free_sides: float = 0.0
     uneven_mm: float = 0.0
     seed: int | None = None
+    model: str = USPA44.name
+
+    @property
+    def grid(self) -> SensorGeometry:
+        """Nominal geometry of its model."""
+        return next(pad for pad in PADS if pad.name == self.model)
 
     @property
     def layer(self) -> Layer:
@@ -72,7 +79,9 @@ class Pad:
 
     def geometry(self) -> SensorGeometry:
         """Return the geometry with the pad's true pitch."""
-        return replace(USPA44, pitch_mm=self.pitch_mm)
+        if self.grid == USPA44:
+            return replace(USPA44, pitch_mm=self.pitch_mm)
+        return replace(self.grid, pitch_mm=self.grid.pitch_mm * self.pitch_mm / USPA44.pitch_mm)
 
     def rest(self, taxels: int) -> NDArray[np.float64]:
         """Return the place and lean of each magnet at rest, as a movement, (taxels, 5)."""
