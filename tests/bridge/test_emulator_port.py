@@ -262,7 +262,8 @@ def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
         scans += read_until_lost(link)
     apart_ns = np.diff([scan.device_ns for scan in scans if scan.device_ns is not None])
     assert len(scans) == 24
-    assert apart_ns.min() > 40_000_000 and apart_ns.max() > 1_000_000_000, "its stamps have the stop as well"
+    assert apart_ns.max() > 1_000_000_000, "its stamps have the stop as well"
+    assert apart_ns.min() > 20_000_000, "no burst; a clock that is followed may be corrected by some ms after a stop"
 
 
 def test_a_stop_amid_a_scan_tears_none():

@@ -121,7 +121,7 @@ def timeless(record):
 def played(files, **settings):
     """Records of the API, written by its own sink."""
     out, model = files / "api.jsonl", load_model(files / "tiny.onnx")
-    with open_source(f"replay:{files}/taps.npz", rate_hz=50) as source:
+    with open_source(f"replay:{files}/taps.npz", rate_hz=20) as source:
         runtime = open_runtime(model, source, baselines=files / "zero.json", **settings)
         sink, stream = open_sink(f"jsonl:{out}", model.contract, source), Stream(source, runtime)
         for result in stream:
@@ -141,7 +141,7 @@ def played(files, **settings):
     ],
 )
 def test_records_of_the_command_line_are_those_of_the_api(files, options, settings):
-    fixed = ["--model", files / "tiny.onnx", "--baseline", files / "zero.json", "--rate-hz", "50"]
+    fixed = ["--model", files / "tiny.onnx", "--baseline", files / "zero.json", "--rate-hz", "20"]
     for _ in range(5):
         made = played(files, **settings)
         said = records(run(*fixed, "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", *options).stdout)
