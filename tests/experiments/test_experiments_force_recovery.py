@@ -162,6 +162,6 @@ def test_training_presses_go_with_their_forces(bench):
     assert scans.windows.shape == (40, 4, 3, 4, 4)
     assert 0.3 * 0.99 < scans.force_n.min() < 2
     assert scans.force_n.max() > 6
-    np.testing.assert_allclose(z_of(scans) / scans.force_n, 1450, rtol=0.35)
+    np.testing.assert_allclose(z_of(scans) / scans.force_n, 1450, rtol=0.5)  # some lie on the rim or are dragged
     # A deformation is a force over a stiffness; one figure's may be a few times another's, not more.
     assert np.ptp(np.log(scans.volume_mm3 / scans.force_n)) < np.log(4)
