@@ -116,7 +116,7 @@ def test_the_report_has_every_training_set_on_every_test_set(page):
     rows = rows_of(page.with_suffix(".csv"))
     assert len({(row["trained on"], row["tested on"], row["taps"]) for row in rows}) == len(rows) == 5 * 4 * 2
     assert {"test PSNR dB", "covered %", "width %", "parameters", "MMAC", "run time ms", "steps"} <= set(rows[0])
-    assert len(rows_of(page.with_name("unseen-verdict.csv"))) == 40
+    assert len(rows_of(page.with_name("unseen-verdict.csv"))) == 30
     for picture in ("unseen.png", "unseen-shapes.png"):
         assert page.with_name(picture).stat().st_size > 10_000
-    assert page.read_text().count("the bound is ") == 8
+    assert page.read_text().count("the bound is ") == 6

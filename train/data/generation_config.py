@@ -1,4 +1,4 @@
-"""What lets a set be made again with the same bytes: its seed, one thread, and the hash of a user's file."""
+"""Means to make a set again with the same bytes: its seed, one thread, and the hash of a user's file."""
 
 import hashlib
 from collections.abc import Iterator
