@@ -94,7 +94,7 @@ class Rounds:
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
         self._received: dict[str, int] | None = None
-        self._pace: Pace | None = None
+        self._pace: tuple[Pace, frozenset[str]] | None = None
         self._patience_s = patience_s
         self._restless_ns: dict[str, int] = {}
         path = None if source.kind == "replay" else source.sensor_file.path
@@ -282,13 +282,13 @@ class Rounds:
         if len(self._deadlines) >= TOGETHER_SENSORS:
             period_s = self._shortest_period_s()
             together_s = period_s / READS_A_PERIOD if period_s < LONGEST_TOGETHER_S else 0.0
-            before_s = 0.0 if self._pace is None else self._pace.together_s
+            before_s = 0.0 if self._pace is None else self._pace[0].together_s
             if abs(together_s - before_s) < SAME_SHARE * together_s:
                 together_s = before_s
-        pace = Pace(together_s, self._patience_s if self._deadlines else 0.0, frozenset(self._restless_ns))
+        pace = Pace(together_s, self._patience_s if self._deadlines else 0.0), frozenset(self._restless_ns)
         if pace != self._pace:
             self._pace = pace
-            self._source.set_pace(pace)
+            self._source.set_pace(*pace)
 
     def _follow(self, result: Result) -> Result:
         """Count a result, and give it to the sinks."""

@@ -1,17 +1,17 @@
-"""Source of scans from links, read in threads of its own so that nothing waits for inference."""
+"""Source of scans from links, each read in a thread of its own: nothing waits for inference or for a slow link."""
 
 import atexit
 import threading
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, wait
 from contextlib import ExitStack
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Final, Protocol, Self
 
 from edge.errors import SourceTakenError, UsageError
-from edge.pipeline.link_reader import LinkReader, started
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, Pace, SourceKind, one_origin
@@ -19,9 +19,13 @@ from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorFile
+from firmware_bridge.silence import POLL_S
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
+UNASKED_S: Final = 0.01
+"""Time between two reads of several links, in [s], until another pace is asked for: while a model loads nobody needs
+their scans at once, and reading frame by frame would slow that down until the kernel had no room for more."""
 
 
 class Reading(Protocol):
@@ -98,9 +102,12 @@ class Source:
         self._sleepers: dict[object, Callable[[], None]] = {}
         self._capacity_scans = capacity_scans
         self._through = False
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._reading = len(links)
+        self._failed: Future[None] | None = None
         self._open = ExitStack()
         self._stream: Callable[[], Reading | None] = lambda: None  # a stream that was dropped has ended
-        self._reader: LinkReader | None = None
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else "open" if self._opened else "not open"
@@ -118,7 +125,7 @@ class Source:
         `open` waits for it and raises its error. `close` also ends what was begun and never opened.
         """
         if self._opening is None:
-            self._opening, _ = started("source-opening", self._open_links)
+            self._opening, _ = _started("source-opening", self._open_links)
 
     def open(self) -> Self:
         """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
@@ -179,10 +186,11 @@ class Source:
         """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
         return next((asked for link in self._links if (asked := link.steer()) is not None), None)
 
-    def set_pace(self, pace: Pace) -> None:
-        """Allow scans to come late. A recording, whose scans wait for their reader, has no use for it."""
-        if self._reader is not None:
-            self._reader.set_pace(pace)
+    def set_pace(self, pace: Pace, restless: Collection[str] = ()) -> None:
+        """Allow scans to come late, but none that repeats the one before on a link with a restless sensor."""
+        for link in self._links:
+            still_s = 0.0 if any(name.startswith(link.prefix) for name in restless) else pace.still_s
+            link.set_pace(pace._replace(still_s=still_s))
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
@@ -228,8 +236,8 @@ class Source:
             if taken:
                 return taken
             self._through = True
-        if self._reader is not None:
-            self._reader.reading.result()
+        if self._failed is not None:
+            self._failed.result()
         return None
 
     async def wait_async(self, timeout_s: float) -> None:
@@ -262,11 +270,37 @@ class Source:
                 opening.enter_context(link)
             refuse_emulated(self.sensor_file, _one_kind(self._links), self._force)  # some know their kind only now
             if not self.patient:
-                self._reader = LinkReader(self._links, self._put, self._end)
-                self.thread_ids = self._reader.thread_ids
-                opening.callback(self._reader.close)
+                self._begin_reading()
+                opening.callback(self._end_reading)
             self._open = opening.pop_all()
         atexit.register(self.close)
+
+    def _begin_reading(self) -> None:
+        if len(self._links) > 1:
+            self.set_pace(Pace(UNASKED_S))
+        for link in self._links:
+            reading, thread = _started("link-reader", partial(self._follow, link))
+            self._threads.append(thread)
+            reading.add_done_callback(self._end)
+        self.thread_ids = tuple(thread.native_id for thread in self._threads if thread.native_id is not None)
+
+    def _end_reading(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _follow(self, link: Link) -> None:
+        """Read a link until it has ended, is lost for good, or all reading ends."""
+        while not (self._stop.is_set() or link.ended):
+            scans: Sequence[Scan] = ()
+            try:
+                scans = link.read(POLL_S)
+            finally:  # its notices come also before its end
+                notices: list[Notice | TimedPose] = [*link.notices()]
+                if link.kind != "device":  # recordings hold poses, and the demo's robot states some
+                    notices += link.poses()
+                if notices or scans:
+                    self._put(notices, scans)
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
@@ -289,9 +323,15 @@ class Source:
                     self._make_room()
                 self._waiting.append(scan)
 
-    def _end(self) -> None:
+    def _end(self, reading: Future[None]) -> None:
+        """Note that a link was read to its end; if it was lost, that ends the others."""
+        if reading.exception() is not None:
+            self._failed = self._failed or reading
+            self._stop.set()
         with self._lock:
-            self._ring()
+            self._reading -= 1
+            if not self._reading:
+                self._ring()
 
     def _ring(self) -> None:
         self._bell.put(None)
@@ -313,3 +353,23 @@ def _one_kind(links: Sequence[Link]) -> SourceKind:
         listed = ", ".join(f"{link.name} is {link.kind}" for link in links)
         raise SourceError(f"sources are of several kinds ({listed}), expected one: run them apart")
     return kinds.pop()
+
+
+def _started(name: str, run: Callable[[], None]) -> tuple[Future[None], threading.Thread]:
+    """Return the end of a function that a new thread runs, and the thread.
+
+    It is a daemon, unlike one of an executor, for which a program that forgets to close its source would wait for ever.
+    """
+    end: Future[None] = Future()
+
+    def guarded() -> None:
+        try:
+            run()
+        except BaseException as error:  # noqa: BLE001 - raised again where the end is awaited
+            end.set_exception(error)
+        else:
+            end.set_result(None)
+
+    thread = threading.Thread(target=guarded, name=name, daemon=True)
+    thread.start()
+    return end, thread

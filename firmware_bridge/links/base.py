@@ -10,32 +10,16 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
 
-class Wait(NamedTuple):
-    """Condition of the next `read(0)`: once the descriptor is readable, and after `longest_s` in any case.
-
-    Attributes:
-        descriptor: file descriptor of the open link.
-        longest_s: longest wait, in [s].
-        listens: False where nothing is to be read before `longest_s` is over, unless the link is lost.
-    """
-
-    descriptor: int
-    longest_s: float
-    listens: bool = True
-
-
 class Pace(NamedTuple):
     """Leave to read scans late, together with others, which costs less than to wake up for each.
 
     Attributes:
         together_s: time between two reads, in [s], the same for all links that are read together; 0: as bytes come.
         still_s: longest time for which scans may wait that repeat the ones before within noise, in [s]; 0: none.
-        restless: names of sensors for whose sake no scan of their link may wait so.
     """
 
     together_s: float = 0.0
     still_s: float = 0.0
-    restless: frozenset[str] = frozenset()
 
 
 SourceKind = Literal["device", "replay", "emulated"]
@@ -118,13 +102,6 @@ class Link(Protocol):
         The scans of many sensors are then read together, and a sensor that nothing touches is read once a period and
         decoded a few times a second. A link that cannot do so ignores it.
         """
-
-    def wait_on(self) -> Wait | None:
-        """Return the condition to wait for before `read(0)`, which then does not wait; None where a read may take long.
-
-        A link that waits for something else than a descriptor, or is about to open, needs a thread of its own.
-        """
-        return None
 
     def notices(self) -> list[Notice]:
         """Return the notices since the last call, all from before the scans that the last `read` returned."""

@@ -45,7 +45,6 @@ class BurstReader:
 
     Attributes:
         descriptor: file descriptor of the port.
-        held_until_s: time until which the reader waits for the end of a scan, its beginning fetched; None otherwise.
         empty_s: latest time at which no more than the beginning of a scan was waiting.
     """
 
@@ -63,8 +62,6 @@ class BurstReader:
         self.descriptor = descriptor
         self._clock_s = clock_s
         self._newest_s = self.empty_s = clock_s()
-        self._held = b""
-        self.held_until_s: float | None = None
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
@@ -91,62 +88,57 @@ class BurstReader:
         """Return the bytes received, once `wanted_bytes` have come, or no more come.
 
         Args:
-            timeout_s: longest wait for the first byte, in [s]. At 0 the call does not wait: the beginning of a scan is
-                kept, and the caller requests the rest by another call after `longest_wait_s`.
-            wanted_bytes: number of bytes until a scan can close; constant until bytes are returned.
+            timeout_s: longest wait for the first byte, in [s].
+            wanted_bytes: number of bytes until a scan can close.
 
         Raises:
             OSError: the port is gone, and all earlier bytes have been returned.
         """
         end_s = self._clock_s() + timeout_s
         while True:
-            left_s = max(end_s - self._clock_s(), 0.0)
-            wait_s = min(left_s, self.longest_wait_s(wanted_bytes))
-            if 0 < wait_s <= STEP_S:  # poll() counts in milliseconds
-                time.sleep(wait_s)
-                wait_s = 0
-            data = self._step(bool(self._poll.poll(1000 * wait_s)), wanted_bytes)
-            if data or left_s <= 0:
+            now_s = self._clock_s()
+            left_s = max(end_s - now_s, 0.0)
+            hurried = wanted_bytes < FULL_BYTES and now_s - self._newest_s <= LONGEST_REST_S
+            full = self._fills(0.0 if hurried else min(left_s, LONGEST_WAIT_S))
+            begun_s = self._clock_s()
+            data = self._fetch(full, wanted_bytes, begun_s)
+            if data:
+                self._newest_s = self._clock_s()
+                return data
+            self.empty_s = begun_s  # from before the read: this thread may not run for long after it
+            if left_s <= 0:
                 return data
 
-    def longest_wait_s(self, wanted_bytes: int) -> float:
-        """Return the longest time until the next call of `read` while the descriptor is not readable, in [s]."""
-        if self.held_until_s is None:
-            hurried = wanted_bytes < FULL_BYTES and self._clock_s() - self._newest_s <= LONGEST_REST_S
-            return 0.0 if hurried else LONGEST_WAIT_S
-        left_s = max(self.held_until_s - self._clock_s(), 0.0)
-        return left_s if wanted_bytes >= FULL_BYTES else min(left_s, STEP_S)
-
-    def _step(self, full: bool, wanted_bytes: int) -> bytes:
-        """Return the bytes there, unless they are the beginning of a scan whose end is on its way.
+    def _fetch(self, full: bool, wanted_bytes: int, now_s: float) -> bytes:
+        """Return the bytes there, after waiting for the end of a scan that has begun.
 
         Args:
             full: True if FULL_BYTES are waiting, or the port is gone.
             wanted_bytes: as in `read`.
+            now_s: monotonic, in [s].
         """
-        now_s = self._clock_s()
-        if self.held_until_s is None:
-            if wanted_bytes >= FULL_BYTES:
-                early = wanted_bytes - FULL_BYTES
-                self._held = self._take(b"", early if full else wanted_bytes)
-                on_its_way = full and len(self._held) == early
-            else:
-                self._held = self._take(b"", wanted_bytes)
-                on_its_way = now_s - self._newest_s <= LONGEST_REST_S and len(self._held) < wanted_bytes
-            if on_its_way:
-                self.held_until_s = now_s + LONGEST_REST_S
-                return b""
+        whole = wanted_bytes >= FULL_BYTES
+        early_bytes = wanted_bytes - FULL_BYTES if whole and full else wanted_bytes
+        data = self._take(b"", early_bytes)
+        if whole:
+            on_its_way = full and len(data) == early_bytes
         else:
-            if full or wanted_bytes < FULL_BYTES or now_s >= self.held_until_s:
-                self._held = self._take(self._held, wanted_bytes)
-            if now_s < self.held_until_s and not (full or len(self._held) == wanted_bytes):
-                return b""
-        data, self._held, self.held_until_s = self._held, b"", None
-        if data:
-            self._newest_s = self._clock_s()
-        else:
-            self.empty_s = now_s  # from before the read: this thread may not run for long after it
+            on_its_way = now_s - self._newest_s <= LONGEST_REST_S and len(data) < wanted_bytes
+        end_s, full = now_s + LONGEST_REST_S, False
+        while on_its_way and not full and len(data) < wanted_bytes:
+            left_s = max(end_s - self._clock_s(), 0.0)
+            full = self._fills(left_s if whole else min(left_s, STEP_S))
+            if full or not whole or left_s <= 0:
+                data = self._take(data, wanted_bytes)
+            on_its_way = left_s > 0
         return data
+
+    def _fills(self, wait_s: float) -> bool:
+        """Return whether FULL_BYTES are waiting, or the port is gone, after waiting at most so long for it."""
+        if 0 < wait_s <= STEP_S:  # poll() counts in milliseconds
+            time.sleep(wait_s)
+            wait_s = 0
+        return bool(self._poll.poll(1000 * wait_s))
 
     def take_all(self) -> bytes:
         """Return all bytes there, without waiting for more; `gather` was called before.

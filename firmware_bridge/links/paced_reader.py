@@ -79,7 +79,7 @@ class PacedReader:
         A port rests only with time stamps: by the times of reads, the next one would drift away from the end of a scan.
         """
         pace, now_s = self.pace, self._clock_s()
-        held_s = 0.0 if pace.restless else pace.still_s
+        held_s = pace.still_s
         stamped_ns = scans[-1].device_ns if held_s and scans else None
         period_s = None if stamped_ns is None else self._scans.period_s
         self._hold_s, self._together_s = 0.0, pace.together_s
@@ -125,7 +125,7 @@ class PacedReader:
             now_s = self._clock_s()
             pieces.append(Piece(data, round(1e9 * now_s), round(1e9 * empty_s)))
             self.due_s = due_s = self._step_s + (due_s if now_s - due_s < LATE_S else now_s)
-            if due_s - pieces[0].time_ns / 1e9 > self._hold_s or self.pace.restless or not self._scans.still(data):
+            if due_s - pieces[0].time_ns / 1e9 > self._hold_s or not self.pace.still_s or not self._scans.still(data):
                 break
         self._pieces = []
         return pieces

@@ -1,4 +1,4 @@
-"""Wrapper that opens a lost or silent link again, for as long as it takes.
+"""Wrapper that gives a link its user's name, puts its taxels in place, and opens it again when it is lost or silent.
 
 It is also the border where the errors of drivers and of network libraries stop: each is the loss of one link.
 """
@@ -6,13 +6,18 @@ It is also the border where the errors of drivers and of network libraries stop:
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, TypeVar
 
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, Pace, SerialLine, SourceKind, Wait
+from firmware_bridge.links.base import Link, Notice, NoticeKind, Pace, SerialLine
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import LINK_SILENT_S
 
@@ -33,8 +38,10 @@ class LastingLink(Link):
     def __init__(
         self,
         link: Link,
-        give_up_s: float = math.inf,
+        give_up_s: float | None = math.inf,
         *,
+        name: str = "",
+        places: Mapping[str, Mounting] = MappingProxyType({}),
         clock_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
@@ -42,14 +49,26 @@ class LastingLink(Link):
 
         Args:
             link: wrapped link, whose first opening must succeed.
-            give_up_s: longest outage or silence, in [s]; 0 allows no outage, but any silence.
+            give_up_s: longest outage or silence, in [s]; 0 allows no outage, but any silence. None for a source that is
+                not opened again, and counts no outages.
+            name: prefix of the sensors: "4" of "left" is "left/4"; without one they keep the names of the link.
+            places: mountings of sensors whose taxels come in the order of an id map, by the link's name of each. Links
+                that sort readings by their id take a `placed_map` instead, which costs no time.
             clock_ns: monotonic clock, in [ns].
             sleep: sleeps for a time in [s].
         """
         self.name = link.name
-        self.kind: SourceKind = link.kind
-        self.ended = False
+        self.kind = link.kind
+        self.ended = link.ended
         self.trouble: str | None = None
+        self.patient = link.patient
+        self.unix_offset_ns = link.unix_offset_ns
+        self.origin = link.origin
+        self.states_poses = link.states_poses
+        self.prefix = f"{name}/" if name else ""
+        self.mountings = {f"{self.prefix}{sensor}": one for sensor, one in link.mountings.items()}
+        self._told_as = f"{name}: " if name else ""
+        self._places = dict(places)
         self._link = link
         self._give_up_s = give_up_s
         self._clock_ns = clock_ns
@@ -83,8 +102,7 @@ class LastingLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; an empty list while the link is away.
 
-        The next call closes and opens a link that is lost or silent, which may take long: before it, `wait_on`
-        returns None.
+        The next call closes and opens a link that is lost or silent, which may take long.
 
         Raises:
             LinkLostError: it was away for longer than allowed.
@@ -109,6 +127,10 @@ class LastingLink(Link):
             if self._lost_ns is not None or self._silent:
                 self._end_outage(now_ns)
             self._received_ns = now_ns
+            if self._places:
+                scans = [self._places[one.sensor].place(one) if one.sensor in self._places else one for one in scans]
+            if self.prefix:
+                scans = [replace(scan, sensor=f"{self.prefix}{scan.sensor}") for scan in scans]
         else:
             self._suspect()
         return scans
@@ -117,18 +139,31 @@ class LastingLink(Link):
         """Pass on how late scans may come."""
         self._link.set_pace(pace)
 
-    def wait_on(self) -> Wait | None:
-        """Return the wait condition of the wrapped link; None while it is to be opened again."""
-        return self._link.wait_on() if self._open else None
-
     def notices(self) -> list[Notice]:
-        """Return the events of the link since the last call."""
-        notices, self._notices = self._notices, []
-        return notices + self._link.notices()
+        """Return the events of the link since the last call, with the user's name for it."""
+        notices, self._notices = self._notices + self._link.notices(), []
+        return [
+            notice._replace(sensors=f"{self.prefix}{notice.sensors}", text=notice.text and self._told_as + notice.text)
+            for notice in notices
+        ]
+
+    def poses(self) -> list[TimedPose]:
+        """Return the poses since the last call; those of all its sensors stay those of all."""
+        poses = self._link.poses()
+        if not self.prefix:
+            return poses
+        return [one if one.sensor is None else replace(one, sensor=f"{self.prefix}{one.sensor}") for one in poses]
+
+    def steer(self) -> Callable[[PadPose | None], None] | None:
+        """Return the wrapped link's function that takes where to tap next."""
+        return self._link.steer()
 
     def counters(self) -> dict[str, int]:
-        """Return the wrapped link's counters, its outages (losses and silences) and its reopenings."""
-        return {**self._link.counters(), "outages": self._outages, "reopenings": self._reopenings}
+        """Return the wrapped link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
+        counters = self._link.counters()
+        if self._give_up_s is None:
+            return counters
+        return counters | {"outages": self._outages, "reopenings": self._reopenings}
 
     def can_ids(self) -> frozenset[int]:
         """Return the CAN ids of the wrapped link."""
@@ -147,7 +182,7 @@ class LastingLink(Link):
     def _suspect(self) -> None:
         """Schedule another opening of a silent link, less often each time."""
         now_ns = self._clock_ns()
-        if self.ended or self._give_up_s == 0 or now_ns - self._received_ns < self._silent_s * 1e9:
+        if self.ended or not self._give_up_s or now_ns - self._received_ns < self._silent_s * 1e9:
             return
         if not self._silent and self._lost_ns is None:
             self._silent = True
@@ -176,7 +211,7 @@ class LastingLink(Link):
         now_ns = self._clock_ns() if now_ns is None else now_ns
         self._open = False
         self._away = True
-        if self._give_up_s == 0:
+        if not self._give_up_s:
             raise LinkLostError(why)
         if self._lost_ns is None:
             self._outages += not self._silent

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
-from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -74,11 +73,10 @@ def open_sources(
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
         own = {sensor.removeprefix(f"{name}/"): one for sensor, one in mountings.items() if _is_of(sensor, name)}
         link = open_source(form, rate_hz, demo_recording, model, own)
-        if not (form or "").startswith(_FINITE):
-            link = LastingLink(link, give_up_s)
         if name in named:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
-        named[name] = MountedLink(link, name) if name else link
+        finite = (form or "").startswith(_FINITE)
+        named[name] = LastingLink(link, None if finite else give_up_s, name=name) if name or not finite else link
     return list(named.values())
 
 
@@ -191,7 +189,7 @@ def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: boo
     moved = {name: one for name, one in mountings.items() if one.moves_taxels or (tells_newtons and one.reverses_axes)}
     if not moved:
         return link
-    return MountedLink(link, places=moved)
+    return LastingLink(link, None, places=moved)
 
 
 def _refusal(text: str) -> SourceError:

@@ -19,7 +19,7 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Pace, SerialLine, SourceKind, Wait
+from firmware_bridge.links.base import Link, Pace, SerialLine, SourceKind
 from firmware_bridge.links.fd_reader import BurstReader
 from firmware_bridge.links.holders import in_use
 from firmware_bridge.links.paced_reader import PacedReader, Piece
@@ -108,14 +108,12 @@ class SlcanSerialLink(Link):
         self._received_bytes = 0
         self._dropped_bytes = 0
         self._unread = Unread()
-        self._stamps_to_set: bytes | None = None
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
         self._paced = PacedReader(self._scans)
 
     def __enter__(self) -> Self:
         self._begin_anew()
-        self._stamps_to_set = None
         self.port = self._plugged.find(serial_ports())
         self._serial = self._open_port()
         try:
@@ -150,8 +148,6 @@ class SlcanSerialLink(Link):
         """
         if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
-        if self._stamps_to_set is not None:
-            self._open_anew(self._serial, self._stamps_to_set)
         try:
             self._bursts.gather(self._paced.due_s is not None)
             pieces = self._receive(self._bursts, timeout_s)
@@ -173,21 +169,17 @@ class SlcanSerialLink(Link):
         if self._stamps_on and (self._stamps_are_none() or self._scans.stamps_dropped):
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
-            self._stamps_to_set = STAMPS_OFF
+            self._open_anew(self._serial, STAMPS_OFF)
         elif scans and self._asks_stamps and not self._stamps_on:  # switched off while no scan came
             self._stamps_on = True
-            self._stamps_to_set = STAMPS_ON
-        if timeout_s > 0 and self._stamps_to_set is not None:
-            self._open_anew(self._serial, self._stamps_to_set)
+            self._open_anew(self._serial, STAMPS_ON)
         return scans
 
     def _receive(self, bursts: BurstReader, timeout_s: float) -> list[Piece]:
-        """Return the bytes to decode; an empty list while the end of a scan is on its way, or while scans may wait."""
+        """Return the bytes to decode; an empty list while scans may wait."""
         if self._paced.due_s is not None:
             return self._paced.read(bursts, timeout_s)
         data = bursts.read(timeout_s, self._scans.bytes_until_scan())
-        if bursts.held_until_s is not None:
-            return []
         empty_ns = round(bursts.empty_s * 1e9)
         with suppress(OSError):  # the next call reports an error after bytes
             bursts.look()
@@ -196,15 +188,6 @@ class SlcanSerialLink(Link):
     def set_pace(self, pace: Pace) -> None:
         """Set how late scans may come."""
         self._paced.pace = pace
-
-    def wait_on(self) -> Wait | None:
-        """Return the port's descriptor; None while the channel must be reopened, which waits for a quiet line."""
-        if self._bursts is None or self._stamps_to_set is not None:
-            return None
-        due_s = self._paced.due_s
-        if due_s is not None:
-            return Wait(self._bursts.descriptor, max(due_s - time.monotonic(), 0.0), listens=False)
-        return Wait(self._bursts.descriptor, self._bursts.longest_wait_s(self._scans.bytes_until_scan()))
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
@@ -267,7 +250,6 @@ class SlcanSerialLink(Link):
 
     def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
         """Reopen the channel with time stamps on or off, on a quiet line: of two forms at once most would be lost."""
-        self._stamps_to_set = None
         for command in (CLOSE, stamps):
             _say(port, command)
         with suppress(*_PORT_ERRORS):  # gone, which the next read reports

@@ -8,8 +8,7 @@ from edge_samples import FakeLink, make_scan
 from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, Wait
-from firmware_bridge.links.mounted import MountedLink
+from firmware_bridge.links.base import Link, Notice
 from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
@@ -256,15 +255,15 @@ def test_trouble_is_told_when_it_comes_and_when_it_goes():
 
 
 def test_the_doctor_knows_the_port_behind_a_name():
-    link = MountedLink(SlcanSerialLink("/dev/ttyUSB7", 115_200), "left")
-    assert line_facts(link) == line_facts(LastingLink(link)) == LineFacts("/dev/ttyUSB7", 115_200)
+    link = SlcanSerialLink("/dev/ttyUSB7", 115_200)
+    assert line_facts(link) == line_facts(LastingLink(link, name="left")) == LineFacts("/dev/ttyUSB7", 115_200)
     assert line_facts(FakeLink([])) == LineFacts()
 
 
 def test_can_ids_are_known_behind_names_and_outages():
     serial = SlcanSerialLink("/dev/ttyUSB7")
     serial._scans.feed(encode_frame(CanFrame(0x004, bytes(8))), 1)
-    assert LastingLink(MountedLink(serial, "left")).can_ids() == {0x004}
+    assert LastingLink(serial, name="left").can_ids() == {0x004}
     assert FakeLink([]).can_ids() == frozenset()
 
 
@@ -286,32 +285,8 @@ def test_trouble_and_notices_are_of_the_name():
 
     inner = Telling([[make_scan(0)]])
     inner.trouble = "bus-off"
-    with MountedLink(inner, "left") as link:
+    with LastingLink(inner, None, name="left") as link:
         assert [scan.sensor for scan in link.read(0)] == ["left/4"]
         assert link.trouble == "bus-off"
-        assert [(notice.sensors, notice.text) for notice in link.notices()] == [("left/", "left: before read 1")]
-
-
-class SlowToClose(WorldLink):
-    """Takes a second to close, as an adapter does that takes no more bytes."""
-
-    def __exit__(self, *exc_info):
-        self.world.sleep(1.0)
-        super().__exit__(*exc_info)
-
-    def wait_on(self):
-        return Wait(7, 0.02)
-
-
-@pytest.mark.parametrize("stretches", [{"away": [(0.1, 3.0)]}, {"mute": [(0.1, 3.0)]}])
-def test_a_read_that_may_take_long_is_asked_for_a_thread_of_its_own(stretches):
-    """Links that share a thread are read only while `wait_on` names a descriptor, and never wait then."""
-    world = World(**stretches)
-    with LastingLink(SlowToClose(world), clock_ns=lambda: world.now_ns, sleep=world.sleep) as link:
-        apart = 0
-        while world.now_ns < 6 * S:
-            shared, begun_ns = link.wait_on() is not None, world.now_ns
-            link.read(0 if shared else 0.1)
-            assert not shared or world.now_ns - begun_ns <= 0.02 * S
-            apart += not shared
-        assert apart and link.wait_on() == Wait(7, 0.02)
+        told = [("left/", "left: bus-off"), ("left/", "left: before read 1")]
+        assert [(notice.sensors, notice.text) for notice in link.notices()] == told

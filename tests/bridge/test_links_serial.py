@@ -365,25 +365,3 @@ def test_a_thread_that_stands_still_after_a_look_takes_the_port_for_empty_no_lat
         monkeypatch.undo()
         os.close(leader)
         os.close(follower)
-
-
-def test_the_end_of_a_scan_that_is_nearly_complete_is_looked_for_at_once():
-    """Two sensors at 300 Hz on one line leave no time to wait first."""
-    leader, follower = pty.openpty()
-    now_s = [100.0]
-    try:
-        tty.setraw(follower)
-        reader = bursts.BurstReader(follower, clock_s=lambda: now_s[0])
-        os.write(leader, b"t" * 22)
-        assert reader.read(0, 22) == b"t" * 22
-        assert reader.longest_wait_s(100) == 0 and reader.longest_wait_s(352) == bursts.LONGEST_WAIT_S
-        os.write(leader, b"t" * 10)
-        assert reader.read(0, 22) == b"" and reader.held_until_s is not None
-        assert 0 < reader.longest_wait_s(22) <= bursts.STEP_S
-        now_s[0] += bursts.LONGEST_REST_S
-        assert reader.read(0, 22) == b"t" * 10 and reader.held_until_s is None
-        now_s[0] += 2 * bursts.LONGEST_REST_S
-        assert reader.longest_wait_s(100) == bursts.LONGEST_WAIT_S
-    finally:
-        os.close(leader)
-        os.close(follower)

@@ -144,19 +144,6 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
     assert {scan.device_ns for scan in scans} == {None} and link.trouble is None
 
 
-def test_to_leave_stamps_out_waits_for_a_read_that_may_take_its_time(monkeypatch):
-    """A thread that reads several links must not wait for the quiet line of one of them."""
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        assert device.received(10) == b"C\rS8\rZ1\rO\r" and link.wait_on() is not None
-        for line in [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)][:MOST_LATE_STAMPS]:
-            os.write(device.device_fd, line)
-        wait_for(lambda: link.read(0) == [] and link.wait_on() is None)
-        assert device.received(0) == b""
-        assert link.read(0.01) == [] and link.wait_on() is not None
-        assert device.received(7) == b"C\rZ0\rO\r"
-
-
 def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leave_them_out(monkeypatch):
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:

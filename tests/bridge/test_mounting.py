@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.mounted import MountedLink
+from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.registry import open_source
 from firmware_bridge.recording.csv_reader import CSV_HEADER, csv_header
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
@@ -74,9 +74,9 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
 
 @pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
 def test_forces_of_the_vendors_server_are_turned_wherever_its_sensor_is(mounting):
-    assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), MountedLink)
+    assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), LastingLink)
     as_mapped = open_source("xela-server:ws://robot", mountings={"1": Mounting(gains=(2.0,) * 48)})
-    assert not isinstance(as_mapped, MountedLink)
+    assert not isinstance(as_mapped, LastingLink)
 
 
 def test_what_sits_as_mapped_costs_nothing():
@@ -141,7 +141,7 @@ def test_csv_of_the_vendors_server_is_put_in_place_and_what_edge_sr_recorded_is_
     )
     for name, expected in (("4.csv", TURNED.place(scan).counts), ("4.npz", scan.counts)):
         with open_source(f"replay:{tmp_path}/{name}", 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED}) as link:
-            assert isinstance(link, MountedLink) == (name == "4.csv") and link.kind == "replay"
+            assert isinstance(link, LastingLink) == (name == "4.csv") and link.kind == "replay"
             scans = []
             while not link.ended:
                 scans += link.read(1.0)

@@ -10,7 +10,6 @@ from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Pace
-from firmware_bridge.links.mounted import MountedLink
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Recording, Track
@@ -98,14 +97,14 @@ def test_a_read_may_end_within_a_line_of_mixed_sensors():
 
 
 @pytest.mark.parametrize(
-    ("links", "pace"),
+    ("links", "pace", "restless"),
     [
-        (1, Pace(still_s=0.1)),
-        (2, Pace(still_s=0.1, together_s=0.003)),
-        (2, Pace(still_s=0.1, restless=frozenset({"f0/4"}))),
+        (1, Pace(still_s=0.1), ""),
+        (2, Pace(still_s=0.1, together_s=0.003), ""),
+        (2, Pace(still_s=0.1), "f0/4"),
     ],
 )
-def test_scans_at_rest_come_several_at_once_and_none_is_lost_or_late_when_one_moves(links, pace):
+def test_scans_at_rest_come_several_at_once_and_none_is_lost_or_late_when_one_moves(links, pace, restless):
     """The press is in the newest scan of what comes with it; a link at rest does not wake up for another."""
     rng = np.random.default_rng(2)
     counts = (REST_COUNTS + rng.integers(-3, 4, (SCANS, 3, 4, 4))).astype(np.int32)
@@ -113,10 +112,10 @@ def test_scans_at_rest_come_several_at_once_and_none_is_lost_or_late_when_one_mo
     recording = Recording(Path("made.csv"), (Track("4", counts, None),), 100.0)
     with ExitStack() as closing:
         emulators = [closing.enter_context(Emulator([recording], waits=True)) for _ in range(links)]
-        opened = [LastingLink(SlcanSerialLink(emulator.port)) for emulator in emulators]
-        source = Source(*(MountedLink(link, f"f{index}") for index, link in enumerate(opened)))
+        named = enumerate(emulators)
+        source = Source(*(LastingLink(SlcanSerialLink(emulator.port), name=f"f{index}") for index, emulator in named))
         closing.enter_context(source)
-        source.set_pace(pace)
+        source.set_pace(pace, [restless] if restless else [])
         taken: list[list[Scan]] = []
         end_s = time.monotonic() + 30
         while sum(map(len, taken)) < SCANS * links and time.monotonic() < end_s:
@@ -126,7 +125,7 @@ def test_scans_at_rest_come_several_at_once_and_none_is_lost_or_late_when_one_mo
         scans = [scan for together in mine for scan in together]
         assert [scan.number for scan in scans] == list(range(SCANS))
         assert (np.stack([scan.counts for scan in scans]) == counts).all()
-        if f"f{index}/4" in pace.restless:
+        if f"f{index}/4" == restless:
             assert np.median([len(together) for together in mine if together]) <= 2
             continue
         assert max(len(together) for together in mine) >= 5

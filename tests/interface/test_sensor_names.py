@@ -7,29 +7,27 @@ from test_latest import StagedLink, scans, stream_of
 from edge.api import Commands, PadPose, Stream, UsageError, open_runtime, paired
 from edge.pipeline.commands import Command
 from edge.pipeline.scan_reader import Source
-from firmware_bridge.links.mounted import MountedLink
+from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.poses.timed_pose import TimedPose
 
 
 def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
     """A sensor may still come before; one of another link, or with a baseline, at any time."""
-    left, right = (
-        MountedLink(StagedLink(*stages, endless=True), name)
-        for name, stages in {"a": [scans(0), scans(*range(1, 20))], "b": [scans(0)]}.items()
-    )
-    with Source(left, right) as source:
+    left = StagedLink(scans(0), scans(*range(1, 20)), endless=True)
+    right = StagedLink(scans(0), endless=True)
+    with Source(LastingLink(left, None, name="a"), LastingLink(right, None, name="b")) as source:
         stream = Stream(source, open_runtime(FakeModel(), source, baselines={"a/8": BASELINE}))
         with pytest.raises(UsageError, match=r"^no sensor '4': the names begin with a/, b/$"):
             stream.latest("4")
-        left.wrapped.let(0)
+        left.let(0)
         assert stream.latest("a/5").result is stream.latest("b/5").result is None
-        left.wrapped.let(1)
+        left.let(1)
         for call in (stream.latest, stream.read, lambda name: stream.pose(0, 0, sensor=name)):
             with pytest.raises(UsageError, match=r"^no sensor 'a/5': sensors are a/4$"):
                 call("a/5")
         for name in ("a/8", "b/4", "b/5"):
             assert stream.latest(name).result is None
-        right.wrapped.let(0)
+        right.let(0)
         with pytest.raises(UsageError, match="no sensor 'a/5'"):
             next(paired(stream, ["a/4", "a/5"]))
 

@@ -324,7 +324,7 @@ def test_scans_may_wait_only_at_rest_and_only_where_every_sink_can_wait(impatien
     gates = {0: begun, 119: rested}
     sink = Patient(lambda result: gates.pop(result.scan.number, begun).set())
     run(link, sink, ListSink() if impatient else Patient())
-    assert paces == ([Pace()] if impatient else [Pace(still_s=0.2), Pace(still_s=0.2, restless=frozenset("4"))])
+    assert paces == ([Pace()] if impatient else [Pace(still_s=0.2), Pace()])
 
 
 @pytest.mark.parametrize(("sensors", "every_ms"), [(3, 0.0), (4, 2.5)])

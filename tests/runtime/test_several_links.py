@@ -1,8 +1,6 @@
 """One source of several links: scripts, and emulated adapters on pseudo-terminals."""
 
-import contextlib
 import itertools
-import os
 import threading
 import time
 
@@ -11,12 +9,10 @@ import pytest
 from bridge_samples import make_recording, stacked
 from edge_samples import FakeLink, make_scan
 
-from edge.pipeline.link_reader import LinkReader
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError, SourceError
-from firmware_bridge.links.base import Notice, Pace, Wait
-from firmware_bridge.links.mounted import MountedLink
+from firmware_bridge.links.base import Notice, Pace
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.scan import Scan
@@ -38,60 +34,20 @@ def numbers(taken, sensor):
     return [one.number for one in taken if isinstance(one, Scan) and one.sensor == sensor]
 
 
-class PipeLink(FakeLink):
-    """A script whose reads wait for a byte in a pipe each, and never themselves."""
-
-    def __init__(self, batches, **settings):
-        super().__init__(batches, **settings)
-        self.reader, self.writer = os.pipe()
-        self.threads = set()
-
-    def read(self, timeout_s):
-        self.threads.add(threading.get_ident())
-        assert timeout_s == 0, "a link that can be waited for was read as one that cannot"
-        if self._batches:
-            os.read(self.reader, 1)
-        return super().read(0)
-
-    def wait_on(self):
-        return Wait(self.reader, 10.0 if self._batches else 0)
-
-    def __exit__(self, *exc_info):
-        os.close(self.reader)
-        os.close(self.writer)
-
-
-def test_scans_of_each_link_keep_their_order_in_one_thread():
-    links = [PipeLink([[make_scan(n)] for n in range(50)]) for _ in range(4)]
-    source = Source(*(MountedLink(link, f"f{index}") for index, link in enumerate(links)))
-
-    def say():
-        for _ in range(50):
-            for link in links:
-                os.write(link.writer, b"!")
-
-    speaker = threading.Thread(target=say)
-    with source:
-        assert len(source.thread_ids) == 1
-        speaker.start()
-        taken = []
-        while (some := source.take(0.2)) is not None:
-            taken += some
-        speaker.join()
+def test_scans_of_each_link_keep_their_order():
+    links = [FakeLink([[make_scan(n)] for n in range(50)]) for _ in range(4)]
+    source = Source(*(LastingLink(link, None, name=f"f{index}") for index, link in enumerate(links)))
+    taken = take_all(source)
     for index in range(4):
         assert numbers(taken, f"f{index}/4") == list(range(50))
     assert source.counters() == {"scans": 200}
-    assert len(set.union(*(link.threads for link in links))) == 1
 
 
-@pytest.mark.parametrize("mixed", [False, True])
-def test_a_link_that_hangs_holds_up_no_other(mixed):
+def test_a_link_that_hangs_holds_up_no_other():
     gate = threading.Event()
     slow = FakeLink([gate, [make_scan(0)]])
-    fast = PipeLink([[make_scan(n)] for n in range(5)]) if mixed else FakeLink([[make_scan(n)] for n in range(5)])
-    with Source(MountedLink(slow, "slow"), MountedLink(fast, "fast")) as source:
-        if isinstance(fast, PipeLink):
-            os.write(fast.writer, b"!" * 5)
+    fast = FakeLink([[make_scan(n)] for n in range(5)])
+    with Source(LastingLink(slow, None, name="slow"), LastingLink(fast, None, name="fast")) as source:
         taken = []
         while len(taken) < 5:
             taken += source.take(5) or ()
@@ -102,54 +58,26 @@ def test_a_link_that_hangs_holds_up_no_other(mixed):
     assert numbers(taken, "slow/4") == [0]
 
 
-class Flapping(FakeLink):
-    """A link that is away before every other read."""
-
-    def __init__(self, reads):
-        super().__init__([[] for _ in range(reads)])
-        self.reader, self.writer = os.pipe()
-
-    def wait_on(self):
-        return Wait(self.reader, 0) if len(self._batches) % 2 else None
-
-    def __exit__(self, *exc_info):
-        os.close(self.reader)
-        os.close(self.writer)
-
-
-def test_a_link_that_comes_and_goes_for_days_costs_no_memory():
-    ended = threading.Event()
-    links = [Flapping(201), Flapping(201)]
-    with contextlib.ExitStack() as closing:
-        for link in links:
-            closing.enter_context(link)
-        reader = LinkReader(links, lambda notices, scans: None, ended.set)
-        closing.callback(reader.close)
-        assert ended.wait(60)
-        assert all(len(kept) <= 4 for kept in vars(reader).values() if isinstance(kept, (list, dict, tuple)))
-
-
 class Telling(FakeLink):
     def notices(self):
         return [Notice(self.reads, "back", f"before read {self.reads}")]
 
 
 def test_what_is_told_comes_before_the_scans_that_are_given_with_it():
-    taken = take_all(Source(Telling([[make_scan(n)] for n in range(20)]), MountedLink(FakeLink([]), "other")))
+    taken = take_all(
+        Source(Telling([[make_scan(n)] for n in range(20)]), LastingLink(FakeLink([]), None, name="other"))
+    )
     order = [one.text if isinstance(one, Notice) else one.number for one in taken]
     assert order[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_one_that_gives_up_ends_all_after_its_scans_and_what_it_told(shared):
-    lost = (PipeLink if shared else FakeLink)([[make_scan(0)]], error=LinkLostError("gone"))
+def test_one_that_gives_up_ends_all_after_its_scans_and_what_it_told():
+    lost = FakeLink([[make_scan(0)]], error=LinkLostError("gone"))
     told = [Notice(0, "lost", "told")]
     lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
     other = FakeLink([], endless=True)
     taken = []
-    with Source(lost, MountedLink(other, "other")) as source:
-        if isinstance(lost, PipeLink):
-            os.write(lost.writer, b"!!")
+    with Source(lost, LastingLink(other, None, name="other")) as source:
         with pytest.raises(LinkLostError, match="gone"):
             while True:
                 taken += source.take(0.2) or ()
@@ -164,7 +92,7 @@ def test_the_kind_of_several_is_what_they_are_once_open():
             self.kind = "emulated"
             return self
 
-    with Source(Late([]), MountedLink(Late([]), "b")) as source:
+    with Source(Late([]), LastingLink(Late([]), None, name="b")) as source:
         assert source.kind == "emulated"
     with pytest.raises(SourceError, match="of several kinds"):
         Source(Late([]), FakeLink([])).__enter__()
@@ -187,9 +115,7 @@ def two_adapters():
 
 def lasting(adapters):
     names = ("left", "right")
-    return [
-        MountedLink(LastingLink(SlcanSerialLink(one.port)), name) for name, one in zip(names, adapters, strict=True)
-    ]
+    return [LastingLink(SlcanSerialLink(one.port), name=name) for name, one in zip(names, adapters, strict=True)]
 
 
 @pytest.mark.parametrize("together_s", [0.0, 0.003])
@@ -206,7 +132,7 @@ def test_two_ports_are_read_in_one_thread_and_nothing_is_lost_or_mixed_up(two_ad
             if len(taken) > 40:  # both are open and have sent by then
                 threads |= {thread.name for thread in set(threading.enumerate()) - before}
         counters = source.counters()
-    assert threads == {"scan-reader"}
+    assert threads == {"link-reader"}
     assert not set(threading.enumerate()) - before, "a thread outlived the source"
     for recording, name in zip(recordings, ("left", "right"), strict=True):
         mine = [one for one in taken if isinstance(one, Scan) and one.sensor == f"{name}/4"]
@@ -230,8 +156,8 @@ def test_a_port_that_is_away_holds_up_no_other_and_comes_back_to_the_common_thre
         port = tmp_path / "left"
         port.symlink_to(gone.port)
         links = [
-            MountedLink(LastingLink(SlcanSerialLink(str(port))), "left"),
-            MountedLink(LastingLink(SlcanSerialLink(stays.port)), "right"),
+            LastingLink(SlcanSerialLink(str(port)), name="left"),
+            LastingLink(SlcanSerialLink(stays.port), name="right"),
         ]
         with Source(*links) as source:
 
@@ -258,14 +184,17 @@ def test_a_port_that_is_away_holds_up_no_other_and_comes_back_to_the_common_thre
                 back = next(index for index, one in enumerate(taken) if isinstance(one, Notice))
                 assert not numbers(taken[:back], "left/4"), "scans from behind the outage came before word of it"
                 readers = {t.name for t in threading.enumerate() if t.name.startswith(("link-", "scan-"))}
-                assert readers == {"scan-reader"}
+                assert readers == {"link-reader"}
                 assert source.counters()["outages"] == outages + 1
     assert [name for name in names if name.startswith("link-reader")]
     assert not {thread for thread in set(threading.enumerate()) - before if thread.name.startswith(("link-", "scan-"))}
 
 
 def test_the_source_closes_at_once_while_a_link_is_away():
-    links = [LastingLink(FakeLink([], error=LinkLostError("gone"))), MountedLink(FakeLink([], endless=True), "right")]
+    links = [
+        LastingLink(FakeLink([], error=LinkLostError("gone"))),
+        LastingLink(FakeLink([], endless=True), None, name="right"),
+    ]
     before = set(threading.enumerate())
     with Source(*links) as source:
         while not any(isinstance(one, Notice) for one in source.take(0.2) or ()):
