@@ -70,17 +70,8 @@ class NewestResults:
         newest.result = result
         newest.unseen += 1
 
-    def pass_on(self, result: Result) -> None:
-        """Take a result that an iteration returns at once."""
-        newest = self._sensors.get(result.scan.sensor)
-        if newest is None:
-            self._sensors[result.scan.sensor] = _Newest(result, 0)
-            return
-        newest.result = result
-        newest.unseen = 0
-
     def see(self, result: Result) -> None:
-        """Count a result that was taken before, and that an iteration returns now."""
+        """Count a result that an iteration returns now."""
         self._sensors[result.scan.sensor].unseen -= 1
 
     def tell(self, event: Event) -> None:

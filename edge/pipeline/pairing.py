@@ -6,7 +6,7 @@ from typing import Final
 
 from edge.errors import UsageError
 from edge.perception.result import Result
-from edge.pipeline.result_rounds import ALL_HEARD_SCANS
+from edge.pipeline.loop import ALL_HEARD_SCANS
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import CAPACITY_SCANS
 from edge.validation import check_positive

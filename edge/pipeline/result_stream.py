@@ -2,10 +2,9 @@
 
 import threading
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from itertools import islice
 
 from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
@@ -13,8 +12,8 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.pipeline.latest import Latest, NewestResults
+from edge.pipeline.loop import Loop
 from edge.pipeline.pose_queue import PoseError, pose_of_fields
-from edge.pipeline.result_rounds import Rounds
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
@@ -77,17 +76,12 @@ class Stream:
         if duration_s is not None:
             check_positive("duration_s", duration_s)
         self._source = source
-        newest = self._newest = NewestResults()
-
-        def tell(event: Event) -> None:
-            newest.tell(event)
-            on_event(event)
-
-        self._rounds = Rounds(
+        self._newest = NewestResults()
+        self._on_event = on_event
+        self._loop = Loop(
             source,
             runtime,
             sinks=sinks,
-            on_event=tell,
             stop=stop,
             duration_s=duration_s,
             commands=commands,
@@ -96,10 +90,7 @@ class Stream:
             clock_s=clock_s,
             clock_ns=clock_ns,
         )
-        self.statistics = self._rounds.statistics
-        self._running = self._rounds.run()
-        self._made: deque[Result] = deque()
-        self._between = True
+        self.statistics = self._loop.statistics
         self._error: Exception | None = None
         self._turn = threading.RLock()
         self._worker: ThreadPoolExecutor | None = None
@@ -119,7 +110,7 @@ class Stream:
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        return self._rounds.counters
+        return self._loop.counters
 
     def pose(
         self,
@@ -157,7 +148,7 @@ class Stream:
         fields = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
         try:
-            self._rounds.poses.put(pose_of_fields(fields, now_ns))
+            self._loop.poses.put(pose_of_fields(fields, now_ns))
         except PoseError as error:
             raise UsageError(f"a pose: {error}") from error
 
@@ -170,21 +161,24 @@ class Stream:
             SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         """
         while True:
-            while self._made:  # left by a task that was cancelled
-                yield self._next_made()
-            if self._newest.ended:
+            while self._loop.made:
+                result = self._next_made()
+                if result is not None:
+                    self._newest.see(result)
+                    yield result
+            if self.ended and self._error is None:
                 return
-            result = self._step(POLL_S, on=True)
-            if result is not None:
-                self._newest.pass_on(result)
-                yield result
+            self._step(POLL_S)
 
     async def __aiter__(self) -> AsyncIterator[Result]:
         """Yield every result as `__iter__` does, beside other tasks; nothing is lost where one of them cancels it."""
         while True:
-            while self._made:
-                yield self._next_made()
-            if self._newest.ended:
+            while self._loop.made:
+                result = self._next_made()
+                if result is not None:
+                    self._newest.see(result)
+                    yield result
+            if self.ended and self._error is None:
                 return
             await self._step_beside()
 
@@ -209,7 +203,7 @@ class Stream:
     def latest_of_all(self) -> dict[str, Latest]:
         """Return the newest result of every sensor that has sent a scan, by name; otherwise as `latest`."""
         self._round(0.0)
-        self._made.clear()
+        self._pass_over()
         now_ns = self._clock_ns()
         return {name: self._newest.take(name, now_ns) for name in self._newest.sensors}
 
@@ -244,7 +238,7 @@ class Stream:
         Raises:
             UsageError: no sensor has this name; the message lists those that there are.
         """
-        why = None if sensor is None else self._rounds.no_sensor(sensor)
+        why = None if sensor is None else self._loop.no_sensor(sensor)
         if why is not None:
             raise UsageError(why)
 
@@ -262,13 +256,21 @@ class Stream:
 
     def _taken_newest(self, sensor: str | None) -> Latest:
         latest = self._newest.take(sensor, self._clock_ns())
-        self._made.clear()
+        self._pass_over()
         return latest
 
-    def _next_made(self) -> Result:
-        result = self._made.popleft()
-        self._newest.see(result)
-        return result
+    def _next_made(self) -> Result | None:
+        """Return the next result; None after an event, which is told instead."""
+        made = self._loop.made.popleft()
+        if isinstance(made, Event):
+            self._on_event(made)
+            return None
+        return made
+
+    def _pass_over(self) -> None:
+        """Tell what happened, and leave the results out that were made."""
+        while self._loop.made:
+            self._next_made()
 
     def _round(self, wait_s: float) -> None:
         """Make the results of the scans that wait, after waiting at most `wait_s` for them."""
@@ -277,54 +279,46 @@ class Stream:
                 f"{self._source.name} is a recording that is read as fast as its results are made, without a latest "
                 "one: iterate over the stream, or open it with paced=True"
             )
-        for _ in range(1 if self._between else 2):  # results of the last round may be left
-            while (result := self._step(wait_s)) is not None:
-                self._newest.add(result)
+        self._step(wait_s)
+        while self._loop.left:
+            self._step(0.0)
 
-    def _step(self, wait_s: float, *, on: bool = False) -> Result | None:
-        """Make the next result, `on` into the next round; None at the end of a round, and where there are no more."""
+    def _step(self, wait_s: float) -> None:
+        """Make the next results, after waiting at most `wait_s` [s] for scans; an error waits until they are taken."""
         with self._turn:
             if self._error is not None:
                 raise self._error.with_traceback(None)  # else every call would lengthen it
-            self._rounds.wait_s = wait_s
+            loop, seen = self._loop, len(self._loop.made)
             try:
-                result = next(self._running)
-                if result is None and on:
-                    result = next(self._running)
-            except StopIteration:
-                self._newest.ended = True
-                result = None
+                loop.step(wait_s)
             except Exception as error:
-                self._error = error
-                raise
-            self._between = result is None
-            return result
-
-    def _keep_step(self) -> None:
-        """Make the next result, if scans wait, and keep it for the task that asked, or for the one after it."""
-        result = self._step(0.0)
-        if result is not None:
-            self._newest.add(result)
-            self._made.append(result)
+                loop.finish()
+                self._error = self._error or error
+                if len(loop.made) == seen:
+                    raise
+            finally:
+                for one in islice(loop.made, seen, None):
+                    self._newest.tell(one) if isinstance(one, Event) else self._newest.add(one)
+                self._newest.ended = loop.ended and self._error is None
 
     async def _step_beside(self, wait_s: float = POLL_S) -> None:
-        """Make the next result in a thread, once scans wait; the result stays here if the task is cancelled."""
+        """Make the next results in a thread, once scans wait; they stay here if the task is cancelled."""
         import asyncio
 
-        if self._between and not self._source.patient:
+        if not (self._loop.left or self._source.patient):
             await self._source.wait_async(wait_s)
         if self._worker is None:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
-        await asyncio.get_running_loop().run_in_executor(self._worker, self._keep_step)
+        await asyncio.get_running_loop().run_in_executor(self._worker, self._step, 0.0)
 
     def close(self) -> None:
         """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
         if self._worker is not None:
             self._worker.shutdown()
-        self._rounds.sinks = ()
-        with self._turn, suppress(ValueError):  # a callback that closes the source is still within the generator
-            self._made.clear()
-            self._running.close()
+        self._loop.sinks = ()
+        with self._turn:  # unless this is a callback of a step
+            self._loop.finish()
+            self._pass_over()
             self._error = UsageError(
                 f"the stream of source {self._source.name} is closed: results that were left are old"
             )

@@ -13,10 +13,10 @@ from pose_samples import make_posed_contract
 
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
+from edge.pipeline.loop import Loop
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
 from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
 from edge.pipeline.pump import pump
-from edge.pipeline.result_rounds import Rounds
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
@@ -244,7 +244,7 @@ def test_poses_come_to_the_sinks_before_the_scans_that_they_serve():
 
 def test_a_run_without_poses_asks_for_none(monkeypatch):
     asked = []
-    monkeypatch.setattr(Rounds, "_take_poses", lambda self, taken: asked.append(taken))
+    monkeypatch.setattr(Loop, "_take_poses", lambda self, taken: asked.append(taken))
     monkeypatch.setattr(Link, "poses", lambda self: asked.append(self) or [])
     with Source(FakeLink([[make_scan(0)], [make_scan(1)]])) as source:
         results = list(Stream(source, make_runtime(), commands=Commands()))

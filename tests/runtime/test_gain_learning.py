@@ -351,7 +351,7 @@ class TestKeeping:
         with Source(FakeLink([], endless=not ends), sensor_file=load_sensor_file(file)) as source:
             stream = Stream(source, make_runtime(FakeModel()), on_event=events.append)
             file.unlink()
-            stream._rounds._keeper.keep("4", LEARNED)
+            stream._loop._keeper.keep("4", LEARNED)
             if ends:
                 assert list(stream) == []
             else:

@@ -1,8 +1,9 @@
-"""Maker of the results of a source, round by round: of all scans that wait, then again."""
+"""The loop from scans to results: it takes what waits, has patterns made, and gives results and events to the sinks."""
 
 import math
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import Final
 
@@ -45,16 +46,18 @@ REFUSED_AGAIN_S: Final = 10.0
 """Time until another refused command is told, in [s]: a stream of them must not flood."""
 
 
-class Rounds:
+class Loop:
     """Maker of results from scans, commands and poses, for a stream; its settings are those of the stream.
 
-    Sinks and `on_event` get events in their place between results, and sinks get a result before anything else does.
+    Sinks get each result and event as soon as it is made.
 
     Attributes:
+        made: results and events that were made, in their order, until the stream takes them.
         statistics: of the results so far.
         poses: queue of the poses from outside.
-        wait_s: longest wait for scans at the beginning of the next round, in [s].
         sinks: get results, events and poses.
+        left: patterns still to be made for scans that waited when one of several calls of inference began.
+        ended: True once there are no more results to make.
     """
 
     def __init__(
@@ -63,7 +66,6 @@ class Rounds:
         runtime: Runtime,
         *,
         sinks: Sequence[Sink],
-        on_event: Callable[[Event], object],
         stop: threading.Event | None,
         duration_s: float | None,
         commands: Commands | None,
@@ -72,15 +74,18 @@ class Rounds:
         clock_s: Callable[[], float],
         clock_ns: Callable[[], int],
     ) -> None:
+        self.made: deque[Result | Event] = deque()
         self.statistics = Statistics() if statistics is None else statistics
         self.poses = PoseQueue() if commands is None else commands.poses
-        self.wait_s = POLL_S
         self.sinks = tuple(sinks)
+        self.left = 0
+        self.ended = False
         self._source = source
         self._runtime = runtime
-        self._on_event = on_event
         self._stop = threading.Event() if stop is None else stop
-        self._duration_s = duration_s
+        self._length_s = math.inf if duration_s is None else duration_s
+        self._begun_s: float | None = None
+        self._first_ns: int | None = None
         self._commands = commands
         unused_by = None if any(sink.uses_poses for sink in self.sinks) else runtime.unposed
         self._intake = PoseIntake(
@@ -117,57 +122,59 @@ class Rounds:
         counters["unwritten"] = statistics.unwritten
         return counters
 
-    def run(self) -> Generator[Result | None]:
-        """Yield the results of a round, None at its end, and so on; what `Stream.__iter__` raises ends it."""
-        try:
-            yield from self._rounds()
-        finally:
-            if self._keeper is not None:
-                self._keeper.close()
-                if self._keeper.trouble is not None:
-                    detail = f"learned gains are not kept: {self._keeper.trouble}"
-                    self._tell(Event(self._clock_ns(), "note", None, detail))
+    def step(self, wait_s: float) -> None:
+        """Make the results of all that waits, after waiting at most `wait_s` [s] for it.
 
-    def _rounds(self) -> Iterator[Result | None]:
-        """Yield the results of all scans that wait, and then None, again and again.
+        Patterns are made in one call of inference: of several sensors, the others get theirs in the next steps. Of a
+        patient source every scan gets its own.
 
-        Scans that come while patterns are made join the round, but do not prolong it.
+        Raises:
+            BridgeError: the source is lost; what was taken before has its results.
+            EdgeError: a sink or the model fails.
         """
-        left = 0
         try:
-            for taken in self._taken():
-                if self._commands is not None:
-                    self._obey(self._commands)
-                for one in taken:
-                    if isinstance(one, TimedPose):
-                        self.poses.begun = True
-                if self.poses.begun:
-                    self._take_poses(taken)
-                for one in taken:
-                    if isinstance(one, Scan):
-                        for result in self._runtime.take(one, self._latency_clock):
-                            yield self._follow(result)
-                    elif isinstance(one, Notice):
-                        yield from self._patterns()
-                        self._heed(one)
-                left = min(left or self._runtime.waiting, self._runtime.waiting)
-                for result in self._infer():
-                    left -= 1
-                    yield result
-                if left > 0 and not self._source.patient:
-                    continue
-                left = 0
-                yield from self._patterns() if self._source.patient else ()
-                for event in self._silence.look():
-                    self._tell(event)
-                self._set_pace()
-                if not taken:
-                    self._rest()
-                yield None
-        except BridgeError:  # the source is lost: what was taken before gets its results
-            yield from self._patterns()
+            taken = self._take(0.0 if self._runtime.waiting else wait_s)
+        except BridgeError:
+            self._make_patterns()
             raise
-        yield from self._patterns()
+        if taken is None:
+            self._make_patterns()
+            self.finish()
+            return
+        if self._commands is not None:
+            self._obey(self._commands)
+        self.poses.begun = self.poses.begun or any(isinstance(one, TimedPose) for one in taken)
+        if self.poses.begun:
+            self._take_poses(taken)
+        for one in taken:
+            if isinstance(one, Scan):
+                for result in self._runtime.take(one, self._latency_clock):
+                    self._follow(result)
+            elif isinstance(one, Notice):
+                self._make_patterns()
+                self._heed(one)
+        # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
+        self.left = min(self.left or self._runtime.waiting, self._runtime.waiting)
+        self.left -= self._infer()
+        if self._source.patient:
+            self._make_patterns()
+        elif self.left > 0:
+            return
+        self.left = 0
+        for event in self._silence.look():
+            self._tell(event)
+        self._set_pace()
+        if not taken:
+            self._rest(wait_s)
+
+    def finish(self) -> None:
+        """Keep what was learned; there are no more results."""
+        self.ended, self.left = True, 0
+        if self._keeper is not None:
+            keeper, self._keeper = self._keeper, None
+            keeper.close()
+            if keeper.trouble is not None:
+                self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {keeper.trouble}"))
 
     def no_sensor(self, name: str) -> str | None:
         """Return why no sensor has this name; None if one has, or if one that has it may still come.
@@ -195,10 +202,10 @@ class Rounds:
             self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
             commands.reason = None
 
-    def _rest(self) -> None:
+    def _rest(self, wait_s: float) -> None:
         """Let the sinks do what is due, four times a second while no scan comes."""
         now_s = self._clock_s()
-        if self.wait_s or now_s - self._waited_s >= POLL_S:
+        if wait_s or now_s - self._waited_s >= POLL_S:
             self._waited_s = now_s
             for sink in self.sinks:
                 sink.wait()
@@ -221,41 +228,42 @@ class Rounds:
         for event in intake.look(self._now_ns):
             self._tell(event)
 
-    def _taken(self) -> Iterator[list[Scan | Notice | TimedPose]]:
-        """Yield the scans, notices and poses of the source, until it ends, `stop` is set, or the time is over.
+    def _take(self, wait_s: float) -> list[Scan | Notice | TimedPose] | None:
+        """Return what waits; None once the source has ended, `stop` is set, or the time is over.
 
         A patient source's time is that of its scans.
         """
-        length_s = math.inf if self._duration_s is None else self._duration_s
-        begun_s = self._clock_s()
-        first_ns: int | None = None
-        while not self._stop.is_set() and (self._source.patient or self._clock_s() - begun_s < length_s):
-            taken = self._source.take(0.0 if self._runtime.waiting else self.wait_s)
-            self.statistics.overruns = self._source.overruns
-            self._received = None
-            if taken is None:
-                return
-            for one in taken if self._source.patient else ():  # one scan at most
-                if isinstance(one, Scan):
-                    first_ns = one.time_ns if first_ns is None else first_ns
-                    if one.time_ns - first_ns >= length_s * 1e9:
-                        return
-            yield taken
+        patient, now_s = self._source.patient, self._clock_s()
+        if self._begun_s is None:
+            self._begun_s, now_s = now_s, self._clock_s()
+        if self._stop.is_set() or (not patient and now_s - self._begun_s >= self._length_s):
+            return None
+        taken = self._source.take(wait_s)
+        self.statistics.overruns = self._source.overruns
+        self._received = None
+        for one in taken if patient and taken is not None else ():  # one scan at most
+            if isinstance(one, Scan):
+                self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
+                if one.time_ns - self._first_ns >= self._length_s * 1e9:
+                    return None
+        return taken
 
-    def _patterns(self) -> Iterator[Result]:
-        """Yield the results of all sensors that wait for their patterns."""
+    def _make_patterns(self) -> None:
+        """Make the results of all sensors that wait for their patterns."""
         while self._runtime.waiting:
-            yield from self._infer()
+            self._infer()
 
-    def _infer(self) -> Iterator[Result]:
-        """Yield the results of the sensors that have waited longest, as many as one call has time for."""
-        waiting = self._runtime.waiting
-        results = self._runtime.infer(self._longest_call_us(), self._latency_clock) if waiting else []
-        for name, pad in self._runtime.take_learned().items():
-            if self._keeper is not None:
+    def _infer(self) -> int:
+        """Make the results of those that have waited longest, as many as one call has time for; return their number."""
+        if not self._runtime.waiting:
+            return 0
+        results = self._runtime.infer(self._longest_call_us(), self._latency_clock)
+        if self._keeper is not None:
+            for name, pad in self._runtime.take_learned().items():
                 self._keeper.keep(name, pad)
         for result in results:
-            yield self._follow(result)
+            self._follow(result)
+        return len(results)
 
     def _longest_call_us(self) -> float | None:
         """Return the time that one inference may take, in [us]: scans that come meanwhile wait for its end."""
@@ -290,8 +298,8 @@ class Rounds:
             self._pace = pace
             self._source.set_pace(*pace)
 
-    def _follow(self, result: Result) -> Result:
-        """Count a result, and give it to the sinks."""
+    def _follow(self, result: Result) -> None:
+        """Count a result, and hand it on."""
         scan, statistics = result.scan, self.statistics
         deadline = self._deadlines.get(scan.sensor)
         if deadline is None:
@@ -311,7 +319,7 @@ class Rounds:
             counters = self._count()
             for sink in self.sinks:
                 sink.write(result, counters)
-        return result
+        self.made.append(result)
 
     def _heed(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
@@ -329,7 +337,7 @@ class Rounds:
             counters = self._count()
             for sink in self.sinks:
                 sink.tell(event, counters)
-        self._on_event(event)
+        self.made.append(event)
 
     def _count(self) -> dict[str, int]:
         """Return the counters, with the records that the sinks left out."""
