@@ -279,7 +279,7 @@ class Source:
         if len(self._links) > 1:
             self.set_pace(Pace(UNASKED_S))
         for link in self._links:
-            reading, thread = _started("link-reader", partial(self._follow, link))
+            reading, thread = _started("scan-reader", partial(self._follow, link))
             self._threads.append(thread)
             reading.add_done_callback(self._end)
         self.thread_ids = tuple(thread.native_id for thread in self._threads if thread.native_id is not None)

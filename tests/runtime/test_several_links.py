@@ -132,7 +132,7 @@ def test_two_ports_are_read_in_one_thread_and_nothing_is_lost_or_mixed_up(two_ad
             if len(taken) > 40:  # both are open and have sent by then
                 threads |= {thread.name for thread in set(threading.enumerate()) - before}
         counters = source.counters()
-    assert threads == {"link-reader"}
+    assert threads == {"scan-reader"}
     assert not set(threading.enumerate()) - before, "a thread outlived the source"
     for recording, name in zip(recordings, ("left", "right"), strict=True):
         mine = [one for one in taken if isinstance(one, Scan) and one.sensor == f"{name}/4"]
@@ -184,9 +184,9 @@ def test_a_port_that_is_away_holds_up_no_other_and_comes_back_to_the_common_thre
                 back = next(index for index, one in enumerate(taken) if isinstance(one, Notice))
                 assert not numbers(taken[:back], "left/4"), "scans from behind the outage came before word of it"
                 readers = {t.name for t in threading.enumerate() if t.name.startswith(("link-", "scan-"))}
-                assert readers == {"link-reader"}
+                assert readers == {"scan-reader"}
                 assert source.counters()["outages"] == outages + 1
-    assert [name for name in names if name.startswith("link-reader")]
+    assert [name for name in names if name.startswith("scan-reader")]
     assert not {thread for thread in set(threading.enumerate()) - before if thread.name.startswith(("link-", "scan-"))}
 
 
