@@ -10,14 +10,13 @@ from typing import Final
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
+from edge.pipeline.cadence import Cadences
 from edge.pipeline.commands import Commands, obey
-from edge.pipeline.deadline import Deadline
 from edge.pipeline.gain_keeper import GainKeeper
 from edge.pipeline.pose_intake import PoseIntake
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.silence import Silence
 from edge.pipeline.sink import Sink
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice, Pace
@@ -91,8 +90,7 @@ class Loop:
         self._intake = PoseIntake(
             runtime, self.poses, recorded=source.patient, unused_by=unused_by, no_sensor=self.no_sensor
         )
-        self._silence = Silence(runtime.expected, recorded=source.kind == "replay")
-        self._deadlines: dict[str, Deadline] = {}
+        self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
         self._now_ns = 0
         self._waited_s = self._refused_s = -math.inf
         self._clock_s = clock_s
@@ -161,7 +159,7 @@ class Loop:
         elif self.left > 0:
             return
         self.left = 0
-        for event in self._silence.look():
+        for event in self._cadences.look():
             self._tell(event)
         self._set_pace()
         if not taken:
@@ -269,12 +267,8 @@ class Loop:
         """Return the time that one inference may take, in [us]: scans that come meanwhile wait for its end."""
         if self._runtime.waiting < 2:  # the rule, for which it need not be known
             return None
-        period_s = self._shortest_period_s()
+        period_s = self._cadences.shortest_period_s
         return None if period_s == math.inf else 1e6 * period_s / CALLS_A_PERIOD
-
-    def _shortest_period_s(self) -> float:
-        periods_ns = [deadline.period_ns for deadline in self._deadlines.values() if deadline.period_ns is not None]
-        return min(periods_ns, default=math.inf) / 1e9
 
     def _watch_rest(self, result: Result) -> None:
         """Keep which sensors have been near contact of late."""
@@ -287,13 +281,13 @@ class Loop:
     def _set_pace(self) -> None:
         """Let the source read late where that costs nothing: many sensors together, and those at rest now and then."""
         together_s = 0.0
-        if len(self._deadlines) >= TOGETHER_SENSORS:
-            period_s = self._shortest_period_s()
+        if len(self._cadences) >= TOGETHER_SENSORS:
+            period_s = self._cadences.shortest_period_s
             together_s = period_s / READS_A_PERIOD if period_s < LONGEST_TOGETHER_S else 0.0
             before_s = 0.0 if self._pace is None else self._pace[0].together_s
             if abs(together_s - before_s) < SAME_SHARE * together_s:
                 together_s = before_s
-        pace = Pace(together_s, self._patience_s if self._deadlines else 0.0), frozenset(self._restless_ns)
+        pace = Pace(together_s, self._patience_s if len(self._cadences) else 0.0), frozenset(self._restless_ns)
         if pace != self._pace:
             self._pace = pace
             self._source.set_pace(*pace)
@@ -301,18 +295,13 @@ class Loop:
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""
         scan, statistics = result.scan, self.statistics
-        deadline = self._deadlines.get(scan.sensor)
-        if deadline is None:
-            deadline = self._deadlines[scan.sensor] = Deadline(self._source.rate_hz)
-        if not scan.unread_ns:  # scans that waited unread came at no pace
-            deadline.follow(scan.time_ns)
-        back = self._silence.follow(scan, deadline.period_ns)
+        back = self._cadences.follow(scan)
         if result.latency_us is not None:
-            statistics.late += deadline.check(result.latency_us)
+            statistics.late += self._cadences[scan.sensor].late(result.latency_us)
         if self._patience_s:
             self._watch_rest(result)
         statistics.add(result)
-        statistics.missed = self._silence.missed
+        statistics.missed = self._cadences.missed
         if back is not None:
             self._tell(back)
         if self.sinks:
@@ -325,11 +314,11 @@ class Loop:
         """Forget readings and taps from before an outage, and report the notice as an event."""
         if notice.kind in ("lost", "silent", "back"):
             self._runtime.lose_touch(notice.sensors, same_pad=not notice.text)  # no text: a recording jumped
-            self._silence.begin_anew(notice.time_ns, notice.sensors)
+            self._cadences.begin_anew(notice.time_ns, notice.sensors)
         if notice.text:
             self._tell(Event.of(notice))
         else:
-            self._silence.forget(notice.sensors)
+            self._cadences.forget(notice.sensors)
 
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)

@@ -1,5 +1,4 @@
 import gc
-import itertools
 import threading
 import tracemalloc
 from dataclasses import replace
@@ -10,48 +9,9 @@ from test_pump import run, scans
 
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.runtime import Runtime
-from edge.pipeline.deadline import FEWEST_INTERVALS, LONGEST_BURST, Deadline
 from edge.pipeline.run_statistics import Statistics
 
 MS = 1_000_000
-
-
-def followed(intervals_ms, rate_hz=None):
-    deadline = Deadline(rate_hz)
-    deadline.follow(0)
-    for time_ms in itertools.accumulate(intervals_ms):
-        deadline.follow(round(time_ms * MS))
-    return deadline
-
-
-def test_the_period_is_the_median_of_what_came():
-    assert followed([10] * (FEWEST_INTERVALS - 1)).period_ns is None
-    assert followed([10] * FEWEST_INTERVALS).period_ns == 10 * MS
-    assert followed([9, 11, 10, 10, 900, 10, 1, 9, 11]).period_ns == 10 * MS
-    assert followed([20] * 40 + [5] * 31).period_ns == 5 * MS
-
-
-def test_scans_that_were_held_up_and_come_in_a_burst_change_no_period():
-    assert followed([10] * 40 + [400] + [0.3] * 39 + [10] * 5).period_ns == 10 * MS
-
-
-def test_a_sensor_that_has_become_much_faster_is_believed_in_the_end():
-    assert followed([10] * 40 + [0.5] * (LONGEST_BURST + 40)).period_ns == MS // 2
-
-
-def test_scans_of_one_read_are_no_interval():
-    assert followed([10, 0, 10, 0, 10, 0, 10, 0, 10]).period_ns == 10 * MS
-
-
-def test_a_given_rate_is_the_period_from_the_start():
-    assert Deadline(100).period_ns == followed([3] * 50, rate_hz=100).period_ns == 10 * MS
-
-
-def test_a_pattern_is_late_after_one_period_and_not_before():
-    deadline = followed([10] * 9)
-    assert not deadline.check(10_000)
-    assert deadline.check(10_000.001)
-    assert not Deadline().check(1e9)
 
 
 def test_the_loop_counts_late_patterns_and_tells_every_latency():

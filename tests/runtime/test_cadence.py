@@ -1,26 +1,64 @@
-"""Sensors that fall silent, and scans that left no trace."""
+"""Period and deadline of a sensor, sensors that fall silent, and scans that left no trace."""
 
+import itertools
 import random
 from dataclasses import replace
 
 import pytest
 from edge_samples import make_scan
 
-from edge.pipeline.deadline import Deadline
-from edge.pipeline.silence import SENSOR_SILENT_NS, SETTLING_SCANS, Silence
+from edge.pipeline.cadence import FEWEST_INTERVALS, LONGEST_BURST, SENSOR_SILENT_NS, SETTLING_SCANS, Cadence, Cadences
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
+RATE_HZ = 100.0
 
 
 def scan(number, time_ms, sensor="4", device_ms=None):
     device_ns = None if device_ms is None else device_ms * MS
-    return replace(make_scan(number, sensor=sensor), time_ns=time_ms * MS, device_ns=device_ns)
+    return replace(make_scan(number, sensor=sensor), time_ns=round(time_ms * MS), device_ns=device_ns)
+
+
+def followed(intervals_ms, rate_hz=None):
+    cadence = Cadence(rate_hz)
+    for number, time_ms in enumerate(itertools.accumulate(intervals_ms, initial=0)):
+        cadence.follow(scan(number, time_ms))
+    return cadence
+
+
+def test_the_period_is_the_median_of_what_came():
+    assert followed([10] * (FEWEST_INTERVALS - 1)).period_ns is None
+    assert followed([10] * FEWEST_INTERVALS).period_ns == 10 * MS
+    assert followed([9, 11, 10, 10, 900, 10, 1, 9, 11]).period_ns == 10 * MS
+    assert followed([20] * 40 + [5] * 31).period_ns == 5 * MS
+
+
+def test_scans_that_were_held_up_and_come_in_a_burst_change_no_period():
+    assert followed([10] * 40 + [400] + [0.3] * 39 + [10] * 5).period_ns == 10 * MS
+
+
+def test_a_sensor_that_has_become_much_faster_is_believed_in_the_end():
+    assert followed([10] * 40 + [0.5] * (LONGEST_BURST + 40)).period_ns == MS // 2
+
+
+def test_scans_of_one_read_are_no_interval():
+    assert followed([10, 0, 10, 0, 10, 0, 10, 0, 10]).period_ns == 10 * MS
+
+
+def test_a_given_rate_is_the_period_from_the_start():
+    assert Cadence(100).period_ns == followed([3] * 50, rate_hz=100).period_ns == 10 * MS
+
+
+def test_a_pattern_is_late_after_one_period_and_not_before():
+    cadence = followed([10] * 9)
+    assert not cadence.late(10_000)
+    assert cadence.late(10_000.001)
+    assert not Cadence().late(1e9)
 
 
 def missed(*scans):
     """Count what is missed of these scans and some more at their pace, as only scans after a gap show what was lost."""
-    silence, last = Silence(), scans[-1]
+    cadences, last = Cadences(rate_hz=RATE_HZ), scans[-1]
     after = [
         replace(
             last,
@@ -31,8 +69,8 @@ def missed(*scans):
         for n in range(1, SETTLING_SCANS + 2)
     ]
     for one in (*scans, *after):
-        silence.follow(one, PERIOD_NS)
-    return silence.missed
+        cadences.follow(one)
+    return cadences.missed
 
 
 def test_what_never_came_is_counted_by_the_gap():
@@ -54,34 +92,32 @@ def test_scans_that_were_thrown_away_unseen_are_not_missed_as_well():
 
 def test_what_was_held_up_and_comes_in_a_burst_was_late_and_not_missed():
     """Forty scans are held up, two are lost."""
-    silence, deadline = Silence(), Deadline()
+    cadences = Cadences()
     times_us = [10_000 * n for n in range(100)]
     times_us += [1_400_000 + 300 * n for n in range(40)]
     times_us += [10_000 * n for n in range(142, 200)]
     for number, time_us in enumerate(times_us):
-        deadline.follow(1000 * time_us)
-        silence.follow(replace(scan(number, 0), time_ns=1000 * time_us), deadline.period_ns)
-    assert silence.missed == 2
+        cadences.follow(replace(scan(number, 0), time_ns=1000 * time_us))
+    assert cadences.missed == 2
 
 
 def test_a_stall_that_lost_nothing_misses_nothing():
     """The median of the newest intervals, 1 % off, once made a second a period too long."""
     for seed in range(40):
         noise = random.Random(seed)
-        silence, deadline = Silence(), Deadline()
+        cadences = Cadences()
         due_ms = [10 * n + noise.uniform(-1, 1) for n in range(1000)]
         arrivals_ms = [max(due, 2500 if 1500 <= due < 2500 else 0, 6200 if 5400 <= due < 6200 else 0) for due in due_ms]
         for number, arrival_ms in enumerate(arrivals_ms):
             late_ms = noise.expovariate(0.5) if noise.random() < 0.05 else 0.2
             one = replace(scan(number, 0), time_ns=round((arrival_ms + late_ms) * MS) + number)
-            deadline.follow(one.time_ns)
-            silence.follow(one, deadline.period_ns)
-        assert silence.missed == 0, seed
+            cadences.follow(one)
+        assert cadences.missed == 0, seed
 
 
 def missed_by_a_busy_reader(seed, *, stamped, away_ms, busy, lost=()):
     """Count what is missed of a thousand scans that came when the reader had time, which it lacked at first."""
-    noise, silence, deadline = random.Random(seed), Silence(), Deadline()
+    noise, cadences = random.Random(seed), Cadences()
     free_ms, arrival_ms = away_ms, 0.0
     for number, due in enumerate(due for due in range(1000) if due not in lost):
         due_ms = 10 * due + noise.uniform(-0.4, 0.4)
@@ -95,10 +131,8 @@ def missed_by_a_busy_reader(seed, *, stamped, away_ms, busy, lost=()):
             device_ns=round(due_ms) * MS if stamped else None,
             unread_ns=round(unread_ms * MS),
         )
-        if not one.unread_ns:
-            deadline.follow(one.time_ns)
-        silence.follow(one, deadline.period_ns)
-    return silence.missed
+        cadences.follow(one)
+    return cadences.missed
 
 
 @pytest.mark.parametrize("away_ms", [0, 500])
@@ -123,19 +157,19 @@ def test_the_device_s_own_time_tells_bursts_from_losses():
 
 
 def test_without_a_period_nobody_knows():
-    silence = Silence()
-    silence.follow(scan(0, 0), None)
-    silence.follow(scan(1, 500), None)
-    assert silence.missed == 0
+    cadences = Cadences()
+    cadences.follow(scan(0, 0))
+    cadences.follow(scan(1, 500))
+    assert cadences.missed == 0
 
 
 def test_a_finger_that_comes_after_it_was_missed_is_told_back_once():
-    silence, events = Silence(["4", "6"]), []
+    cadences, events = Cadences(["4", "6"], rate_hz=RATE_HZ), []
     for n in range(100):
         for sensor in ("4", "6") if n >= 80 else ("4",):
-            back = silence.follow(scan(n, 10 * n, sensor), PERIOD_NS)
+            back = cadences.follow(scan(n, 10 * n, sensor))
             events += [] if back is None else [back]
-        events += silence.look()
+        events += cadences.look()
     assert [(event.kind, event.sensor, event.time_ns // MS) for event in events] == [
         ("silent", "6", SENSOR_SILENT_NS // MS + 10),
         ("back", "6", 800),
@@ -144,13 +178,13 @@ def test_a_finger_that_comes_after_it_was_missed_is_told_back_once():
 
 
 def test_a_finger_that_falls_silent_while_the_other_goes_on_is_told_once_and_told_back():
-    silence, events = Silence(), []
+    cadences, events = Cadences(rate_hz=RATE_HZ), []
     for n in range(200):
         for sensor in ("4", "6"):
             if sensor == "4" or not 20 <= n < 120:
-                back = silence.follow(scan(n, 10 * n, sensor), PERIOD_NS)
+                back = cadences.follow(scan(n, 10 * n, sensor))
                 events += [] if back is None else [back]
-        events += silence.look()
+        events += cadences.look()
     assert [(event.kind, event.sensor, event.time_ns // MS) for event in events] == [
         ("silent", "6", 190 + SENSOR_SILENT_NS // MS + 10),
         ("back", "6", 1200),
@@ -160,37 +194,37 @@ def test_a_finger_that_falls_silent_while_the_other_goes_on_is_told_once_and_tol
 
 
 def test_after_the_link_was_away_no_finger_is_silent_for_coming_second():
-    silence = Silence()
+    cadences = Cadences(rate_hz=RATE_HZ)
     for sensor in ("4", "6"):
-        silence.follow(scan(0, 0, sensor), PERIOD_NS)
-    silence.begin_anew(5_000 * MS)
-    silence.follow(scan(1, 5_000), PERIOD_NS)
-    assert silence.look() == []
-    silence.follow(scan(2, 5_000 + SENSOR_SILENT_NS // MS + 1), PERIOD_NS)
-    assert [event.sensor for event in silence.look()] == ["6"]
+        cadences.follow(scan(0, 0, sensor))
+    cadences.begin_anew(5_000 * MS)
+    cadences.follow(scan(1, 5_000))
+    assert cadences.look() == []
+    cadences.follow(scan(2, 5_000 + SENSOR_SILENT_NS // MS + 1))
+    assert [event.sensor for event in cadences.look()] == ["6"]
 
 
 def test_one_link_that_was_away_excuses_its_own_sensors_alone():
-    silence = Silence()
+    cadences = Cadences(rate_hz=RATE_HZ)
     for sensor in ("left/4", "right/4", "right/6"):
-        silence.follow(scan(0, 0, sensor), PERIOD_NS)
-    silence.begin_anew(5_000 * MS, "left/")
-    silence.follow(scan(1, 5_000, "right/4"), PERIOD_NS)
-    assert [event.sensor for event in silence.look()] == ["right/6"]
+        cadences.follow(scan(0, 0, sensor))
+    cadences.begin_anew(5_000 * MS, "left/")
+    cadences.follow(scan(1, 5_000, "right/4"))
+    assert [event.sensor for event in cadences.look()] == ["right/6"]
 
 
 def test_a_sensor_that_there_should_be_and_is_never_heard_is_told_once():
-    silence = Silence(["4", "6"])
-    assert silence.look() == []
+    cadences = Cadences(["4", "6"], rate_hz=RATE_HZ)
+    assert cadences.look() == []
     events = []
     for n in range(100):
-        silence.follow(scan(n, 10 * n), PERIOD_NS)
-        events += silence.look()
+        cadences.follow(scan(n, 10 * n))
+        events += cadences.look()
     assert [(event.kind, event.sensor) for event in events] == [("silent", "6")]
 
 
 def test_when_all_are_silent_it_is_not_a_finger():
-    silence = Silence()
+    cadences = Cadences(rate_hz=RATE_HZ)
     for sensor in ("4", "6"):
-        silence.follow(scan(0, 0, sensor), PERIOD_NS)
-    assert silence.look() == []
+        cadences.follow(scan(0, 0, sensor))
+    assert cadences.look() == []

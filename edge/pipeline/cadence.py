@@ -1,0 +1,252 @@
+"""Cadence of the sensors' scans: period, deadline, missing scans, and sensors that fall silent. No I/O, no clock."""
+
+import math
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from edge.perception.event import Event
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.silence import SENSOR_SILENT_NS
+
+REMEMBERED_INTERVALS: Final = 31
+FEWEST_INTERVALS: Final = 5
+"""Fewest intervals that give a period."""
+BURST_SHARE: Final = 8
+"""Divisor of the period: scans nearer to each other than an eighth of it were held up. Bursts of all sixteen frames,
+16 ms apart, are further apart."""
+LONGEST_BURST: Final = 500
+"""Scans of a burst: five seconds of a sensor at 100 Hz; a longer one is the sensor's own pace."""
+GAP_PERIODS: Final = 1.5
+"""Periods between two scans that make a gap; jitter, and the 16 ms for which some adapters hold scans, stay below at
+10 ms."""
+SETTLING_SCANS: Final = 5
+"""Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
+PACED_SCANS: Final = 32
+"""Scans without a gap from which on their mean period is more exact than the median of the newest: with that, 1 % off,
+a stall of a second would seem to have swallowed a scan."""
+SHORTEST_PERIOD_NS: Final = 500_000
+"""Shortest period of a sensor, half of that of the fastest: scans nearer to each other waited somewhere, and give no
+period."""
+
+
+class _Period:
+    """Running median of the intervals between times, which neither jitter nor a gap moves, in [ns]."""
+
+    def __init__(self) -> None:
+        self.ns: int | None = None
+        self._intervals: deque[int] = deque()
+        self._sorted: list[int] = []
+        self._last_ns: int | None = None
+        self._hurried = 0
+
+    def follow(self, time_ns: int) -> None:
+        """Take the next time; one that stands still gives no interval."""
+        last_ns, self._last_ns = self._last_ns, time_ns
+        if last_ns is None or time_ns <= last_ns:
+            return
+        interval_ns = time_ns - last_ns
+        # Held up somewhere, it came right behind the one before; unless all of late did.
+        hurried = self.ns is not None and interval_ns * BURST_SHARE < self.ns
+        self._hurried = self._hurried + 1 if hurried else 0
+        if self._hurried > LONGEST_BURST:
+            self._intervals.clear()
+            self._sorted.clear()
+            self.ns = None
+        elif hurried:
+            return
+        if len(self._intervals) == REMEMBERED_INTERVALS:
+            del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
+        self._intervals.append(interval_ns)
+        insort(self._sorted, interval_ns)
+        if len(self._sorted) >= FEWEST_INTERVALS:
+            self.ns = self._sorted[len(self._sorted) // 2]
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Gap of a sensor: the scan before it, the period, and the least lateness in periods of the scans after it."""
+
+    before: Scan
+    period_ns: float
+    least: float = math.inf
+    settled: int = 0
+
+
+class Cadence:
+    """Cadence of one sensor: a pattern is due one period after its scan, and what did not come shows as a gap.
+
+    The wire does not number scans: the number missing between two follows from the sensor's own period, and is only as
+    exact as that.
+
+    Attributes:
+        last: newest scan; None before the first.
+        missed: scans that did not arrive, as far as gaps show.
+    """
+
+    def __init__(self, rate_hz: float | None = None) -> None:
+        """Begin without a scan; `rate_hz` is the sensor's rate in [Hz], None if unknown."""
+        self.last: Scan | None = None
+        self.missed = 0
+        self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self._arrivals, self._stamps = _Period(), _Period()
+        self._gap: _Gap | None = None
+        self._paced_from: Scan | None = None
+        self._mean_ns: float | None = None
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between scans, in [ns]; None as long as too few have arrived."""
+        return self._known_ns or self._arrivals.ns
+
+    def late(self, latency_us: float) -> bool:
+        """Return whether a pattern missed its deadline, so long after its scan in [us]; never without a period."""
+        period_ns = self.period_ns
+        return period_ns is not None and latency_us * 1e3 > period_ns
+
+    def forget(self) -> None:
+        """Forget the scans: a recording goes on elsewhere, and none is missing."""
+        self.last = self._gap = self._paced_from = None
+
+    def follow(self, scan: Scan) -> None:
+        """Take the next scan."""
+        if not scan.unread_ns:  # scans that waited unread came at no pace
+            self._arrivals.follow(scan.time_ns)
+        if scan.device_ns is not None:
+            self._stamps.follow(scan.device_ns)
+        before, self.last = self.last, scan
+        if before is None:
+            self._paced_from = scan
+            return
+        period_ns = self.period_ns
+        if scan.device_ns is not None:  # else bursts of a busy reader would look like gaps
+            period_ns = self._stamps.ns or period_ns
+        if period_ns and period_ns >= SHORTEST_PERIOD_NS:
+            self._follow_gap(before, scan, period_ns)
+
+    def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
+        """Count the scans missing in a gap, once scans come at their pace again: late ones come in a burst."""
+        gap_ns, gap = scan.on_bus_ns - before.on_bus_ns, self._gap
+        if gap is not None and period_ns > GAP_PERIODS * gap.period_ns:
+            # A wrong pace only looked like a gap: scans read late come in bursts.
+            self._gap, self._mean_ns, self._paced_from = None, None, scan
+        elif gap_ns > GAP_PERIODS * period_ns:
+            if gap is not None:
+                gap.least, gap.settled = math.inf, 0
+            else:
+                self._gap = _Gap(before, self._mean_period_ns(before, period_ns))
+        elif gap is not None and gap_ns >= gap.period_ns / 2:
+            periods = (scan.on_bus_ns - gap.before.on_bus_ns) / gap.period_ns
+            gap.least = min(gap.least, periods - (scan.number - gap.before.number))
+            gap.settled += 1
+            if gap.settled == SETTLING_SCANS:
+                self.missed += max(round(gap.least), 0)
+                self._gap, self._paced_from = None, scan
+
+    def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
+        """Return the mean period over all scans since the last gap, or before it, if there were enough.
+
+        Over few scans, bursts make the median too small, and hardly the mean.
+        """
+        first = self._paced_from or scan
+        scans = scan.number - first.number
+        mean_ns = (scan.on_bus_ns - first.on_bus_ns) / scans if scans else 0.0
+        if scans >= PACED_SCANS:
+            self._mean_ns = mean_ns
+        return self._mean_ns or max(period_ns, mean_ns)
+
+
+class Cadences:
+    """Cadences of all sensors, and those that fall silent while another goes on.
+
+    Attributes:
+        missed: scans of all sensors that did not arrive, as far as gaps show.
+    """
+
+    def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False, rate_hz: float | None = None) -> None:
+        """Begin without a scan.
+
+        Args:
+            expected: names of sensors that should be there.
+            recorded: True if the scans are of a recording, which has no cable to check.
+            rate_hz: rate of each sensor, in [Hz]; None if unknown.
+        """
+        self.missed = 0
+        self._recorded = recorded
+        self._rate_hz = rate_hz
+        self._expected = set(expected)
+        self._sensors: dict[str, Cadence] = {}
+        self._first_ns: int | None = None
+        self._silent: set[str] = set()
+        self._since_ns: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._sensors)
+
+    def __getitem__(self, sensor: str) -> Cadence:
+        return self._sensors[sensor]
+
+    @property
+    def shortest_period_s(self) -> float:
+        """Shortest period of a sensor, in [s]; infinite as long as none is known."""
+        return min((one.period_ns or math.inf for one in self._sensors.values()), default=math.inf) / NS_PER_S
+
+    def begin_anew(self, time_ns: int, sensors: str = "") -> None:
+        """Restart the silence of sensors whose names begin so at `time_ns` [ns], when their link came back."""
+        self._since_ns[sensors] = time_ns
+
+    def forget(self, sensors: str = "") -> None:
+        """Forget the scans of sensors whose names begin so: a recording goes on elsewhere."""
+        for name, cadence in self._sensors.items():
+            if name.startswith(sensors):
+                cadence.forget()
+
+    def follow(self, scan: Scan) -> Event | None:
+        """Take the next scan of a sensor; return an event if it was silent."""
+        sensor = scan.sensor
+        cadence = self._sensors.get(sensor)
+        if cadence is None:
+            cadence = self._sensors[sensor] = Cadence(self._rate_hz)
+        since_ns = cadence.last.time_ns if cadence.last is not None else self._first_ns
+        if cadence.last is None:
+            self._expected.discard(sensor)
+            self._first_ns = scan.time_ns if self._first_ns is None else self._first_ns
+        missed = cadence.missed
+        cadence.follow(scan)
+        self.missed += cadence.missed - missed
+        if sensor not in self._silent:
+            return None
+        self._silent.remove(sensor)
+        away_s = (scan.time_ns - (scan.time_ns if since_ns is None else since_ns)) / 1e9
+        return Event(scan.time_ns, "back", sensor, f"sensor {sensor} is back after {away_s:.1f} s")
+
+    def look(self) -> list[Event]:
+        """Return events of sensors newly silent while another is not; the link reports a silence of all of them."""
+        last_ns = {name: one.last.time_ns for name, one in self._sensors.items() if one.last is not None}
+        if len(last_ns) + len(self._expected) < 2 or self._first_ns is None:
+            return []
+        newest_ns = max(last_ns.values(), default=self._first_ns)
+        events: list[Event] = []
+        for sensor, time_ns in last_ns.items():
+            if newest_ns - self._received_ns(sensor, time_ns) > SENSOR_SILENT_NS and sensor not in self._silent:
+                self._silent.add(sensor)
+                events.append(self._silence(sensor, newest_ns, time_ns, "the recording has none in that time"))
+        if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
+            missing, self._expected = sorted(self._expected), set()
+            self._silent.update(missing)
+            why = "the recording has none of it, though there is a baseline or a force for it"
+            events += [self._silence(sensor, newest_ns, self._first_ns, why) for sensor in missing]
+        return events
+
+    def _silence(self, sensor: str, now_ns: int, since_ns: int, why_recorded: str) -> Event:
+        why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
+        return Event(
+            now_ns, "silent", sensor, f"no scan from sensor {sensor} for {(now_ns - since_ns) / 1e9:.1f} s: {why}"
+        )
+
+    def _received_ns(self, sensor: str, time_ns: int) -> int:
+        since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
+        return max([time_ns, *since_ns])
