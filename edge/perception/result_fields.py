@@ -201,7 +201,7 @@ FIELDS: Final = (
     Field("mismatch", _REAL, "mismatch", "share of the readings' energy that the pattern does not explain, weighted by "
           "noise, gains and drift", decimals=4, byte=584),
     Field("tap_mismatch", _OBJECT, "tap_mismatch", "of each earlier tap, the newest first: how little it belongs to "
-          "this contact, 0 to 1; from .5 it is left out", json=_rounded, out=Out.RECORD),
+          "this contact, 0 to 1; from 0.5 it is left out", json=_rounded, out=Out.RECORD),
     Field("pose", _REAL, "pose", "pose of the pad at this scan in the object's plane: place, turn from x to y, and "
           "their standard deviations; unknown without poses", make=_pose_numbers, parts=_POSE_PARTS, json=_pose,
           out=_RECORD_ROS),

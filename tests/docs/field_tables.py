@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS
 from edge.sinks.shm_layout import IN_MEMORY, MAPS_IN_MEMORY, MEMBERS, offsets_of
@@ -30,19 +28,6 @@ def record_table() -> Iterator[str]:
         if field.out & (Out.RECORD | Out.MAP):
             kind = "object" if field.json and not field.kind.shape else _type_in_json(field)
             yield f"| `{field.name}` | {kind} | {field.text} |"
-
-
-def array_table() -> Iterator[str]:
-    """Arrays of an npz."""
-    yield "| array | dtype | shape | unknown | what, unless a record has it |\n|---|---|---|---|---|"
-    for field in FIELDS:
-        if Out.NPZ in field.out:
-            shape = SHAPES.get(field.kind.shape) or (str(len(field.parts)) if field.parts else "")
-            shape = f"(n, {shape})" if shape else "(n)"
-            text = "" if field.out & (Out.RECORD | Out.MAP) else field.text
-            kind = np.dtype(field.kind.array)
-            name = kind.str if kind.kind == "U" else kind.name
-            yield f"| `{field.name}` | `{name}` | {shape} | {_unknown(field.kind.unknown)} | {text} |"
 
 
 def memory_table() -> Iterator[str]:
@@ -80,7 +65,6 @@ def _unknown(value: Any) -> str:
 
 TABLES = {
     ("formats.md", "record"): record_table,
-    ("formats.md", "npz"): array_table,
     ("middleware.md", "shm"): memory_table,
 }
 
