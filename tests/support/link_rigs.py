@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
 
@@ -87,6 +87,10 @@ class CanRig(Rig):
         """Return the frames that links have sent."""
         raise NotImplementedError
 
+    def after_next_frame(self, action: Callable[[], object]) -> None:
+        """Do something in the reader's thread, once, between a frame and what the reader makes of it."""
+        raise NotImplementedError
+
     def give(self, link: Link, scans: int) -> list[Scan]:
         given = []
         for _ in range(scans):
@@ -160,6 +164,9 @@ class GsUsbRig(CanRig):
     def sent(self):
         return self._port.adapter.sent
 
+    def after_next_frame(self, action):
+        _after_next(self._port.adapter, "fetch", action)
+
     def lose(self):
         self._port.adapter.unplug()
 
@@ -200,7 +207,11 @@ class PythonCanRig(CanRig):
         self._far = VirtualBus(channel=self._channel, preserve_timestamps=True)
         self._plugged = threading.Event()
         self._plugged.set()
-        monkeypatch.setattr(can, "Bus", lambda channel, **_: PulledBus(self._plugged, channel=channel))
+        monkeypatch.setattr(can, "Bus", self._open)
+
+    def _open(self, *, channel, **_):
+        self._near = PulledBus(self._plugged, channel=channel)
+        return self._near
 
     def link(self, **settings):
         return CanBusLink("virtual", self._channel, **settings)
@@ -211,6 +222,9 @@ class PythonCanRig(CanRig):
     def sent(self):
         heard = iter(lambda: self._far.recv(0.0), None)
         return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard]
+
+    def after_next_frame(self, action):
+        _after_next(self._near, "recv", action)
 
     def lose(self):
         self._plugged.clear()
@@ -279,6 +293,18 @@ class ReplayRig(Rig):
 
     def link(self, **settings):
         return ReplayLink([self._recording])
+
+
+def _after_next(device: object, fetching: str, action: Callable[[], object]) -> None:
+    fetch = getattr(device, fetching)
+
+    def fetch_and_act(timeout_s):
+        setattr(device, fetching, fetch)
+        fetched = fetch(timeout_s)
+        action()
+        return fetched
+
+    setattr(device, fetching, fetch_and_act)
 
 
 def processes_playing(path: Path) -> list[int]:
