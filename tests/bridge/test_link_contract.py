@@ -219,7 +219,7 @@ def test_half_a_scan_is_forgotten_with_the_link(rig):
 @of(CAN)
 def test_triggers_wake_older_controllers(rig):
     with rig.link(model=LAYOUT_A_MAP, triggers=trigger_frames(LAYOUT_A_MAP)) as link:
-        assert rig.sent() == [trigger_frame(board) for board in range(1, 8)]
+        assert rig.sent(7) == [trigger_frame(board) for board in range(1, 8)]
         frames = [CanFrame(0x710 + taxel, bytes((0, 0, 1, 0, 2, 0, 3, 0))) for taxel in range(16)]
         (scan,) = rig.read(link, frames)
         assert scan.sensor == "1" and scan.complete and link.counters()["foreign"] == 0

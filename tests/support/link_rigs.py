@@ -18,7 +18,7 @@ from server_samples import looping
 from xela_server_emulator import ServerEmulator
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder, encode_frame
-from firmware_bridge.emulation.pty_port import PseudoPort
+from firmware_bridge.emulation.pty_port import PseudoPort, listen
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
@@ -83,8 +83,8 @@ class CanRig(Rig):
     def hear_at(self, frame: CanFrame, bus_us: int) -> None:
         raise NotImplementedError
 
-    def sent(self) -> list[CanFrame]:
-        """Return the frames that links have sent."""
+    def sent(self, frames: int) -> list[CanFrame]:
+        """Return the frames that a link has sent, so many."""
         raise NotImplementedError
 
     def after_next_frame(self, action: Callable[[], object]) -> None:
@@ -130,8 +130,12 @@ class SlcanRig(CanRig):
         line = encode_frame(frame._replace(timestamp_ms=bus_us // 1000 % 60_000))
         assert self._port.write(line) == len(line)
 
-    def sent(self):
-        return SlcanDecoder().feed(self._port.received())
+    def sent(self, frames):
+        decoder, heard, end_s = SlcanDecoder(), [], time.monotonic() + 60
+        while len(heard) < frames:
+            assert time.monotonic() < end_s, heard
+            heard += decoder.feed(b"".join(listen([self._port], 0.1).values()))
+        return heard
 
     def lose(self):
         self._port.unplug()
@@ -161,7 +165,7 @@ class GsUsbRig(CanRig):
     def hear_at(self, frame, bus_us):
         self._port.adapter.hear(frame, stamp_us=bus_us)
 
-    def sent(self):
+    def sent(self, frames):
         return self._port.adapter.sent
 
     def after_next_frame(self, action):
@@ -219,9 +223,9 @@ class PythonCanRig(CanRig):
     def hear_at(self, frame, bus_us):
         self._far.send(message_of(frame, timestamp=bus_us / 1e6))
 
-    def sent(self):
-        heard = iter(lambda: self._far.recv(0.0), None)
-        return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard]
+    def sent(self, frames):
+        heard = [self._far.recv(1.0) for _ in range(frames)]
+        return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
 
     def after_next_frame(self, action):
         _after_next(self._near, "recv", action)
