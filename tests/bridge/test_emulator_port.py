@@ -160,17 +160,17 @@ def test_one_command_plays_several_buses_each_to_its_own_end(tmp_path):
 
 def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
     """No controller sends in one burst what it has missed."""
-    path = write_recording(tmp_path / "a.csv", make_counts(16))
-    with start(path, "--rate-hz", 40) as process, SlcanSerialLink(process.stdout.readline().strip()) as link:
-        scans = read_scans(link, 4)
+    path = write_recording(tmp_path / "a.csv", make_counts(10))
+    with start(path, "--rate-hz", 20) as process, SlcanSerialLink(process.stdout.readline().strip()) as link:
+        scans = read_scans(link, 3)
         process.send_signal(signal.SIGSTOP)
         time.sleep(0.5)
         process.send_signal(signal.SIGCONT)
         scans += read_until_lost(link)
     apart_ns = np.diff([scan.device_ns for scan in scans if scan.device_ns is not None])
-    assert len(scans) == 16
+    assert len(scans) == 10
     assert apart_ns.max() > 400_000_000, "its stamps have the stop as well"
-    assert apart_ns.min() > 10_000_000, "no burst; a clock that is followed may be corrected by some ms after a stop"
+    assert apart_ns.min() > 20_000_000, "no burst; a clock that is followed may be corrected by some ms after a stop"
 
 
 def test_a_stop_amid_a_scan_tears_none():

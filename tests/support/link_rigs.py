@@ -131,7 +131,8 @@ class SlcanRig(CanRig):
         assert self._port.write(line) == len(line)
 
     def sent(self, frames):
-        decoder, heard, end_s = SlcanDecoder(), [], time.monotonic() + 60
+        decoder, end_s = SlcanDecoder(), time.monotonic() + 60
+        heard = decoder.feed(b"".join(listen([self._port], 0.1).values()))
         while len(heard) < frames:
             assert time.monotonic() < end_s, heard
             heard += decoder.feed(b"".join(listen([self._port], 0.1).values()))
