@@ -1,9 +1,11 @@
+"""The controller and the adapter that are emulated: their frames, times and answers."""
+
 import random
 from itertools import islice
 
 import numpy as np
 import pytest
-from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked
+from bridge_samples import make_counts, make_recording, read_until_lost
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -57,7 +59,7 @@ def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
     assert gaps == pytest.approx([FRAME_S] * 15)
 
 
-def test_a_controller_sends_one_frame_at_a_time_even_when_it_falls_behind():
+def test_a_controller_that_falls_behind_sends_one_after_the_other():
     times = [time_s for time_s, _ in timeline(rate_hz=1000.0)]
     assert np.diff(times) == pytest.approx([FRAME_S] * (len(times) - 1))
 
@@ -70,9 +72,8 @@ def test_two_controllers_share_the_bus():
 
 
 def test_the_seed_decides_everything():
-    options = {"jitter_s": 0.002}
-    assert timeline(seed=1, **options) == timeline(seed=1, **options)
-    assert timeline(seed=1, **options) != timeline(seed=2, **options)
+    first, again, other = (timeline(seed=seed, jitter_s=0.002) for seed in (1, 1, 2))
+    assert first == again != other
 
 
 def test_looping_goes_on_in_time():
@@ -87,53 +88,36 @@ def test_looping_goes_on_in_time():
 FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
 
 
-def test_an_adapter_opens_after_bitrate_and_open_only():
-    adapter = SlcanAdapter()
-    assert adapter.feed(b"O\r") == b"\a" and not adapter.channel_open
-    assert adapter.feed(b"S8\r") == b"\r" and not adapter.hears_the_bus
-    assert adapter.feed(b"O\r") == b"\r" and adapter.hears_the_bus
-    assert adapter.feed(b"O\r") == b"\a" and adapter.hears_the_bus
-    assert adapter.feed(b"S8\r") == b"\a" and adapter.feed(b"Z1\r") == b"\a"
-    assert adapter.feed(b"C\r") == b"\r" and not adapter.hears_the_bus
-    assert adapter.feed(b"O\r") == b"\r" and adapter.hears_the_bus
-    assert adapter.refused == 4
-
-
-def test_an_adapter_at_another_bitrate_hears_nothing():
-    adapter = SlcanAdapter()
-    adapter.feed(b"S6\rO\r")
-    assert adapter.channel_open and not adapter.hears_the_bus
-
-
-@pytest.mark.parametrize("command", [b"\r", b"C\r", b"S9\r", b"S\r", b"S88\r", b"OO\r", b"x\r", b"t0010\r", b"V1\r"])
-def test_an_adapter_refuses_nonsense(command):
-    adapter = SlcanAdapter()
-    assert adapter.feed(command) == b"\a" and adapter.refused == 1
-
-
-def test_an_adapter_takes_commands_in_pieces_and_forgets_overlong_ones():
-    adapter = SlcanAdapter()
-    assert adapter.feed(b"S") == b"" and adapter.feed(b"8\rO") == b"\r" and adapter.feed(b"\r") == b"\r"
-    assert adapter.hears_the_bus
-    adapter.feed(b"x" * 100_000)
-    assert len(adapter._pending) < 100
-    assert adapter.feed(b"\rC\r") == b"\a\r"
-
-
-def test_an_adapter_that_acknowledges_nothing():
-    adapter = SlcanAdapter(acknowledges=False)
-    assert adapter.feed(b"O\rS8\rO\rO\rV\r") == b"" and adapter.hears_the_bus and adapter.refused == 2
-
-
-def test_an_adapter_tells_its_version_and_sends_frames():
-    adapter = SlcanAdapter()
-    assert adapter.feed(b"V\r") == b"V1013\r"
-    assert adapter.feed(b"S8\rO\rt20120700\r") == b"\r\rz\r"
-    assert adapter.sent == [b"t20120700"]
+@pytest.mark.parametrize(
+    ("options", "talk", "hears", "refused"),
+    [  # it opens after bitrate and open alone, and what is open is not opened again
+        (
+            {},
+            [(b"O\r", b"\a"), (b"S8\r", b"\r"), (b"O\r", b"\r"), (b"O\rS8\rZ1\r", b"\a\a\a"), (b"C\rO\r", b"\r\r")],
+            True,
+            4,
+        ),
+        ({}, [(b"S6\rO\r", b"\r\r")], False, 0),  # at another bitrate it hears nothing
+        ({}, [(b"S", b""), (b"8\rO", b"\r"), (b"\r", b"\r"), (b"x" * 100_000, b""), (b"\rC\r", b"\a\r")], False, 1),
+        ({}, [(b"V\r", b"V1013\r"), (b"S8\rO\rt20120700\r", b"\r\rz\r")], True, 0),
+        ({}, [(b"\rC\rS9\rS\rS88\rOO\rx\rt0010\rV1\r", b"\a" * 9)], False, 9),
+        ({"acknowledges": False}, [(b"O\rS8\rO\rO\rV\r", b"")], True, 2),
+        ({"old_canable": True}, [(b"C\rS8\rZ1\rO\rF\rV\rN\r", b"")], True, 1),
+        ({"left_open": True}, [(b"F\rF1\rC\rF\r", b"F00\r\a\r\a")], False, 2),
+    ],
+)
+def test_an_adapter_obeys_and_refuses_as_a_strict_one(options, talk, hears, refused):
+    adapter = SlcanAdapter(**options)
+    for commands, answers in talk:
+        assert adapter.feed(commands) == answers
+    assert (adapter.hears_the_bus, adapter.refused) == (hears, refused)
+    assert adapter.sent == ([b"t20120700"] if b"t201" in talk[-1][0] else [])
 
 
 def test_time_stamps_are_on_request_and_wrap_each_minute():
-    adapter = SlcanAdapter()
+    old, adapter = SlcanAdapter(old_canable=True), SlcanAdapter()
+    old.feed(b"Z1\r")
+    assert old.encode(FRAME, 1.0) == b"t0048937E317E1593120F\r"
     assert adapter.encode(FRAME, 59.9999) == b"t0048937E317E1593120F\r"
     adapter.feed(b"Z1\r")
     assert adapter.encode(FRAME, 59.9999) == b"t0048937E317E1593120FEA5F\r"
@@ -142,13 +126,10 @@ def test_time_stamps_are_on_request_and_wrap_each_minute():
     assert adapter.encode(FRAME, 60.0) == b"t0048937E317E1593120F\r"
 
 
-def test_flags_are_told_while_it_is_open_and_cleared_by_telling():
+def test_flags_are_cleared_by_telling():
     adapter = SlcanAdapter(left_open=True)
-    assert adapter.feed(b"F\r") == b"F00\r"
     adapter.flags = 0x8A
     assert adapter.feed(b"F\r") + adapter.feed(b"F\r") == b"F8A\rF00\r"
-    assert adapter.feed(b"F1\r") == b"\a" and adapter.feed(b"C\r") == b"\r"
-    assert adapter.feed(b"F\r") == b"\a" and adapter.refused == 2
 
 
 def test_the_state_is_told_as_it_changes_and_bus_off_hears_nothing():
@@ -159,56 +140,26 @@ def test_the_state_is_told_as_it_changes_and_bus_off_hears_nothing():
     assert adapter.state_line("a", 0, 0) == b"", "who is closed tells nothing"
 
 
-def test_old_canable_firmware_answers_nothing_and_knows_little():
-    adapter = SlcanAdapter(old_canable=True)
-    assert adapter.feed(b"C\rS8\rZ1\rO\rF\rV\rN\r") == b"" and adapter.hears_the_bus
-    assert adapter.encode(FRAME, 1.0) == b"t0048937E317E1593120F\r", "no time stamp"
-    assert adapter.refused == 1
-
-
-def test_an_adapter_left_open():
-    assert SlcanAdapter(left_open=True).hears_the_bus
-
-
-def test_several_recordings_are_several_controllers():
-    recordings = [make_recording(10, seed=1), make_recording(10, seed=2)]
-    with Emulator(recordings, controllers=(9, 2)) as emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_until_lost(link)
-    for sensor, recording in zip(("9", "2"), recordings, strict=True):
-        assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
-
-
-def test_a_loop_does_not_end():
-    with Emulator([make_recording(3, rate_hz=200)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_scans(link, 10)
-    assert (scans[3].counts == scans[0].counts).all()
-
-
 @pytest.mark.parametrize(
-    "options", [{"controllers": [4, 6]}, {"controllers": [16]}, {"controllers": [-1]}, {"jitter_s": -1}]
+    ("recordings", "options", "words"),
+    [
+        (1, {"controllers": [4, 6]}, "expected"),
+        (1, {"controllers": [16]}, "expected"),
+        (1, {"controllers": [-1]}, "expected"),
+        (2, {"controllers": [4, 4]}, "2 different ones"),
+        (1, {"jitter_s": -1}, "expected"),
+        (1, {"latency_s": float("nan")}, "expected"),
+        (1, {"latency_s": float("inf")}, "expected"),
+        (1, {"rate_hz": 0.0}, "expected"),
+        (1, {"rate_hz": float("nan")}, "expected"),
+    ],
 )
-def test_options_out_of_range(options):
-    with pytest.raises(ValueError, match="expected"):
-        Emulator([make_recording(1)], **options)
+def test_options_out_of_range(recordings, options, words):
+    with pytest.raises(ValueError, match=words):
+        Emulator([make_recording(1)] * recordings, **options)
 
 
-def test_the_same_controller_twice():
-    with pytest.raises(ValueError, match="2 different ones"):
-        Emulator([make_recording(1)] * 2, controllers=[4, 4])
-
-
-def test_more_options_out_of_range():
-    for options in (
-        {"latency_s": float("nan")},
-        {"latency_s": float("inf")},
-        {"rate_hz": 0.0},
-        {"rate_hz": float("nan")},
-    ):
-        with pytest.raises(ValueError, match="expected"):
-            Emulator([make_recording(1)], **options)
-
-
-def test_recordings_that_no_such_sensor_made(tmp_path):
+def test_recordings_that_no_such_sensor_made():
     other = make_recording(1)
     wide = Track("4", np.zeros((1, 3, 5, 6), dtype=np.int32), None)
     with pytest.raises(RecordingError, match=r"\(3, 5, 6\)"):

@@ -11,13 +11,15 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import serial
-from bridge_samples import make_counts, make_recording, read_until_lost, stacked, write_recording
+from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
+from serial_samples import wait_for
 
-from firmware_bridge.emulation import emulator_thread, robot_main
+from firmware_bridge.emulation import robot_main
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.slcan_main import main
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
@@ -26,36 +28,8 @@ from firmware_bridge.scans.slcan_scans import SlcanScans
 # The pseudo-terminal.
 
 
-def open_raw(port: str, baudrate: int = 3_000_000) -> serial.Serial:
-    return serial.Serial(port, baudrate, rtscts=True, timeout=0.2)
-
-
-def read_to_the_end(port: serial.Serial) -> bytes:
-    """All until the emulator hangs up, or falls silent."""
-    data = b""
-    with contextlib.suppress(serial.SerialException):
-        while more := port.read(port.in_waiting or 1):
-            data += more
-    return data
-
-
-def test_silence_before_bitrate_and_open():
-    with Emulator([make_recording(5)]) as emulator, open_raw(emulator.port) as port:
-        assert port.read(100) == b""
-        port.write(b"O\r")
-        assert port.read(100) == b"\a"
-        port.write(b"S8\r")
-        assert port.read(100) == b"\r"
-        port.write(b"O\r")
-        assert port.read(23).startswith(b"\rt0048")
-    assert emulator.adapter.refused == 1
-
-
-def test_frames_begin_when_the_channel_opens(monkeypatch):
-    """They do not begin at the next look of the emulator whether it is to stop."""
-    monkeypatch.setattr(emulator_thread, "_STOP_POLL_S", 30.0)
-    with Emulator([make_recording(5)]) as emulator, SlcanSerialLink(emulator.port) as link:
-        assert len(read_until_lost(link, timeout_s=20)) == 5
+def open_raw(port: str) -> serial.Serial:
+    return serial.Serial(port, 3_000_000, rtscts=True, timeout=0.2)
 
 
 def test_close_stops_the_stream():
@@ -68,48 +42,6 @@ def test_close_stops_the_stream():
         assert not emulator.adapter.channel_open
         port.write(b"O\r")
         assert len(port.read(1000)) == 1000
-
-
-@pytest.mark.parametrize("left_open", [False, True])
-def test_the_wrong_line_speed_is_noise(left_open):
-    recording = make_recording(30)
-    with Emulator([recording], left_open=left_open) as emulator, open_raw(emulator.port, 115_200) as port:
-        port.write(b"S8\rO\r" * 20)
-        scans = SlcanScans()
-        data = read_to_the_end(port)
-        assert scans.feed(data, 0) == []
-        assert emulator.adapter.hears_the_bus == left_open
-        assert scans.counters()["frames"] == 0
-        if left_open:
-            # Noise, and less of it: bytes run into each other.
-            assert 0 < len(data) < 30 * 16 * 22 / 10
-
-
-def test_usb_adapters_ignore_the_line_speed():
-    with Emulator([make_recording(3)], ignores_line_speed=True) as emulator, open_raw(emulator.port, 115_200) as port:
-        port.write(b"S8\rO\r")
-        assert len(port.read(3 * 16 * 22)) == 3 * 16 * 22
-
-
-def test_a_slow_reader_loses_frames_and_stops_nobody():
-    """The kernel keeps some twenty thousand bytes for a reader; the device keeps none beyond."""
-    with Emulator([make_recording(400, rate_hz=480.0)]) as emulator, open_raw(emulator.port) as port:
-        port.write(b"S8\rO\r")
-        end_s = time.monotonic() + 60
-        while emulator.lost_frames < 100:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
-        decoder = SlcanScans()
-        while emulator.sent_frames + emulator.lost_frames < 400 * 16:
-            decoder.feed(port.read(port.in_waiting), 0)  # not for one byte more: it may hang up meanwhile
-            time.sleep(0.001)
-        with contextlib.suppress(OSError):  # it hangs up when all is fetched, however late the kernel hands it on
-            while True:
-                decoder.feed(port.read(port.in_waiting or 1), 0)
-        told = decoder.counters()
-        # A frame of which only a part had room is lost as well: its head is skipped before the next.
-        assert told["frames"] == emulator.sent_frames
-        assert told["frames"] + emulator.lost_frames == 400 * 16
 
 
 def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
@@ -141,23 +73,11 @@ def test_an_answer_waits_for_the_end_of_a_frame_that_found_no_room():
 def test_it_hangs_up_when_all_is_played_and_fetched():
     recording = make_recording(20)
     with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
-        time.sleep(0.4)  # all is played, nothing is fetched
+        wait_for(lambda: emulator.sent_frames == 20 * 16)  # nothing is fetched
         assert not emulator.wait(0)
         scans = read_until_lost(link)
-        assert emulator.wait(5)
+        assert emulator.wait(60)
     assert (stacked(scans) == recording.tracks[0].counts).all()
-
-
-def test_the_cable_out():
-    with Emulator([make_recording(50)], loop=True) as emulator, open_raw(emulator.port) as port:
-        port.write(b"S8\rO\r")
-        port.read(500)
-        emulator.hang_up()
-        assert emulator.wait(0)
-        with pytest.raises(serial.SerialException):
-            for _ in range(100):
-                port.read(1000)
-        emulator.hang_up()
 
 
 def test_a_link_replaces_links_alone(tmp_path):
@@ -203,19 +123,23 @@ def test_latency_bunches_what_arrives(latency_s, fewest, most):
 # The command.
 
 
-def start(*arguments: object) -> subprocess.Popen:
+def start(*arguments: object) -> Any:
     command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", *map(str, arguments)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def test_the_command_plays_and_ends(tmp_path):
+def test_the_command_plays_and_ends_with_who_started_it(tmp_path):
     path = write_recording(tmp_path / "a.csv", make_counts(8))
     with start(path, path, "--controller", "3,5", "--rate-hz", 200, "--no-acks", "--seed", 4) as process:
         with SlcanSerialLink(process.stdout.readline().strip()) as link:
             scans = read_until_lost(link)
         assert {scan.sensor for scan in scans} == {"3", "5"} and len(scans) == 16
         assert link.counters()["replies"] == 0
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
+    with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
+        assert process.stdout.readline().startswith("/dev/pts/") and process.poll() is None
+        process.stdin.close()
+        assert process.wait(60) == 0
 
 
 def test_one_command_plays_several_buses_each_to_its_own_end(tmp_path):
@@ -234,88 +158,76 @@ def test_one_command_plays_several_buses_each_to_its_own_end(tmp_path):
     assert stamps == {"bus0/4": 8, "bus0/6": 8, "bus1/4": 20}
 
 
-@pytest.mark.parametrize("buses", [0, 3])
-def test_more_buses_than_recordings_are_refused(tmp_path, capsys, buses):
-    path = write_recording(tmp_path / "a.csv", make_counts(8))
-    with pytest.raises(SystemExit, match="2"):
-        main([str(path), str(path), "--buses", str(buses)])
-    assert f"--buses is {buses}, expected 1 to the number of recordings, 2" in capsys.readouterr().err
-
-
-def test_the_robot_of_the_demo_has_one_bus(tmp_path, capsys):
-    path = write_recording(tmp_path / "a.csv", make_counts(8))
-    with pytest.raises(SystemExit, match="2"):
-        robot_main.main([str(path), str(path), "--rate-hz", "100", "--buses", "2"])
-    assert "--buses is 2: the robot has one pad, so leave it out" in capsys.readouterr().err
-
-
 def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
     """No controller sends in one burst what it has missed."""
-    path = write_recording(tmp_path / "a.csv", make_counts(24))
+    path = write_recording(tmp_path / "a.csv", make_counts(10))
     with start(path, "--rate-hz", 20) as process, SlcanSerialLink(process.stdout.readline().strip()) as link:
-        scans = []
-        while len(scans) < 4:
-            scans += link.read(1.0)
+        scans = read_scans(link, 3)
         process.send_signal(signal.SIGSTOP)
-        time.sleep(1.2)
+        time.sleep(0.5)
         process.send_signal(signal.SIGCONT)
         scans += read_until_lost(link)
     apart_ns = np.diff([scan.device_ns for scan in scans if scan.device_ns is not None])
-    assert len(scans) == 24
-    assert apart_ns.max() > 1_000_000_000, "its stamps have the stop as well"
+    assert len(scans) == 10
+    assert apart_ns.max() > 400_000_000, "its stamps have the stop as well"
     assert apart_ns.min() > 20_000_000, "no burst; a clock that is followed may be corrected by some ms after a stop"
 
 
 def test_a_stop_amid_a_scan_tears_none():
     """Only the machine can stop an emulator there; a controller sends its scans whole."""
     with (
-        Emulator([make_recording(40), make_recording(40, seed=1)], seed=3) as emulator,
+        Emulator([make_recording(20), make_recording(20, seed=1)], seed=3) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         encode = emulator.adapter.encode
-        numbers = iter(range(40 * 32))
+        numbers = iter(range(20 * 32))
 
         def encode_slowly(frame, time_s):
-            if next(numbers) in (20, 325, 648):
+            if next(numbers) in (20, 325):
                 time.sleep(0.5)
             return encode(frame, time_s)
 
         emulator.adapter.encode = encode_slowly
         scans = read_until_lost(link)
-    assert (stacked(scans, "4") == make_counts(40)).all() and (stacked(scans, "6") == make_counts(40, seed=1)).all()
+    assert (stacked(scans, "4") == make_counts(20)).all() and (stacked(scans, "6") == make_counts(20, seed=1)).all()
     assert emulator.lost_frames == 0 and all(scan.fresh.all() for scan in scans)
     for sensor in "46":
-        apart_ns = np.diff([scan.device_ns for scan in scans if scan.sensor == sensor])
-        assert (apart_ns > 300_000_000).sum() >= 3, "a gap of each stop; the machine may have stopped it as well"
+        apart_ns = np.diff([scan.device_ns or 0 for scan in scans if scan.sensor == sensor])
+        assert (apart_ns > 300_000_000).sum() >= 2, "a gap of each stop; the machine may have stopped it as well"
         assert apart_ns.min() > 0, "a clock whose rate is followed may be corrected by some ms after a stop"
 
 
-def test_the_command_ends_with_who_started_it(tmp_path):
-    path = write_recording(tmp_path / "a.csv", make_counts(8))
-    with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
-        assert process.stdout.readline().startswith("/dev/pts/")
-        assert process.poll() is None
-        process.stdin.close()
-        assert process.wait(10) == 0
-
-
-def test_the_command_says_what_is_wrong(tmp_path, capsys):
-    path = write_recording(tmp_path / "a.csv", make_counts(1))
-    for arguments, words in (
-        ([str(tmp_path / "gone.csv")], "cannot be read"),
-        ([str(path)], "--rate-hz"),
-        ([str(path), "--controller", "x"], "'x' are not controller ids, such as 4,6"),
-        ([str(path), "--rate-hz", "9", "--link", "/nonexist/x"], "link is /nonexist/x, expected a path in a folder"),
-        ([str(path), "--rate-hz", "9", "--link", str(path)], "a.csv, expected a path that is free or a link"),
-        ([str(path), "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
-        ([str(path), "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
-        ([str(path), "--rate-hz", "0"], "positive"),
-        ([str(path), "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == 2
-        assert words in capsys.readouterr().err.splitlines()[-1]
+@pytest.mark.parametrize(
+    ("command", "arguments", "words"),
+    [
+        (main, ["gone.csv"], "cannot be read"),
+        (main, ["a.csv"], "--rate-hz"),
+        (main, ["a.csv", "--controller", "x"], "'x' are not controller ids, such as 4,6"),
+        (
+            main,
+            ["a.csv", "--rate-hz", "9", "--link", "/nonexist/x"],
+            "link is /nonexist/x, expected a path in a folder",
+        ),
+        (main, ["a.csv", "--rate-hz", "9", "--link", "a.csv"], "a.csv, expected a path that is free or a link"),
+        (main, ["a.csv", "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
+        (main, ["a.csv", "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
+        (main, ["a.csv", "--rate-hz", "0"], "positive"),
+        (main, ["a.csv", "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
+        (main, ["a.csv", "a.csv", "--buses", "0"], "--buses is 0, expected 1 to the number of recordings, 2"),
+        (main, ["a.csv", "a.csv", "--buses", "3"], "--buses is 3, expected 1 to the number of recordings, 2"),
+        (
+            robot_main.main,
+            ["a.csv", "a.csv", "--rate-hz", "100", "--buses", "2"],
+            "--buses is 2: the robot has one pad, so leave it out",
+        ),
+    ],
+)
+def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, capsys, command, arguments, words):
+    write_recording(tmp_path / "a.csv", make_counts(1))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        command(arguments)
+    assert words in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):

@@ -1,40 +1,31 @@
-"""The python-can link: the real library, its virtual bus, and what its other interfaces do."""
+"""The python-can link: its clocks, its bus errors, and what is refused at its opening."""
 
+import builtins
 import errno
 import itertools
-import random
 import threading
-import time
 from functools import partial
+from pathlib import Path
 
 import can
 import pytest
-from bridge_samples import make_counts, read_scans
+from can.interfaces.virtual import VirtualBus
+from gs_usb_samples import frames_of
+from link_rigs import PulledBus, message_of
 
-from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.xela_controller import scan_frames
-from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink
+from firmware_bridge.links.can_networks import can_networks
+from firmware_bridge.links.discovery import can_interfaces
 from firmware_bridge.links.reconnecting import LastingLink
-from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
-from firmware_bridge.scans.slcan_scans import SlcanScans
-
-
-def frames_of(scans, controller=4, seed=0):
-    noise = random.Random(seed)
-    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
-
-
-def message_of(frame, **settings):
-    settings = {"is_extended_id": frame.extended, "is_remote_frame": frame.remote} | settings
-    return can.Message(arbitration_id=frame.can_id, data=frame.data, **settings)
+from firmware_bridge.scans.can_id_maps import trigger_frame
 
 
 @pytest.fixture
-def bus(request):
+def bus(tmp_path):
     """Somebody else on the virtual network of this test."""
-    with can.Bus(interface="virtual", channel=request.node.name, ignore_config=True, preserve_timestamps=True) as bus:
+    with VirtualBus(channel=tmp_path.name, preserve_timestamps=True) as bus:
         yield bus
 
 
@@ -42,37 +33,22 @@ def link_to(bus, **settings):
     return CanBusLink("virtual", bus.channel_id, **settings)
 
 
-def test_the_same_scans_as_over_slcan(bus):
-    frames = [frame for pair in zip(frames_of(50), frames_of(50, controller=6, seed=1), strict=True) for frame in pair]
-    del frames[700:703], frames[100]
-    frames.insert(40, frames[39])
-    frames.insert(300, CanFrame(0x004, bytes(8), extended=True))
-    frames.insert(301, CanFrame(0x004, b"", remote=True))
-    expected = SlcanScans().feed(b"".join(map(encode_frame, frames)), 0)
-    with link_to(bus) as link:
-        for number, frame in enumerate(frames):  # a machine that pauses here must make no pause on the bus
-            bus.send(message_of(frame, timestamp=1.8e9 + number * 130e-6))
-        scans = read_scans(link, len(expected))
-        assert link.read(0.01) == []
-        counters = link.counters()
-    assert len(scans) == len(expected) >= 95
-    for scan, other in zip(scans, expected, strict=True):
-        assert (scan.sensor, scan.number) == (other.sensor, other.number)
-        assert (scan.counts == other.counts).all() and (scan.renewed == other.renewed).all()
-        # What lay there for long, on a busy machine, sets no clock.
-        assert scan.device_ns <= scan.time_ns if not scan.unread_ns else scan.device_ns is None
-    assert (counters["frames"], counters["foreign"], counters["duplicates"]) == (len(frames), 2, 1)
+def read_all(link, messages):
+    return [scan for _ in range(messages) for scan in link.read(0.0)]
 
 
-def test_a_scan_comes_with_its_last_frame(bus):
+# Clocks.
+
+
+def test_frames_without_stamps_and_those_of_fd(bus):
     now_ns = itertools.count(5 * 10**12, 1_000_000)  # a machine that pauses here must make no pause on the bus
     with link_to(bus, clock_ns=now_ns.__next__) as link:
-        for frame in frames_of(1)[:15]:
+        bus.send(message_of(frames_of(1)[0], is_fd=True))
+        for frame in frames_of(1):
             bus.send(message_of(frame))
-        assert [link.read(0.0) for _ in range(15)] == [[]] * 15 and link.read(0.01) == []
-        bus.send(message_of(frames_of(1)[15]))
-        (scan,) = link.read(100.0)
-        assert scan.complete and scan.device_ns is None  # it carries no time
+        (scan,) = read_all(link, 17)
+        assert scan.complete and scan.device_ns is None
+        assert (link.counters()["fd_frames"], link.counters()["readings"]) == (1, 16)
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
@@ -81,16 +57,15 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
     with link_to(bus, clock_ns=lambda: now_ns[0]) as link:
         for cycle in range(6):
             for frame in frames_of(1, seed=cycle):
-                wall_s = 1.8e9 + cycle * 0.01 + step_s * (cycle >= 3)
-                bus.send(message_of(frame, timestamp=wall_s))
-            (scan,) = [scan for _ in range(16) for scan in link.read(0.0)]
+                bus.send(message_of(frame, timestamp=1.8e9 + cycle * 0.01 + step_s * (cycle >= 3)))
+            (scan,) = read_all(link, 16)
             assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns < 1_000_000
             now_ns[0] += 10_000_000
         assert link.counters()["clock_restarts"] == (step_s < 0)
 
 
 @pytest.mark.parametrize("begun_us", [0, 10**9])
-def test_a_driver_that_counts_from_its_opening_makes_no_reading_old(bus, begun_us):
+def test_a_driver_that_counts_from_its_opening_makes_nothing_old(bus, begun_us):
     """Count stamps from each opening: those after an outage may lie ahead of the earlier ones by any time."""
     now_ns, delays_ns = [5 * 10**12], []
     link = link_to(bus, clock_ns=lambda: now_ns[0])
@@ -98,122 +73,110 @@ def test_a_driver_that_counts_from_its_opening_makes_no_reading_old(bus, begun_u
         with link:
             for frame in frames_of(1, seed=opened_us):
                 bus.send(message_of(frame, timestamp=opened_us / 1e6))
-            (scan,) = [scan for _ in range(16) for scan in link.read(0.0)]
+            (scan,) = read_all(link, 16)
             delays_ns.append(scan.time_ns - scan.not_before_ns)
         now_ns[0] += 9 * 10**9
     assert delays_ns == [0, 0] and link.counters()["clock_restarts"] == 0
 
 
-def test_the_interface_gone_is_told_at_once_and_every_time(bus):
-    with link_to(bus) as link:
-        bus.send(message_of(frames_of(1)[0]))
-        link.read(0.0)
-        link._bus.shutdown()
-        for _ in range(2):
-            with pytest.raises(LinkLostError, match=r"can:virtual:\S+: link lost, .*closed bus"):
-                link.read(100.0)
+# Errors of the bus.
 
 
-def test_a_network_that_goes_down_is_told(bus, monkeypatch):
-    def recv(timeout):
-        raise can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
-
-    with link_to(bus) as link:
-        monkeypatch.setattr(link._bus, "recv", recv)
-        with pytest.raises(LinkLostError, match="Network is down"):
-            link.read(1.0)
+def error_message(classes, *data):
+    return can.Message(arbitration_id=classes, data=bytes(data), is_error_frame=True, is_extended_id=False)
 
 
-def test_any_number_of_times(bus):
-    link = link_to(bus)
-    frames = frames_of(3)
+BUS_OFF, PASSIVE = error_message(0x40), error_message(4, 0, 0x10)
+FRAME = message_of(frames_of(1)[0])
+
+
+def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
+    network = root / "class/net" / name
+    network.mkdir(parents=True)
+    (network / "flags").write_text("0x40081\n" if up else "0x40080\n")
+    (network / "type").write_text(f"{kind}\n")
+    if driver:
+        (root / driver).mkdir()
+        (network / "device").mkdir()
+        (network / "device/driver").symlink_to(root / driver)
+
+
+@pytest.fixture
+def networks(monkeypatch, tmp_path):
+    monkeypatch.setattr(can_bus, "can_networks", partial(can_networks, tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def lasting(bus, networks, monkeypatch):
+    """Link of socketcan that is opened again when it is silent, over the virtual bus, on a clock of its own."""
+    now_ns, plugged = [10**12], threading.Event()
+    plugged.set()
+    make_network(networks, "can0", up=True)
+    monkeypatch.setattr(can, "Bus", lambda **_: PulledBus(plugged, channel=bus.channel_id))
+    inner = CanBusLink("socketcan", "can0", clock_ns=lambda: now_ns[0])
+    with LastingLink(inner, clock_ns=lambda: now_ns[0], sleep=lambda _: None) as link:
+
+        def read(*messages, cable=True):
+            """Read messages, then let a second pass without any, and read again."""
+            plugged.set() if cable else plugged.clear()
+            for message in messages:
+                bus.send(message)
+                link.read(0.0)
+            now_ns[0] += 10**9
+            for _ in range(2):
+                link.read(0.0)
+            return link
+
+        yield read
+
+
+@pytest.mark.parametrize(("told", "words"), [(BUS_OFF, "bus-off"), (PASSIVE, "passive")])
+def test_a_bus_that_is_off_stays_so_however_often_it_is_opened(lasting, told, words):
+    """The kernel reports it once, to the sockets that are open then."""
+    link = lasting(told)
     for _ in range(3):
-        with link:
-            for frame in frames[:8]:
-                bus.send(message_of(frame))
-            assert [link.read(0.0) for _ in range(8)] == [[]] * 8
-        with link:
-            for frame in frames[24:]:
-                bus.send(message_of(frame))
-            (scan,) = read_scans(link, 1)
-            assert (scan.counts == make_counts(3)[2]).all()
-    link.__exit__(None, None, None)
+        assert words in (lasting().trouble or "")
+    counters = link.counters()
+    assert counters["reopenings"] >= 3 and counters["bus_off"] + counters["error_passive"] == 1
+    assert lasting(FRAME).trouble is None, "what told that it is over may have come meanwhile"
 
 
-def test_silence_is_only_silence(bus):
+def test_error_passive_goes_on_though_frames_come(lasting):
+    assert "passive" in (lasting(PASSIVE, FRAME).trouble or "")
+
+
+def test_a_network_that_was_down_begins_anew(lasting):
+    assert "bus-off" in (lasting(BUS_OFF).trouble or "")
+    for _ in range(3):
+        lasting(cable=False)
+    lasting()
+    assert lasting().trouble is None
+
+
+def test_errors_of_another_interface_are_counted_alone(bus):
+    """Nobody knows the meaning of their bits."""
     with link_to(bus) as link:
-        assert [link.read(0.001) for _ in range(20)] == [[]] * 20
-        assert link.trouble is None
-
-
-def test_errors_are_counted_and_told(bus):
-    with link_to(bus) as link:
-        error = can.Message(arbitration_id=0x40, data=bytes(8), is_error_frame=True, is_extended_id=False)
-        bus.send(error)
+        bus.send(BUS_OFF)
         link.read(0.0)
         counters = link.counters()
-        # What another interface than socketcan means by its bits, nobody knows.
         assert (counters["error_frames"], counters["other_errors"], counters["bus_off"]) == (1, 1, 0)
-        link._interface = "socketcan"
-        bus.send(error)
-        link.read(0.0)
+
+
+def test_a_bus_that_says_it_is_off(bus, monkeypatch):
+    monkeypatch.setattr(VirtualBus, "state", can.BusState.ERROR)
+    link = link_to(bus)
+    with link:
+        for _ in range(3):
+            link.read(0.001)
         assert link.counters()["bus_off"] == 1 and "bus-off" in (link.trouble or "")
-        bus.send(message_of(frames_of(1)[0]))
-        link.read(0.0)
-        assert link.trouble is None
-        bus.send(error)
-        link.read(0.0)
-    link._interface = "virtual"
+    monkeypatch.undo()
     with link:
         link.read(0.0)
         assert link.trouble is None, "it began anew"
 
 
-def test_a_bus_that_says_it_is_off(bus, monkeypatch):
-    with link_to(bus) as link:
-        monkeypatch.setattr(type(link._bus), "state", can.BusState.ERROR)
-        for _ in range(3):
-            link.read(0.001)
-        assert link.counters()["bus_off"] == 1 and "bus-off" in (link.trouble or "")
-
-
-def test_fd_frames_are_none_of_ours(bus):
-    with link_to(bus) as link:
-        bus.send(message_of(frames_of(1)[0], is_fd=True))
-        link.read(0.0)
-        assert (link.counters()["fd_frames"], link.counters()["readings"]) == (1, 0)
-
-
-def test_triggers_wake_older_controllers(bus):
-    with link_to(bus, model=LAYOUT_A_MAP, triggers=trigger_frames(LAYOUT_A_MAP)) as link:
-        heard = [bus.recv(1.0) for _ in range(7)]
-        assert [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one] == [
-            trigger_frame(board) for board in range(1, 8)
-        ]
-        for taxel in range(16):
-            bus.send(message_of(CanFrame(0x710 + taxel, bytes((0, 0, 1, 0, 2, 0, 3, 0)))))
-        (scan,) = read_scans(link, 1)
-        assert scan.sensor == "1" and scan.complete
-
-
-def test_triggers_that_do_not_go_out(bus, monkeypatch):
-    from can.interfaces.virtual import VirtualBus
-
-    def send(bus, message, timeout=None):
-        raise can.CanOperationError("Transmit buffer full")
-
-    monkeypatch.setattr(VirtualBus, "send", send)
-    link = link_to(bus, triggers=[trigger_frame(1)])
-    with pytest.raises(DeviceError, match="does not send frames: Transmit buffer full"):
-        link.__enter__()
-    assert len(bus.channel) == 1, "it has left"
-
-
-def test_a_link_that_is_not_open():
-    link = CanBusLink("virtual", "x")
-    with pytest.raises(ValueError, match="with statement"):
-        link.read(0.1)
-    link.__exit__(None, None, None)
+# Opening.
 
 
 @pytest.mark.parametrize(
@@ -227,103 +190,103 @@ def test_a_link_that_is_not_open():
         ("kvaser", "0", "device"),
     ],
 )
-def test_what_it_says_about_itself(interface, channel, kind):
-    link = CanBusLink(interface, channel)
-    assert (link.name, link.kind, link.ended) == (f"can:{interface}:{channel}", kind, False)
+def test_which_kind_of_source_it_is(interface, channel, kind):
+    assert CanBusLink(interface, channel).kind == kind
 
 
-def error_message(classes, *data):
-    return can.Message(arbitration_id=classes, data=bytes(data), is_error_frame=True, is_extended_id=False)
+@pytest.mark.parametrize(
+    ("interface", "channel", "settings"),
+    [
+        ("kvaser", "0", {"channel": 0, "bitrate": 1_000_000}),
+        ("pcan", "PCAN_USBBUS1", {"channel": "PCAN_USBBUS1", "bitrate": 1_000_000}),
+        ("virtual", "0", {"channel": "0"}),
+        ("socketcan", "can0", {"channel": "can0", "can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}),
+    ],
+)
+def test_the_bitrate_is_given_where_it_is_taken(monkeypatch, networks, interface, channel, settings):
+    asked = []
+    make_network(networks, "can0", up=True)
+    monkeypatch.setattr(can, "Bus", lambda **settings: asked.append(settings))
+    CanBusLink(interface, channel).__enter__()
+    assert asked == [{"interface": interface, "ignore_config": True} | settings]
 
 
-@pytest.fixture
-def lasting(bus, monkeypatch):
-    """Link of socketcan that is opened again when it is silent, over the virtual bus, on a clock of its own."""
-    now_ns = [10**12]
-    monkeypatch.setattr(can_bus, "_check_network", lambda name: None)
-    link = link_to(bus, clock_ns=lambda: now_ns[0])
-    link._interface = "socketcan"
-    virtual = partial(can.Bus, interface="virtual", channel=bus.channel_id, ignore_config=True)
-    monkeypatch.setattr(link, "_open", virtual)
-    with LastingLink(link, clock_ns=lambda: now_ns[0]) as lasting:
-
-        def read(*messages):
-            """Read messages, then let a second pass without any, and read again."""
-            for message in messages:
-                bus.send(message)
-                lasting.read(0.0)
-            now_ns[0] += 10**9
-            for _ in range(2):
-                lasting.read(0.0)
-            return lasting
-
-        yield read
+@pytest.mark.parametrize(
+    ("interface", "words"),
+    [
+        ("slcan", "use slcan:"),
+        ("gs_usb", "use gs_usb:"),
+        ("socketcam", r"expected can:INTERFACE:CHANNEL of (?!.*(slcan|gs_usb)).*kvaser.*pcan.*socketcan.*virtual"),
+    ],
+)
+def test_interfaces_that_are_refused(interface, words):
+    with pytest.raises(SourceError, match=words):
+        CanBusLink(interface, "0")
 
 
-@pytest.mark.parametrize(("told", "words"), [(error_message(0x40), "bus-off"), (error_message(4, 0, 0x10), "passive")])
-def test_a_bus_that_is_off_stays_so_however_often_a_socket_is_opened(lasting, told, words):
-    """The kernel reports it once, to the sockets that are open then."""
-    for number in range(4):
-        link = lasting(told) if number == 0 else lasting()
-        assert words in (link.trouble or ""), number
-    counters = link.counters()
-    assert counters["reopenings"] >= 3 and counters["bus_off"] + counters["error_passive"] == 1
-    assert lasting(message_of(frames_of(1)[0])).trouble is None, "what told that it is over may have come meanwhile"
+def test_python_can_is_not_installed(monkeypatch):
+    real = builtins.__import__
+
+    def no_can(name, *arguments, **settings):
+        if name == "can":
+            raise ImportError(name)
+        return real(name, *arguments, **settings)
+
+    monkeypatch.setattr(builtins, "__import__", no_can)
+    with pytest.raises(DeviceError, match=r"pip install '.+\[can\]'"):
+        CanBusLink("virtual", "x")
 
 
-def test_error_passive_goes_on_though_frames_come(lasting):
-    link = lasting(error_message(4, 0, 0x10), message_of(frames_of(1)[0]))
-    assert "passive" in (link.trouble or "")
+@pytest.mark.parametrize("interface", ["pcan", "kvaser", "neovi", "socketcand", "vector"])
+def test_a_driver_that_is_not_there(interface):
+    with pytest.raises(DeviceError, match=rf"^can:{interface}:0: cannot be opened"):
+        CanBusLink(interface, "0").__enter__()
 
 
-def test_a_network_that_was_down_begins_anew(lasting, monkeypatch):
-    def recv(timeout):
-        raise can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
-
-    link = lasting(error_message(0x40))
-    monkeypatch.setattr(link._link._bus, "recv", recv)
-    lasting()
-    assert not link._open
-    lasting()
-    assert lasting().trouble is None and link._open
-
-
-def test_read_ends_with_the_scan_though_more_time_is_left(bus):
-    with link_to(bus) as link:
-        frames = frames_of(1)
-        sender = threading.Timer(0.02, lambda: [bus.send(message_of(frame)) for frame in frames])
-        sender.start()
-        (scan,) = link.read(100.0)
-        sender.join()
-        assert scan.complete
-
-
-def test_what_came_while_the_reader_stood_still_after_a_wait_is_marked_old(bus, monkeypatch):
-    with link_to(bus) as link:
-        receive = link._bus.recv
-
-        def stands_still(timeout_s):
-            message = receive(timeout_s)
-            for frame in frames_of(1):
-                bus.send(message_of(frame))
-            time.sleep(0.1)
-            return message
-
-        with monkeypatch.context() as patched:
-            patched.setattr(link._bus, "recv", stands_still)
-            assert link.read(0.0) == []
-        (scan,) = read_scans(link, 1)
-        assert scan.unread_ns > 80_000_000
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        ("can0", r"can0 is down: sudo ip link set can0 up type can bitrate 1000000 restart-ms 100$"),
+        ("vcan0", r"vcan0 is down: sudo ip link set vcan0 up$"),
+        ("can2", r"no CAN network can2: .*seen: can0, can1, vcan0$"),
+        ("eth0", r"no CAN network eth0: .*seen: can0, can1, vcan0$"),
+    ],
+)
+def test_a_network_that_is_not_there_or_down(networks, channel, words):
+    make_network(networks, "can0", up=False, driver="gs_usb")
+    make_network(networks, "can1", up=True)
+    make_network(networks, "eth0", up=True, kind="1")
+    make_network(networks, "vcan0", up=False)
+    with pytest.raises(DeviceError, match=words) as refused:
+        CanBusLink("socketcan", channel).__enter__()
+    if channel == "can0":  # `edge-sr devices` advises the same
+        listed = can_interfaces(networks, lambda name: None)[0]
+        assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
 
 
-def test_what_lay_there_because_nobody_read_is_marked_old(bus):
-    with link_to(bus) as link:
-        for frame in frames_of(2):
-            bus.send(message_of(frame))
-        time.sleep(0.6)
-        first, second = read_scans(link, 2)
-        assert first.unread_ns > 500_000_000 < second.unread_ns
-        assert link.read(0.0) == []
-        for frame in frames_of(1, seed=1):
-            bus.send(message_of(frame))
-        assert [scan.unread_ns for scan in read_scans(link, 1)] == [0]
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EAFNOSUPPORT, "Address family not supported"), "modprobe can_raw"),
+        (PermissionError(errno.EPERM, "Operation not permitted"), "no permission"),
+        (can.CanInitializationError("no such channel"), "cannot be opened: no such channel"),
+    ],
+)
+def test_why_a_network_cannot_be_opened(monkeypatch, error, words):
+    def refuse(**settings):
+        raise error
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(DeviceError, match=words) as refused:
+        CanBusLink("pcan", "0").__enter__()
+    assert not isinstance(refused.value, LinkLostError)
+
+
+def test_triggers_that_do_not_go_out(bus, monkeypatch):
+    def send(bus, message, timeout=None):
+        raise can.CanOperationError("Transmit buffer full")
+
+    monkeypatch.setattr(VirtualBus, "send", send)
+    with pytest.raises(DeviceError, match="does not send frames: Transmit buffer full"):
+        link_to(bus, triggers=[trigger_frame(1)]).__enter__()
+    assert len(bus.channel) == 1, "it has left"

@@ -1,3 +1,5 @@
+"""Recordings that are played: at their own pace, side by side, and as a viewer of the page asks."""
+
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
@@ -5,9 +7,11 @@ from bridge_samples import make_counts, write_recording
 from firmware_bridge.errors import RecordingError, SourceError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.replay_player import FASTEST, JUMP_NS, PlayedReplay, Player
 from firmware_bridge.scans.scan import ABSENT
 
 START_NS = 7_000_000_000
+MS = 1_000_000
 
 
 class FakeTime:
@@ -35,44 +39,33 @@ def write_npz(path, sensors, times_ns, counts, **more):
 
 def test_a_csv_at_its_recorded_rate(tmp_path):
     counts = make_counts(5)
-    path = write_recording(tmp_path / "finger.csv", counts, rate_hz=50)
     time = FakeTime()
-    with replay(time, path) as link:
-        assert (link.kind, link.name, link.ended) == ("replay", f"replay:{path}", False)
+    with replay(time, write_recording(tmp_path / "finger.csv", counts, rate_hz=50)) as link:
         for number in range(5):
             (scan,) = link.read(1.0)
-            assert time.now_ns == START_NS + number * 20_000_000 == scan.time_ns
-            assert (scan.sensor, scan.number) == ("finger", number)
+            assert time.now_ns == START_NS + number * 20 * MS == scan.time_ns
             assert (scan.counts == counts[number]).all() and scan.complete and scan.renewed.all()
             assert link.ended == (number == 4)
         assert link.read(1.0) == []
     assert link.counters() == {"scans": 5, "torn_wire": 0, "torn_source": 0, "repeated": 0}
 
 
-def test_waiting_ends_with_the_timeout(tmp_path):
-    path = write_recording(tmp_path / "finger.csv", make_counts(2))
+def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all_that_is_due(tmp_path):
     time = FakeTime()
-    with replay(time, path, rate_hz=10) as link:
+    with replay(time, write_recording(tmp_path / "finger.csv", make_counts(9)), rate_hz=10) as link:
         assert len(link.read(0.0)) == 1
-        assert link.read(0.03) == [] and time.now_ns == START_NS + 30_000_000
-        assert link.read(0.0) == [] and time.now_ns == START_NS + 30_000_000
-        assert len(link.read(1.0)) == 1 and time.now_ns == START_NS + 100_000_000
-
-
-def test_a_late_reader_gets_all_that_is_due_and_the_grid_stays(tmp_path):
-    path = write_recording(tmp_path / "finger.csv", make_counts(9))
-    time = FakeTime()
-    with replay(time, path, rate_hz=100) as link:
-        time.now_ns += 35_000_000
-        assert [scan.number for scan in link.read(1.0)] == [0, 1, 2, 3]
+        assert link.read(0.03) == [] and time.now_ns == START_NS + 30 * MS
+        assert link.read(0.0) == [] and time.now_ns == START_NS + 30 * MS
+        assert len(link.read(1.0)) == 1 and time.now_ns == START_NS + 100 * MS
+        time.now_ns += 250 * MS
+        assert [scan.number for scan in link.read(1.0)] == [2, 3]
         (scan,) = link.read(1.0)
-        assert time.now_ns == scan.time_ns == START_NS + 40_000_000
+        assert time.now_ns == scan.time_ns == START_NS + 400 * MS, "the grid stays"
 
 
 def test_two_fingers_side_by_side(tmp_path):
     paths = [write_recording(tmp_path / f"{name}.csv", make_counts(3, seed), 100) for seed, name in enumerate("ab")]
-    time = FakeTime()
-    with replay(time, *paths) as link:
+    with replay(FakeTime(), *paths) as link:
         assert link.name == f"replay:{paths[0]},{paths[1]}"
         read = [[(scan.sensor, scan.number) for scan in link.read(1.0)] for _ in range(3)]
     assert read == [[("a", n), ("b", n)] for n in range(3)]
@@ -89,45 +82,29 @@ def test_sources_without_a_name_are_called_by_their_place(tmp_path):
         ([forms[0], f"left={forms[1]}"], ["source1/4", "left/4"]),
         (forms[:1], ["4"]),
     ):
-        links = open_sources(texts)
-        assert [scan.sensor for link in links for scan in played(link)] == names
+        assert [scan.sensor for link in open_sources(texts) for scan in link.__enter__().read(1)] == names
 
 
-def played(link):
-    with link:
-        return link.read(1)
-
-
-def test_an_npz_at_its_recorded_times(tmp_path):
+def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):
     counts = make_counts(4)
-    times_ns = [500, 500 + 3_000_000, 500 + 30_000_000, 500 + 33_000_000]
+    times_ns = [500, 500 + 3 * MS, 500 + 30 * MS, 500 + 33 * MS]
     path = write_npz(tmp_path / "both.npz", ["4", "6", "4", "6"], times_ns, counts, rate_hz=np.array(1.0))
-    time = FakeTime()
-    with replay(time, path) as link:
-        scans = []
-        while not link.ended:
-            for scan in link.read(1.0):
-                assert time.now_ns == scan.time_ns
-                scans.append(scan)
-    assert [scan.time_ns - START_NS for scan in scans] == [0, 3_000_000, 30_000_000, 33_000_000]
-    assert [(scan.sensor, scan.number) for scan in scans] == [("4", 0), ("6", 0), ("4", 1), ("6", 1)]
-    assert all((scan.counts == one).all() for scan, one in zip(scans, counts, strict=True))
-
-
-def test_a_given_rate_wins_over_recorded_times(tmp_path):
-    path = write_npz(tmp_path / "one.npz", ["4"] * 3, [0, 1, 2], make_counts(3))
-    time = FakeTime()
-    with replay(time, path, rate_hz=10) as link:
-        assert [len(link.read(1.0)) for _ in range(3)] == [1, 1, 1]
-    assert time.now_ns == START_NS + 200_000_000
+    for rate_hz, due_ms in ((None, [0, 3, 30, 33]), (10, [0, 0, 100, 100])):
+        time, scans = FakeTime(), []
+        with replay(time, path, rate_hz=rate_hz) as link:
+            while not link.ended:
+                scans += link.read(1.0)
+                assert time.now_ns == scans[-1].time_ns
+        assert [scan.time_ns - START_NS for scan in scans] == [due * MS for due in due_ms]
+        assert [(scan.sensor, scan.number) for scan in scans] == [("4", 0), ("6", 0), ("4", 1), ("6", 1)]
+        assert all((scan.counts == one).all() for scan, one in zip(scans, counts, strict=True))
 
 
 def test_torn_and_repeated_scans_are_told(tmp_path):
     counts = make_counts(2)[[0, 0, 1, 1]]
     counts[2, :, 1:] = counts[1, :, 1:]
     counts[3, :, 2, 2] = ABSENT
-    path = write_npz(tmp_path / "one.npz", ["4"] * 4, range(4), counts)
-    with replay(FakeTime(), path) as link:
+    with replay(FakeTime(), write_npz(tmp_path / "one.npz", ["4"] * 4, range(4), counts)) as link:
         scans = [scan for _ in range(4) for scan in link.read(1.0)]
     assert [scan.repeated for scan in scans] == [False, True, False, False]
     assert [scan.torn for scan in scans] == [False, False, True, True]
@@ -135,19 +112,96 @@ def test_torn_and_repeated_scans_are_told(tmp_path):
     assert link.counters() == {"scans": 4, "torn_wire": 1, "torn_source": 1, "repeated": 1}
 
 
-def test_what_cannot_be_replayed(tmp_path):
-    path = write_recording(tmp_path / "finger.csv", make_counts(1))
-    with pytest.raises(SourceError, match=r"finger\.csv .* --rate-hz"):
-        ReplayLink([path])
-    with pytest.raises(SourceError, match="each sensor once"):
-        ReplayLink([path, path], rate_hz=10)
-    for rate_hz in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(SourceError, match="positive"):
-            ReplayLink([path], rate_hz=rate_hz)
-    with pytest.raises(SourceError, match=r"finger\.csv lasts .* give a higher rate"):
-        ReplayLink([write_recording(path, make_counts(2))], rate_hz=1e-10)
-    timed = write_npz(tmp_path / "timed.npz", ["4"], [5], make_counts(1))
-    with pytest.raises(SourceError, match=r"timed\.npz has times of its own.*leave out --rate-hz, or add --paced"):
-        ReplayLink([timed], rate_hz=100, paced=False)
-    with pytest.raises(RecordingError, match="cannot be read"):
-        ReplayLink([tmp_path / "gone.csv"])
+@pytest.mark.parametrize(
+    ("names", "options", "words"),
+    [
+        (["finger.csv"], {}, r"finger\.csv .* --rate-hz"),
+        (["finger.csv"] * 2, {"rate_hz": 10}, "each sensor once"),
+        *((["finger.csv"], {"rate_hz": rate_hz}, "positive") for rate_hz in (0.0, -1.0, float("nan"), float("inf"))),
+        (["finger.csv"], {"rate_hz": 1e-10}, r"finger\.csv lasts .* give a higher rate"),
+        (
+            ["timed.npz"],
+            {"rate_hz": 100, "paced": False},
+            r"timed\.npz has times of its own.*leave out --rate-hz, or add --paced",
+        ),
+        (["gone.csv"], {}, "cannot be read"),
+    ],
+)
+def test_recordings_that_cannot_be_replayed(tmp_path, names, options, words):
+    write_recording(tmp_path / "finger.csv", make_counts(2))
+    write_npz(tmp_path / "timed.npz", ["4"], [5], make_counts(1))
+    with pytest.raises(RecordingError if names == ["gone.csv"] else SourceError, match=words):
+        ReplayLink([tmp_path / name for name in names], **options)
+
+
+# The player of the page.
+
+PERIOD_NS = 20 * MS
+
+
+class Clock(Player):
+    """Player on a clock that its waits move."""
+
+    def __init__(self):
+        super().__init__()
+        self.now_ns = 0
+
+    def wait(self, timeout_s):
+        self.now_ns += round(timeout_s * 1e9)
+
+
+@pytest.fixture
+def played(tmp_path):
+    paths = [write_recording(tmp_path / f"{name}.csv", make_counts(5, seed), 50) for seed, name in enumerate("ab")]
+    player = Clock()
+    return PlayedReplay(paths, player, clock=lambda: player.now_ns), player
+
+
+def take(link, count):
+    scans = []
+    while len(scans) < count:
+        scans += link.read(0.1)
+    return scans
+
+
+def test_it_waits_for_a_viewer_and_goes_round_with_times_that_go_on(played):
+    link, player = played
+    assert link.read(0.1) == [] and player.state.waiting and player.state.length_s == 0.08
+    player.begin()
+    scans = take(link, 14)
+    assert [(scan.sensor, scan.number) for scan in scans] == [(name, number) for number in range(7) for name in "ab"]
+    times_ns = [scan.time_ns for scan in scans[::2]]
+    assert times_ns == [*range(0, 100 * MS, PERIOD_NS), *(80 * MS + JUMP_NS + n * PERIOD_NS for n in range(2))]
+    assert (scans[10].counts == scans[0].counts).all() and not link.ended and player.state.rounds == 1
+    jumped = [(notice.kind, notice.text) for notice in link.notices()]
+    assert jumped == [("back", "")], "earlier readings are old, and nobody has to be informed"
+
+
+@pytest.mark.parametrize("speed", [0.25, 2.0])
+def test_its_speed_changes_when_a_scan_comes_and_not_its_time(played, speed):
+    link, player = played
+    player.begin()
+    take(link, 2)
+    player.set_speed(speed)
+    began_ns, scans = player.now_ns, take(link, 6)
+    assert player.now_ns - began_ns == pytest.approx(2 * PERIOD_NS / speed, rel=0.01)
+    assert np.diff([scan.time_ns for scan in scans[::2]]).tolist() == [PERIOD_NS] * 2
+    player.set_speed(1000)
+    assert player.state.speed == FASTEST
+
+
+def test_paused_it_shows_the_scan_of_each_finger_at_its_place(played):
+    link, player = played
+    player.begin()
+    take(link, 2)
+    player.pause(on=True)
+    assert [link.read(0.1) for _ in range(3)] == [[]] * 3
+    player.jump(0.06)
+    scans = take(link, 2)
+    assert [scan.sensor for scan in scans] == ["a", "b"] and player.state.at_s == pytest.approx(0.06)
+    assert link.read(0.1) == []
+    player.jump(99)
+    take(link, 2)
+    assert player.state.at_s == pytest.approx(0.08)
+    player.pause(on=False)
+    assert take(link, 1)[0].sensor == "a" and player.state.at_s == 0

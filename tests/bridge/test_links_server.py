@@ -1,23 +1,27 @@
+"""The link to the vendor's server: its sensors, its losses, and others that listen at its address."""
+
+import contextlib
 import json
+import socket
 import sys
-import time
+import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
-from bridge_samples import (
-    REST_COUNTS,
-    make_recording,
-    read_scans,
-    read_until_lost,
-    stacked,
-)
-from server_samples import looping, wait_for
+from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
+from server_samples import looping, lose, read_notices, wait_for
+from websockets.protocol import State
+from websockets.sync.client import ClientConnection
 from xela_server_emulator import ServerEmulator
 from xela_server_model import GARBAGE, VERSIONS, VendorServer
 
 from edge.cli import main as cli
-from firmware_bridge.errors import DeviceError, LinkLostError
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
+from firmware_bridge.links import xela_server
+from firmware_bridge.links.registry import open_source, open_sources
 from firmware_bridge.links.xela_server import XelaServerLink
+from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -30,30 +34,11 @@ def test_every_scan_comes_once_and_in_order(version):
         mine = [scan for scan in scans if scan.sensor == sensor]
         assert [scan.number for scan in mine] == list(range(30))
         assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
-        times = [scan.time_ns for scan in mine]
-        assert times == sorted(times)
-        assert all(scan.device_ns is not None and scan.device_ns <= scan.time_ns for scan in mine)
         assert all(scan.vendor_force_n is not None for scan in mine)
         has_temperature = [scan.vendor is not None and scan.vendor.temperature_k is not None for scan in mine]
         assert has_temperature == [version == "1.8.0"] * 30
     counters = {name: count for name, count in link.counters().items() if count and name != "received_bytes"}
     assert counters == {"messages": 31, "welcomes": 1, "scans": 60}
-
-
-def test_what_it_says_about_itself():
-    link = XelaServerLink("ws://robot")
-    assert (link.name, link.kind, link.ended, link.url) == (
-        "xela-server:ws://robot",
-        "device",
-        False,
-        "ws://robot:5000",
-    )
-    with pytest.raises(ValueError, match="with statement"):
-        link.read(0)
-    with ServerEmulator(looping()) as server:
-        link = XelaServerLink(server.url)
-        with link as entered:
-            assert entered is link and link.kind == "emulated"  # a server of ours does not pass for the vendor's
 
 
 def test_garbage_costs_itself_alone():
@@ -74,25 +59,8 @@ def test_a_client_that_does_not_read_gets_what_is_old_and_is_told():
         while not server.lost_messages:
             server.say(" " * 200_000)  # fills what the kernel and the server keep
         wait_for(lambda: server.lost_messages > 30)
-        end_s = time.monotonic() + 60
-        while not link.counters()["missed_messages"]:
-            link.read(0.1)
-            assert time.monotonic() < end_s
+        wait_for(lambda: link.read(0.1) is not None and link.counters()["missed_messages"])
         assert link.counters()["stale_scans"] > 0
-
-
-def test_what_fails_while_it_is_opened_leaves_nothing_open(monkeypatch):
-    def fail(link, timeout_s):
-        raise LinkLostError("gone")
-
-    monkeypatch.setattr(XelaServerLink, "_take", fail)
-    with ServerEmulator(looping()) as server:
-        with pytest.raises(LinkLostError):
-            XelaServerLink(server.url).__enter__()
-        wait_for(lambda: not server._server._clients)
-
-
-# Sensors.
 
 
 def test_sensors_of_other_shapes_are_left_out():
@@ -102,10 +70,9 @@ def test_sensors_of_other_shapes_are_left_out():
 
 
 def test_a_server_with_none_that_fits_is_an_error_not_silence():
-    server = VendorServer([], others=[("uSPa46", 24)], loop=True)
     words = r"no sensor that can be used: sensor 1 is left out: 'uSPa46'"
     with (
-        ServerEmulator(server) as emulator,
+        ServerEmulator(VendorServer([], others=[("uSPa46", 24)], loop=True)) as emulator,
         pytest.raises(DeviceError, match=words) as refused,
         XelaServerLink(emulator.url) as link,
     ):
@@ -121,24 +88,19 @@ def test_taxels_that_fall_silent_are_absent():
         wait_for(lambda: any(not scan.complete for scan in link.read(0.05)))
         assert all(np.flatnonzero(~scan.fresh).tolist() == [2, 3] for scan in read_scans(link, 5))
         vendor.silent = frozenset(range(16))
-        wait_for(lambda: not link.read(0.05) and not link.read(0.05))
-        assert link.counters()["messages"] > 0 and link.trouble is None
         wait_for(lambda: not link.read(0.05) and link.trouble)
         assert link.trouble == "nothing arrives from sensor 1: check its cable and its power"
         vendor.silent = frozenset()
         wait_for(lambda: any(scan.whole for scan in link.read(0.05)))
 
 
-# The whole program.
-
-
 def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
     records = tmp_path / "records.jsonl"
-    still = make_recording(130, rate_hz=200.0)
+    still = make_recording(130, rate_hz=400.0)
     still.tracks[0].counts[:] = REST_COUNTS + np.random.default_rng(1).integers(0, 5, still.tracks[0].counts.shape)
-    with ServerEmulator(VendorServer([still], loop=True), message_hz=200) as server:
-        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "2"])
+    with ServerEmulator(VendorServer([still], loop=True), message_hz=400) as server:
+        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "1.5"])
     assert code == 0, capsys.readouterr().err
     lines = [json.loads(line) for line in records.read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
@@ -148,3 +110,215 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     assert idle and all(line["force_n"] == line["vendor_force_n"][2] for line in idle)
     assert {line["temperature_k"] for line in idle} == {302.5}
     assert any("missed_messages" in line.get("counters", ()) for line in idle)
+
+
+# It goes, hangs and comes back.
+
+
+def test_a_server_that_restarts_counts_its_messages_anew():
+    with ServerEmulator(looping()) as server:
+        link = XelaServerLink(server.url)
+        for _ in range(2):
+            with link:
+                read_scans(link, 5)
+                server.kill()
+            server.start_again()
+        counters = link.counters()
+        assert counters["reordered_messages"] == counters["server_restarts"] == counters["missed_messages"] == 0
+        with link:  # and one that does so without closing
+            read_scans(link, 2)
+            server.count_from(1000)
+            wait_for(lambda: link.read(0.05) and link.counters()["missed_messages"] > 900)
+            server.count_from(0)
+            server.say('{"message": "Welcome"}')
+            wait_for(lambda: link.read(0.05) and link.counters()["server_restarts"] == 1)
+
+
+def test_a_dead_sensor_is_told_of_once_and_not_taken_for_back():
+    vendor = looping()
+    with ServerEmulator(vendor) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
+        read_scans(link, 3)
+        vendor.silent = frozenset(range(16))
+        notices = read_notices(link, 2)
+        wait_for(lambda: not link.read(0.05) and link.counters()["reopenings"] >= 2)
+        assert [notice.kind for notice in notices + link.notices()] == ["silent", "trouble"]
+        assert "nothing arrives from sensor 1" in notices[1].text
+
+
+def test_a_half_open_connection_is_seen(monkeypatch):
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.1)
+    monkeypatch.setattr(xela_server, "ANSWER_S", 0.2)
+    with ServerEmulator(looping()) as server:
+        link = XelaServerLink(server.url)
+        with link:
+            read_scans(link, 5)
+            server.freeze()
+            assert "silent, and no answer within 0.2 s" in lose(link)
+        server.thaw()
+        with link:
+            assert read_scans(link, 5)
+
+
+def test_one_that_closes_just_before_it_is_asked_is_a_lost_link(monkeypatch):
+    def hear_nothing(connection, *args, **kwargs):
+        wait_for(lambda: connection.protocol.state is State.CLOSED)
+        raise TimeoutError
+
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
+    with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
+        read_scans(link, 1)
+        server.kill()
+        monkeypatch.setattr(ClientConnection, "recv", hear_nothing)
+        assert lose(link).startswith(f"{server.url}: link lost: ")
+
+
+def test_a_server_with_nothing_to_say_is_no_lost_link(monkeypatch):
+    """The server answers pings, and is not asked while it sends."""
+    asked, ping = [], ClientConnection.ping
+    monkeypatch.setattr(ClientConnection, "ping", lambda link: asked.append(ping(link)) or asked[-1])
+    with ServerEmulator(looping(), message_hz=0.2) as server, XelaServerLink(server.url) as link:
+        link.read(0.1)
+        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 60.0)
+        assert not any(link.read(0.01) for _ in range(3)) and not asked
+        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.05)
+        wait_for(lambda: link.read(0.02) is not None and len(asked) >= 4)
+        assert all(pong.wait(60) for pong in asked[:-1])
+
+
+def test_a_server_that_talks_but_answers_no_ping_is_kept(monkeypatch):
+    asked, now_ns = [], [0]
+    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
+    monkeypatch.setattr(ClientConnection, "ping", lambda link: asked.append(threading.Event()) or asked[-1])
+    with ServerEmulator(looping()) as server, XelaServerLink(server.url, clock_ns=lambda: now_ns[0]) as link:
+        for _ in range(10):
+            assert link.read(20.0) is not None
+            now_ns[0] += round(2 * xela_server.ANSWER_S * 1e9)
+        assert len(asked) >= 9
+
+
+def test_it_is_told_why_a_server_closes_or_is_left():
+    with ServerEmulator(looping()) as server:
+        link = XelaServerLink(server.url)
+        with link:
+            server.say(looping().message(7, 0.5, 1e9).encode())  # a binary message is one, too
+            assert read_scans(link, 1)
+            server.close_all(1012, "service restart")
+            assert "the server closed it (code 1012, 'service restart')" in lose(link)
+        with link:
+            server.say("x" * (LONGEST_MESSAGE_BYTES + 1))
+            assert "a message that no xela_server sends: " in lose(link)
+
+
+# Connecting.
+
+
+def test_an_error_while_it_is_opened_leaves_nothing_open():
+    with ServerEmulator(looping()) as server:
+        before, clock_ns = len(list(Path("/proc/self/fd").iterdir())), iter([0])
+        with pytest.raises(StopIteration):
+            XelaServerLink(server.url, clock_ns=clock_ns.__next__).__enter__()
+        wait_for(lambda: len(list(Path("/proc/self/fd").iterdir())) == before)
+
+
+@contextlib.contextmanager
+def listening(answer):
+    """Yield the address of a socket that gives `answer` (None: nothing) to who connects, and is no server."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        stop = threading.Event()
+
+        def serve():
+            with listener.accept()[0] as connection:
+                connection.recv(4096)
+                stop.wait(60) if answer is None else connection.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"ws://127.0.0.1:{listener.getsockname()[1]}"
+        stop.set()
+        thread.join()
+
+
+HTTP = b"HTTP/1.1 %s\r\nContent-Length: 0\r\n%s\r\n"
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (HTTP % (b"404 Not Found", b""), "HTTP status 404"),
+        (HTTP % (b"200 OK", b""), "HTTP status 200"),
+        (HTTP % (b"302 Found", b"Location: ws://elsewhere/\r\n"), "broke while it was opened|HTTP status 302"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "another program"),
+        (b"\x15\x03\x01\x00\x02\x02\x46", "expects TLS"),
+        (b"", "another program"),
+        (HTTP % (b"101 Switching Protocols", b""), "is not an xela_server"),
+        (None, r"has not answered for 0\.2 s"),
+    ],
+)
+def test_others_that_listen_there(answer, words, monkeypatch):
+    if answer is None:
+        monkeypatch.setattr(xela_server, "OPENING_S", 0.2)
+    with listening(answer) as url, pytest.raises(DeviceError, match=words) as refused:
+        XelaServerLink(url).__enter__()
+    assert str(refused.value).startswith(url) and "\n" not in str(refused.value)
+
+
+def test_one_that_was_met_and_hangs_holds_up_its_reader_for_less(monkeypatch):
+    monkeypatch.setattr(xela_server, "OPENING_S", 20.0)
+    monkeypatch.setattr(xela_server, "REOPENING_S", 0.2)
+    with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
+        read_scans(link, 3)
+        server.freeze()
+        silent, lost = read_notices(link, 2)
+        assert (silent.kind, lost.kind) == ("silent", "lost")
+        assert "has not answered for 0.2 s: it hangs" in lost.text
+        server.thaw()
+        assert read_scans(link, 3)
+
+
+@pytest.mark.parametrize(
+    ("host", "error", "words"),
+    [
+        ("127.0.0.1", ConnectionRefusedError(111, ""), r"refused: .*start xela_server.*1\.7\.6.*hostname -I"),
+        ("robot", ConnectionRefusedError(111, ""), r"refused: start xela_server there, or name its port$"),
+        ("robot", socket.gaierror(-2, "Name or service not known"), "no such host"),
+        ("robot", TimeoutError("timed out"), "no answer within 3 s"),
+        ("robot", OSError(113, "No route to host"), "No route to host"),
+        ("192.168.0..21", None, "no such host: name it by its IP address"),
+        (".x", None, "no such host: name it by its IP address"),
+        ("x" * 64, None, "no such host: name it by its IP address"),
+    ],
+)
+def test_hosts_that_cannot_be_reached(monkeypatch, host, error, words):
+    def refuse(*args, **kwargs):
+        raise error
+
+    if error is not None:
+        monkeypatch.setattr(socket, "create_connection", refuse)
+    with pytest.raises(DeviceError, match=rf"^ws://\S+:5000: .*{words}"):
+        XelaServerLink(f"ws://{host}").__enter__()
+
+
+@pytest.mark.parametrize(
+    ("url", "known"),
+    [
+        ("ws://robot", "ws://robot:5000"),
+        ("ws://10.0.0.7:5001/", "ws://10.0.0.7:5001"),
+        ("ws://[::1]", "ws://[::1]:5000"),
+        ("WS://Robot:80", "ws://robot:80"),
+    ],
+)
+def test_addresses(url, known):
+    link = open_source(f"xela-server:{url}")
+    assert isinstance(link, XelaServerLink)
+    assert (link.name, link.url, link.kind) == (f"xela-server:{url}", known, "device")
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["robot", "robot:5000", "http://robot", "wss://robot", "ws://", "ws://:5000", "ws://robot:0", "ws://robot:70000",
+     "ws://robot:x", "ws://user:secret@robot", "ws://robot/path", "ws://robot?x=1", "ws://robot#x", "ws://[::1",
+     "ws://ro bot", "ws://robot\n"],
+)  # fmt: skip
+def test_addresses_that_are_none(url):
+    with pytest.raises(SourceError, match=r"expected ws://HOST or ws://HOST:PORT"):
+        open_source(f"xela-server:{url}")

@@ -3,11 +3,9 @@
 import itertools
 import os
 import time
-from itertools import pairwise
-from statistics import median
 
 import pytest
-from bridge_samples import make_recording, read_scans, read_until_lost, stacked
+from bridge_samples import make_recording, read_scans, read_until_lost
 from serial_samples import SilentDevice, wait_for
 
 from firmware_bridge.can import slcan_status
@@ -15,7 +13,6 @@ from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links import slcan_serial
-from firmware_bridge.links.serial_ports import PluggedAdapter
 from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -54,12 +51,11 @@ def test_a_scan_has_the_time_of_its_newest_frame():
     assert delays_ms == [0.0] * 7 + [0.0] + [3.0] * 12, "the smallest is taken for none"
 
 
-@pytest.mark.parametrize("cut", [1, 26, 100, 416, 1000])
+@pytest.mark.parametrize("cut", [1, 100, 1000])
 def test_any_chunking_gives_the_same_times(cut):
     """The frames of two sensors mix, so that no cycle is whole; frames that came in time set the clock first."""
     lines = [line for n in range(9) for line in cycle_lines(n, 110 + 10 * n)]
-    pairs = [zip(cycle_lines(n, 110 + 10 * n), other_cycle(n), strict=True) for n in range(9)]
-    mixed = [line for cycles in pairs for pair in cycles for line in pair]
+    mixed = [one for line in lines for one in (line, line[:3] + b"6" + line[4:])]
     for text in (b"".join(lines), b"".join(mixed)):
         whole, pieces = SlcanScans(), SlcanScans()
         for scans in (whole, pieces):
@@ -69,11 +65,6 @@ def test_any_chunking_gives_the_same_times(cut):
         assert [scan.device_ns for scan in got] == [scan.device_ns for scan in expected]
         assert {scan.device_ns for scan in got} == {10**12 - 10**9 + (10 + 10 * n) * MS for n in range(9)}
         assert whole.counters() == pieces.counters()
-
-
-def other_cycle(number: int) -> list[bytes]:
-    """Return the lines of a cycle of controller 6, with equal stamps."""
-    return [line[:3] + b"6" + line[4:] for line in cycle_lines(number, 110 + 10 * number)]
 
 
 def test_a_torn_scan_has_the_time_of_its_newest_frame_too():
@@ -87,24 +78,14 @@ def test_a_torn_scan_has_the_time_of_its_newest_frame_too():
     assert (second - first, third - second) == (10 * MS, 10 * MS)
 
 
-def test_the_same_stamp_a_minute_later_is_a_minute_later():
+def test_the_same_stamp_is_a_minute_later_and_another_after_an_opening():
     scans = SlcanScans()
     scans.feed(b"".join(cycle_lines(0, 100)), 10**12)  # learns the form
     first, second = (scans.feed(b"".join(cycle_lines(n, 200)), 10**12 + (100 + n * 60_000) * MS)[0] for n in range(2))
     assert first.device_ns is not None and second.device_ns == first.device_ns + 60_000 * MS
-
-
-def test_after_an_opening_the_clock_is_another():
-    scans = SlcanScans()
-    scans.feed(b"".join(cycle_lines(0, 50)), 10**12)
     scans.begin_anew()
-    (scan,) = scans.feed(b"".join(cycle_lines(1, 20)), 10**12 + 30 * MS)
+    (scan,) = scans.feed(b"".join(cycle_lines(1, 20)), second.time_ns + 30 * MS)
     assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= MS
-
-
-def test_without_stamps_there_is_no_device_time():
-    (scan,) = SlcanScans().feed(b"".join(cycle_lines(0)), 10**12)
-    assert scan.device_ns is None
 
 
 def test_stamps_say_how_many_bytes_a_scan_needs():
@@ -114,18 +95,6 @@ def test_stamps_say_how_many_bytes_a_scan_needs():
     assert (plain.bytes_until_scan(), stamped.bytes_until_scan()) == (16 * 22, 16 * 26)
     stamped.feed(cycle_lines(1, 10)[0] + b"t10", 0)
     assert stamped.bytes_until_scan() == 15 * 26 - 3
-
-
-def test_an_emulated_sensor_is_read_with_its_stamps():
-    recording = make_recording(40)
-    with Emulator([recording], waits=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_until_lost(link)
-    assert (stacked(scans) == recording.tracks[0].counts).all()
-    times = [scan.device_ns for scan in scans if scan.device_ns is not None]
-    assert len(times) == 40 and times == sorted(times)
-    assert all(scan.device_ns is not None and scan.device_ns <= scan.time_ns for scan in scans)
-    # On its own clock the sensor keeps its pace, however late scans were read; a busy machine lets some be sent late.
-    assert abs(median((b - a) / MS for a, b in pairwise(times)) - 10) < 2
 
 
 def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatch):
@@ -144,21 +113,23 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
     assert {scan.device_ns for scan in scans} == {None} and link.trouble is None
 
 
-def test_an_adapter_whose_stamps_are_no_milliseconds_of_a_minute_is_told_to_leave_them_out(monkeypatch):
+def test_stamps_that_are_no_milliseconds_of_a_minute_are_left_out(monkeypatch):
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        late = [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)]
-        for line in late[: MOST_LATE_STAMPS - 1]:
-            os.write(device.device_fd, line)
-        wait_for(lambda: link.read(0.01) == [] and link.counters()["late_stamps"] == MOST_LATE_STAMPS - 1)
-        assert device.received(10) == b"C\rS8\rZ1\rO\r"
-        os.write(device.device_fd, late[0])
-        wait_for(lambda: link.read(0.01) == [] and link.counters()["late_stamps"] == MOST_LATE_STAMPS)
-        assert device.received(7) == b"C\rZ0\rO\r"
-        os.write(device.device_fd, late[0] + b"".join(cycle_lines(1) + cycle_lines(2)))
-        scan, *_ = read_scans(link, 1)
-        assert scan.complete and scan.device_ns is None
-    assert device_commands_after(link) == b"C\rS8\rO\rC\r"
+    late = [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)]
+    with SilentDevice() as device:
+        with SlcanSerialLink(device.port) as link:
+            for number, line in enumerate(late[:MOST_LATE_STAMPS], 1):
+                os.write(device.device_fd, line)
+                wait_for(lambda n=number: link.read(0) == [] and link.counters()["late_stamps"] == n)
+            assert device.received(10) == b"C\rS8\rZ1\rO\r"
+            assert device.received(7) == b"C\rZ0\rO\r"
+            os.write(device.device_fd, late[0] + b"".join(cycle_lines(1) + cycle_lines(2)))
+            scan, *_ = read_scans(link, 1)
+            assert scan.complete and scan.device_ns is None
+        assert device.received(2) == b"C\r"
+        with link:
+            pass
+        assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
 def test_an_adapter_whose_clock_stands_still_is_told_to_leave_stamps_out(monkeypatch):
@@ -180,7 +151,7 @@ def test_an_adapter_whose_clock_stands_still_is_told_to_leave_stamps_out(monkeyp
         assert scan.complete and scan.device_ns is None
 
 
-def test_a_stamp_that_flips_now_and_then_is_no_reason_to_leave_them_out(monkeypatch):
+def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(monkeypatch):
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     monkeypatch.setattr(slcan_serial, "LATE_STAMPS_FRAMES", 20)
     flipped = cycle_lines(0, 0)[0][:-5] + b"FA00\r"
@@ -199,14 +170,6 @@ def test_a_stamp_that_flips_now_and_then_is_no_reason_to_leave_them_out(monkeypa
             assert device.received(5) == b"C\rZ0\r"
 
 
-def device_commands_after(link: SlcanSerialLink) -> bytes:
-    with SilentDevice() as device:
-        link._plugged = PluggedAdapter(device.port)
-        with link:
-            pass
-        return device.received(9)
-
-
 # Status.
 
 
@@ -217,13 +180,8 @@ def impatient(monkeypatch):
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 40 * MS)
 
 
-def read_until(link: SlcanSerialLink, condition, timeout_s: float = 20.0) -> int:
-    """Read until something is so; how many scans came."""
-    scans, end_s = 0, time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s, (link.trouble, link.counters())
-        scans += len(link.read(0.01))
-    return scans
+def read_until(link: SlcanSerialLink, condition) -> None:
+    wait_for(lambda: link.read(0.01) is not None and condition())
 
 
 def test_flags_are_asked_for_and_told(impatient):
@@ -269,28 +227,14 @@ def read_now(device: SilentDevice) -> bytes:
         return b""
 
 
-def test_one_that_refuses_is_asked_once(impatient):
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        asked = b""
-        end_s = time.monotonic() + 0.4
-        while time.monotonic() < end_s:
-            link.read(0.01)
-            if b"F" in (heard := read_now(device)):
-                os.write(device.device_fd, b"\a")
-            asked += heard
-        assert asked.count(b"F\r") == 1
-
-
 def test_who_has_answered_once_is_asked_again_after_an_opening(impatient):
     with SilentDevice() as device:
         link = SlcanSerialLink(device.port)
         with link:
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
             os.write(device.device_fd, b"F00\r")
-            wait_for(lambda: link.read(0.01) == [] and link.counters()["status_answers"] == 1)
             end_s = time.monotonic() + 0.05 * (slcan_status.MOST_UNANSWERED + 2)
-            while time.monotonic() < end_s:
-                link.read(0.01)
+            wait_for(lambda: link.read(0.01) == [] and time.monotonic() > end_s)
         read_now(device)
         with link:
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))

@@ -1,25 +1,24 @@
-import os
-import threading
-import time
-import tty
-from contextlib import suppress
+"""The serial ports of this machine, and the links that a user names."""
 
+import libusb_package
 import pytest
 from bridge_samples import make_counts, write_recording
+from can.interfaces.virtual import VirtualBus
+from gs_usb_emulator import GsUsbBackend
+from link_rigs import SlcanRig
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
 from firmware_bridge.links import registry as source
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.registry import FORMS, open_source
-from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.serial_ports import Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import ID_MAPS
+from firmware_bridge.scans.can_id_maps import ID_MAPS, trigger_frame, trigger_frames
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 SECOND_VSCOM = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30XXXXX", "USB-CAN Plus")
@@ -30,28 +29,25 @@ BUILT_IN = Port("/dev/ttyS0", None, None, "n/a")
 
 
 def test_the_ports_of_this_machine(monkeypatch):
-    usb, none = ListPortInfo("/dev/ttyUSB1"), ListPortInfo("/dev/ttyS0")
+    """pyserial raises a TypeError where a device goes while ports are listed: int(None, 16)."""
+    usb, none, fails = (
+        ListPortInfo("/dev/ttyUSB1"),
+        ListPortInfo("/dev/ttyS0"),
+        [TypeError("int()"), TypeError("int()")],
+    )
     usb.vid, usb.pid, usb.serial_number, usb.description = 0x0403, 0x6015, "D30BL366", "x"
     usb.product, usb.manufacturer, usb.location = "USB-CAN Plus", "VScom", "1-2.1:1.0"
-    monkeypatch.setattr(list_ports, "comports", lambda: [usb, none])
+
+    def comports():
+        if fails:
+            raise fails.pop()
+        return [usb, none]
+
+    monkeypatch.setattr(list_ports, "comports", comports)
     expected = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x", "USB-CAN Plus", "VScom", "1.0", "1-2.1")
     assert serial_ports() == [BUILT_IN, expected]
     usb.location = "1-2.1"
     assert serial_ports()[1].interface is None
-
-
-def test_a_device_that_goes_while_ports_are_listed(monkeypatch):
-    """pyserial: int(None, 16)."""
-    looks = []
-
-    def comports():
-        looks.append(None)
-        if len(looks) < 3:
-            raise TypeError("int() can't convert non-string with explicit base")
-        return [ListPortInfo("/dev/ttyS0")]
-
-    monkeypatch.setattr(list_ports, "comports", comports)
-    assert serial_ports() == [BUILT_IN]
 
 
 def test_what_a_port_says():
@@ -91,32 +87,20 @@ def test_of_a_chip_that_many_devices_have_the_words_decide(product, manufacturer
         ([OTHER, VSCOM, BUILT_IN], VSCOM),
         ([CANABLE], CANABLE),
         ([CANABLE_2], CANABLE_2),
-        ([CANABLE, VSCOM], None),
-        ([CANABLE_2, CANABLE, CANABLE], None),
-        ([VSCOM, SECOND_VSCOM], None),
-        ([VSCOM, SECOND_VSCOM, CANABLE], None),
-        ([OTHER, BUILT_IN], None),
-        ([], None),
+        ([CANABLE, VSCOM], r"found, CANable, .* at /dev/ttyACM0, VScom USB-CAN Plus at /dev/ttyUSB0:"),
+        ([CANABLE_2, CANABLE_2], r"--source slcan:/dev/ttyACM1"),
+        ([VSCOM, SECOND_VSCOM], r"2 adapters found.* --source slcan:serial=D30BL366.* seen: /dev/ttyUSB0"),
+        ([OTHER, BUILT_IN], r"no known adapter.*--source slcan:PORT"),
+        ([], r"no known adapter.*--source slcan:PORT.*seen: none"),
     ],
 )
 def test_the_one_known_adapter(ports, found):
-    if found:
+    if isinstance(found, Port):
         assert find_adapter(ports) == found
         return
-    with pytest.raises(NoDeviceError, match="--source demo") as refused:
+    with pytest.raises(NoDeviceError, match=found) as refused:
         find_adapter(ports)
-    assert all(str(port) in str(refused.value) for port in ports)
-
-
-def test_the_messages_say_what_to_do():
-    with pytest.raises(NoDeviceError, match=r"2 adapters found.* --source slcan:serial=D30BL366.* seen: /dev/ttyUSB0"):
-        find_adapter([VSCOM, SECOND_VSCOM])
-    with pytest.raises(NoDeviceError, match=r"--source slcan:/dev/ttyACM1"):
-        find_adapter([CANABLE_2, CANABLE_2])
-    with pytest.raises(NoDeviceError, match=r"found, CANable, .* at /dev/ttyACM0, VScom USB-CAN Plus at /dev/ttyUSB0:"):
-        find_adapter([CANABLE, VSCOM])
-    with pytest.raises(NoDeviceError, match=r"no known adapter.*--source slcan:PORT.*seen: none"):
-        find_adapter([])
+    assert all(str(port) in str(refused.value) for port in ports) and "--source demo" in str(refused.value)
 
 
 def test_by_serial_number():
@@ -127,7 +111,7 @@ def test_by_serial_number():
         find_by_serial("D30BL366", [VSCOM, VSCOM])
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def two_vscom(monkeypatch):
     monkeypatch.setattr(source, "serial_ports", lambda: [BUILT_IN, VSCOM, SECOND_VSCOM])
 
@@ -144,37 +128,42 @@ def two_vscom(monkeypatch):
         ("slcan:serial=D30BL366@1000000", "/dev/ttyUSB0", 1_000_000),
     ],
 )
-def test_slcan_sources(two_vscom, text, port, baudrate):
+def test_slcan_sources(text, port, baudrate):
     link = open_source(text)
     assert isinstance(link, SlcanSerialLink)
     assert (link.port, link.baudrate, link.name, link.kind) == (port, baudrate, text, "device")
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "link", "kind"),
     [
-        "",
-        "slcan",
-        "slcan:",
-        "slcan:@9600",
-        "slcan:serial=",
-        "slcan:serial=@9600",
-        "replay",
-        "replay:",
-        "demo:",
-        "demo",
-        "Demo",
-        "gs_usb:",
-        "gs_usb0",
-        "can",
-        "can:",
-        "can:socketcan",
-        "can:socketcan:",
+        ("gs_usb", GsUsbLink, "device"),
+        ("gs_usb:0039", GsUsbLink, "device"),
+        ("can:virtual:a:b", CanBusLink, "emulated"),
+        ("demo", DemoLink, "emulated"),
     ],
 )
-def test_other_sources_are_refused(two_vscom, text):
+def test_other_sources(text, link, kind):
+    opened = open_source(text, demo_recording="demo.npz")
+    assert isinstance(opened, link) and (opened.name, opened.kind) == (text, kind)
+
+
+def test_no_source_is_the_one_adapter_and_never_a_pretended_one(monkeypatch):
+    with pytest.raises(NoDeviceError, match="--source demo"):
+        open_source(None, demo_recording="demo.npz")
+    monkeypatch.setattr(source, "serial_ports", lambda: [BUILT_IN, VSCOM])
+    link = open_source(None)
+    assert isinstance(link, SlcanSerialLink) and (link.port, link.name) == ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "slcan", "slcan:", "slcan:@9600", "slcan:serial=", "slcan:serial=@9600", "replay", "replay:", "demo:", "Demo",
+     "gs_usb:", "gs_usb0", "can", "can:", "can:socketcan", "can:socketcan:"],
+)  # fmt: skip
+def test_texts_that_are_no_source(text):
     with pytest.raises(SourceError) as refused:
-        open_source(text)
+        open_source(text, demo_recording="demo.npz")
     assert repr(text) in str(refused.value) and all(form in str(refused.value) for form in FORMS)
 
 
@@ -189,112 +178,56 @@ def test_other_sources_are_refused(two_vscom, text):
         ("press.mcap", "replay:press.mcap"),
     ],
 )
-def test_a_source_without_its_form_is_refused_with_what_was_meant(two_vscom, text, meant):
+def test_a_source_without_its_form_is_refused_with_what_was_meant(text, meant):
     with pytest.raises(SourceError) as refused:
         open_source(text)
     assert str(refused.value) == f"source is {text!r}: did you mean {meant}?"
 
 
 @pytest.mark.parametrize("baud", ["", "fast", "0", "-1", "²", "0115200", "99999999999", "9" * 5000])
-def test_a_baud_that_is_none_is_refused(two_vscom, baud):
+def test_a_baud_that_is_none_is_refused(baud):
     with pytest.raises(SourceError, match=rf"^baud is '{baud[:20]}', expected .*slcan:/dev/ttyUSB0@115200$") as refused:
         open_source(f"slcan:/dev/ttyUSB0@{baud}")
     assert len(str(refused.value)) < 120
 
 
-def test_gs_usb_sources():
-    for text, serial_number in (("gs_usb", None), ("gs_usb:0039", "0039")):
-        link = open_source(text, model=ID_MAPS["A"])
-        assert isinstance(link, GsUsbLink)
-        assert (link.serial_number, link.name, link.kind, len(link._triggers)) == (serial_number, text, "device", 7)
-
-
-def test_can_sources():
-    link = open_source("can:virtual:a:b", model=ID_MAPS["A"])
-    assert isinstance(link, CanBusLink)
-    assert (link._interface, link._channel, link.name, len(link._triggers)) == ("virtual", "a:b", "can:virtual:a:b", 7)
-
-
-def test_no_source_is_the_one_adapter(monkeypatch):
-    monkeypatch.setattr(source, "serial_ports", lambda: [BUILT_IN, VSCOM])
-    link = open_source(None)
-    assert isinstance(link, SlcanSerialLink) and (link.port, link.name) == ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0")
-
-
-def test_no_source_is_never_a_pretended_one(two_vscom, tmp_path):
-    with pytest.raises(NoDeviceError, match="--source demo"):
-        open_source(None, demo_recording=tmp_path)
-
-
 def test_replay_sources(tmp_path):
-    first = write_recording(tmp_path / "a.csv", make_counts(2))
-    second = write_recording(tmp_path / "b.csv", make_counts(2))
-    both = open_source(f"replay:{first},{second}", 1000.0)
-    assert isinstance(both, ReplayLink) and both.kind == "replay"
-    with both:
-        assert {scan.sensor for _ in range(2) for scan in both.read(1.0)} == {"a", "b"}
-    comma = write_recording(tmp_path / "a,b.csv", make_counts(2))
-    with open_source(f"replay:{comma}", 1000.0) as link:
-        assert {scan.sensor for scan in link.read(1.0)} == {"a,b"}
+    first, second, comma = (write_recording(tmp_path / f"{name}.csv", make_counts(2)) for name in ("a", "b", "a,b"))
+    for text, sensors in ((f"{first},{second}", {"a", "b"}), (str(comma), {"a,b"})):
+        with open_source(f"replay:{text}", 1000.0) as link:
+            assert {scan.sensor for _ in range(2) for scan in link.read(1.0)} == sensors
     with pytest.raises(RecordingError, match="gone"):
         open_source(f"replay:{tmp_path / 'gone.csv'}")
 
 
-def test_nothing_but_demo_is_the_demo(tmp_path):
-    for text in ("", "demo:", "gs_usb:", "/dev/ttyUSB0"):
-        with pytest.raises(SourceError):
-            open_source(text, demo_recording=tmp_path)
+def frames_of(can_ids):
+    return [CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7))) for can_id in can_ids]
 
 
-def test_the_demo_source(tmp_path):
-    link = open_source("demo", 50.0, tmp_path / "demo.npz")
-    assert isinstance(link, DemoLink) and link.kind == "emulated"
+@pytest.mark.parametrize(
+    ("model", "can_ids", "sensor", "fresh", "boards"),
+    [
+        ("XR1944", [sda << 8 | taxel << 4 | 4 for sda in range(2) for taxel in range(8)], "4", 16, 0),
+        # Half of the taxels make a sensor where they come twice in a row.
+        ("uSPa44", [sda << 8 | taxel << 4 | 4 for sda in range(2) for taxel in range(8)] * 2, "4", 8, 0),
+        ("uSPa44", [sda << 8 | taxel << 4 | 4 for sda in range(4) for taxel in range(4)], "4", 16, 0),
+        ("A", [0x710 | taxel for taxel in range(16)], "1", 16, 7),
+    ],
+)
+def test_the_id_map_is_that_asked_for_and_old_controllers_are_woken(tmp_path, model, can_ids, sensor, fresh, boards):
+    rig = SlcanRig(tmp_path, None)
+    with open_source(rig.name, model=ID_MAPS[model]) as link:
+        scans = rig.read(link, frames_of([*can_ids, can_ids[0]]))
+        assert rig.sent(boards) == [trigger_frame(board) for board in range(1, boards + 1)]
+    rig.close()
+    assert [(scan.sensor, int(scan.fresh.sum())) for scan in scans] == [(sensor, fresh)]
 
 
-def read_one_scan(model, ids, cycles=1):
-    """Return the scan of so many frames of each id, on a line that `open_source` reads, and the commands it sent."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    sent = bytearray()
-
-    def take():
-        """Take commands as an adapter does; without one the link waits a second for each of them."""
-        with suppress(OSError):  # the terminal is closed
-            while True:
-                sent.extend(os.read(master, 4096))
-
-    adapter = threading.Thread(target=take, daemon=True)
-    adapter.start()
-    try:
-        with open_source(f"slcan:{os.ttyname(slave)}", model=model) as link:
-            for can_id in [*ids * cycles, ids[0]]:
-                os.write(master, encode_frame(CanFrame(can_id, bytes((1, 2, 3, 4, 5, can_id >> 8, can_id & 0xF0, 7)))))
-            scans, end_s = [], time.monotonic() + 60
-            while not scans and time.monotonic() < end_s:
-                scans = link.read(0.05)
-            scans += link.read(0.05)
-    finally:
-        os.close(slave)
-        adapter.join()
-        os.close(master)
-    return scans, bytes(sent)
-
-
-def test_the_id_map_is_the_one_asked_for():
-    ids = [sda << 8 | taxel << 4 | 4 for sda in range(2) for taxel in range(8)]
-    (scan,), _ = read_one_scan(ID_MAPS["XR1944"], ids)
-    assert scan.complete
-    # Half of the taxels make a sensor where they come twice in a row.
-    (half,), _ = read_one_scan(ID_MAPS["uSPa44"], ids, cycles=2)
-    assert half.fresh.sum() == 8
-
-
-def test_older_controllers_are_woken_and_others_are_not():
-    ids = [0x710 | taxel for taxel in range(16)]
-    (scan,), sent = read_one_scan(ID_MAPS["A"], ids)
-    assert scan.complete and scan.sensor == "1"
-    assert all(b"t20%d20700\r" % board in sent for board in range(1, 8))
-    ids = [sda << 8 | taxel << 4 | 4 for sda in range(4) for taxel in range(4)]
-    (scan,), sent = read_one_scan(ID_MAPS["uSPa44"], ids)
-    assert scan.complete and scan.sensor == "4"
-    assert b"t2" not in sent
+def test_old_controllers_are_woken_over_other_adapters_too(monkeypatch):
+    triggers, backend = trigger_frames(ID_MAPS["A"]), GsUsbBackend()
+    monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: backend)
+    with open_source("gs_usb", model=ID_MAPS["A"]):
+        assert backend.ports[0].adapter.sent == list(triggers)
+    with VirtualBus(channel="a:b") as far, open_source("can:virtual:a:b", model=ID_MAPS["A"]):
+        heard = [far.recv(1.0) for _ in triggers]
+        assert [one.arbitration_id for one in heard if one] == [one.can_id for one in triggers]

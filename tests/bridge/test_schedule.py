@@ -22,70 +22,37 @@ class FakeTime:
         self.now_ns += round(time_s * NS_PER_S)
 
 
-def test_ticks_lie_on_the_grid_however_long_the_work_takes():
-    time = FakeTime()
-    ticker = Ticker(100, time.clock, time.sleep)
-    start_ns = time.now_ns
-    for number, work_s in enumerate((0.0, 0.003, 0.009, 0.0099), 1):
-        time.pass_s(work_s)
-        assert ticker.wait() == number
-        assert time.now_ns == start_ns + number * 10_000_000
-    assert (ticker.late, ticker.skipped) == (0, 0)
-
-
-def test_a_late_sleep_does_not_move_the_ticks_after_it():
-    time = FakeTime(0.004, 0.0)
-    ticker = Ticker(100, time.clock, time.sleep)
-    start_ns = time.now_ns
-    ticker.wait()
-    assert time.now_ns == start_ns + 14_000_000
-    ticker.wait()
-    assert time.now_ns == start_ns + 20_000_000
-    assert (ticker.late, ticker.skipped) == (0, 0)
-
-
-def test_a_late_tick_is_counted_and_the_next_is_on_the_grid():
-    time = FakeTime()
-    ticker = Ticker(100, time.clock, time.sleep)
-    start_ns = time.now_ns
-    time.pass_s(0.013)
-    assert ticker.wait() == 1
-    assert time.now_ns == start_ns + 13_000_000 and time.slept_s == []
-    assert (ticker.late, ticker.skipped) == (1, 0)
-    assert ticker.wait() == 2
-    assert time.now_ns == start_ns + 20_000_000
-    assert (ticker.late, ticker.skipped) == (1, 0)
-
-
 @pytest.mark.parametrize(
-    ("passed_s", "tick", "skipped"), [(0.0199, 1, 0), (0.0201, 2, 1), (0.0349, 3, 2), (0.7, 70, 69)]
+    ("off_by_s", "ticks", "late", "skipped"),
+    [  # each tick: the time worked before it, its number, and when it came, in [s]
+        ((), [(0.0, 1, 0.01), (0.003, 2, 0.02), (0.009, 3, 0.03), (0.0099, 4, 0.04)], 0, 0),
+        ((), [(0.01, 1, 0.01)], 0, 0),
+        ((0.004,), [(0.0, 1, 0.014), (0.0, 2, 0.02)], 0, 0),
+        ((), [(0.013, 1, 0.013), (0.0, 2, 0.02)], 1, 0),
+        ((), [(0.0199, 1, 0.0199), (0.0, 2, 0.02)], 1, 0),
+        ((), [(0.0201, 2, 0.0201), (0.0, 3, 0.03)], 1, 1),
+        ((), [(0.0349, 3, 0.0349), (0.0, 4, 0.04)], 1, 2),
+        ((), [(0.7, 70, 0.7), (0.0, 71, 0.71)], 1, 69),
+    ],
 )
-def test_an_overrun_skips_whole_ticks_and_comes_back_to_the_grid(passed_s, tick, skipped):
-    time = FakeTime()
+def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks, late, skipped):
+    time = FakeTime(*off_by_s)
     ticker = Ticker(100, time.clock, time.sleep)
     start_ns = time.now_ns
-    time.pass_s(passed_s)
-    assert ticker.wait() == tick
-    assert (ticker.late, ticker.skipped) == (1, skipped)
-    assert ticker.wait() == tick + 1
-    assert time.now_ns == start_ns + (tick + 1) * 10_000_000
+    for work_s, tick, at_s in ticks:
+        time.pass_s(work_s)
+        assert (ticker.wait(), time.now_ns - start_ns) == (tick, round(at_s * NS_PER_S))
+    assert (ticker.late, ticker.skipped) == (late, skipped)
 
 
-def test_exactly_on_time_is_not_late():
+@pytest.mark.parametrize("rate_hz", [59.7544117, 0.5])
+def test_no_rate_drifts(rate_hz):
     time = FakeTime()
-    ticker = Ticker(100, time.clock, time.sleep)
-    time.pass_s(0.01)
-    assert ticker.wait() == 1
-    assert (ticker.late, time.slept_s) == (0, [])
-
-
-def test_a_rate_that_is_no_whole_number_of_nanoseconds_does_not_drift():
-    time = FakeTime()
-    ticker = Ticker(59.7544117, time.clock, time.sleep)
+    ticker = Ticker(rate_hz, time.clock, time.sleep)
     start_ns = time.now_ns
-    for _ in range(100_000):
+    for _ in range(10_000):
         ticker.wait()
-    assert abs(time.now_ns - start_ns - 100_000 / 59.7544117 * NS_PER_S) < 2
+    assert abs(time.now_ns - start_ns - 10_000 / rate_hz * NS_PER_S) < 2
     assert ticker.deadline_ns(0) == start_ns
 
 
@@ -95,13 +62,6 @@ def test_sleeping_goes_on_until_the_deadline():
     assert time.slept_s == pytest.approx([1.0, 0.5, 0.2])
     assert sleep_until(0, time.clock, time.sleep) == 6 * NS_PER_S
     assert len(time.slept_s) == 3
-
-
-def test_a_rate_may_be_less_than_one():
-    time = FakeTime()
-    ticker = Ticker(0.5, time.clock, time.sleep)
-    ticker.wait()
-    assert time.slept_s == [2.0]
 
 
 @pytest.mark.parametrize("rate_hz", [0, -1, float("nan"), float("inf")])

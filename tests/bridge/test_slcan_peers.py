@@ -1,20 +1,20 @@
 """The same line, spoken by python-can: it reads our emulator, and we read what it writes."""
 
 import os
-import random
 import threading
 import time
 
 import can
 import pytest
-from bridge_samples import make_recording, read_scans
+from bridge_samples import make_recording
 from can.interfaces.slcan import slcanBus
+from gs_usb_samples import frames_of
+from link_rigs import message_of
 from serial_samples import SilentDevice
 
-from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
+from firmware_bridge.can.slcan import SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import SlcanAdapter, scan_frames
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.emulation.xela_controller import SlcanAdapter
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 
@@ -23,16 +23,18 @@ def open_peer(port: str) -> slcanBus:
     return slcanBus(f"{port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0)
 
 
-@pytest.mark.parametrize("options", [{}, {"acknowledges": False}, {"old_canable": True}], ids=str)
-def test_it_reads_our_emulator(options):
+@pytest.mark.parametrize(
+    ("options", "stamps"), [({}, b"Z1\r"), ({"acknowledges": False}, b""), ({"old_canable": True}, b"")], ids=str
+)
+def test_it_reads_our_emulator(options, stamps):
     recording = make_recording(20)
     received: list[can.Message] = []
-    with Emulator([recording], loop=True, **options) as emulator, open_peer(emulator.port) as bus:
-        end_s = time.monotonic() + 60
-        while len(received) < 20 * 16 and time.monotonic() < end_s:
-            message = bus.recv(0.1)
-            if message is not None:
-                received.append(message)
+    with Emulator([recording], loop=True, **options) as emulator:
+        emulator.adapter.feed(stamps)
+        with open_peer(emulator.port) as bus:
+            end_s = time.monotonic() + 60
+            while len(received) < 20 * 16 and time.monotonic() < end_s:
+                received += filter(None, [bus.recv(0.1)])
     order = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
     assert [message.arbitration_id for message in received] == order * 20
     assert all(message.dlc == len(message.data) == 8 and not message.is_extended_id for message in received)
@@ -41,30 +43,15 @@ def test_it_reads_our_emulator(options):
     assert values == [int(scan.reshape(3, 16)[2, taxel]) for scan in recording.tracks[0].counts for taxel in taxels]
 
 
-def test_it_reads_our_emulator_with_time_stamps():
-    with Emulator([make_recording(5)], loop=True) as emulator:
-        emulator.adapter.feed(b"Z1\r")
-        with open_peer(emulator.port) as bus:
-            received = [bus.recv(5) for _ in range(80)]
-        assert emulator.adapter.encode(CanFrame(4, bytes(8)), 1.0).endswith(b"03E8\r")
-    assert all(message is not None and len(message.data) == 8 for message in received)
-
-
 def test_we_read_what_it_writes():
     """The package takes the place of the adapter: what it sends is put on our line."""
-    counts = make_recording(3).tracks[0].counts
-    noise = random.Random(1)
-    frames = [frame for scan in counts for frame in scan_frames(scan, 4, noise)]
+    frames = frames_of(3)
     with SilentDevice() as far_end, slcanBus(f"{far_end.port}@3000000", sleep_after_open=0) as bus:
         assert far_end.received(2) == b"O\r"
         for frame in frames:
-            bus.send(can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False))
-        written = far_end.received(len(frames) * 22)
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        os.write(device.device_fd, written)
-        scans = read_scans(link, 3)
-        assert link.counters()["frames"] == 48 and link.counters()["bad_lines"] == 0
-    assert [(scan.counts == expected).all() for scan, expected in zip(scans, counts, strict=True)] == [True] * 3
+            bus.send(message_of(frame))
+        decoder = SlcanDecoder()
+        assert decoder.feed(far_end.received(len(frames) * 22)) == frames and decoder.counters()["bad_lines"] == 0
 
 
 def test_what_it_says_on_opening_is_obeyed_and_is_no_frame():

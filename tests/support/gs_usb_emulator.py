@@ -94,7 +94,7 @@ class _Plugged:
 
     def check(self) -> GsUsbAdapter:
         if not self.adapter.plugged:
-            raise _error(self.port.gone_as)
+            raise libusb_error(self.port.gone_as)
         return self.adapter
 
 
@@ -147,7 +147,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def open_device(self, dev: _Plugged) -> _Plugged:
         dev.check()
         if not dev.port.permitted:
-            raise _error(ACCESS)
+            raise libusb_error(ACCESS)
         dev.port.handles += 1
         return dev
 
@@ -165,7 +165,7 @@ class GsUsbBackend(usb.backend.IBackend):
     def claim_interface(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.kernel_driver or (dev_handle.port.claimed and not dev_handle.claimed_here):
-            raise _error(BUSY)
+            raise libusb_error(BUSY)
         dev_handle.port.claimed = dev_handle.claimed_here = True
 
     def release_interface(self, dev_handle: _Plugged, intf: int) -> None:
@@ -179,13 +179,13 @@ class GsUsbBackend(usb.backend.IBackend):
     def detach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if not dev_handle.port.kernel_driver:
-            raise _error(NOT_FOUND)
+            raise libusb_error(NOT_FOUND)
         dev_handle.port.kernel_driver = False
 
     def attach_kernel_driver(self, dev_handle: _Plugged, intf: int) -> None:
         dev_handle.check()
         if dev_handle.port.claimed:
-            raise _error(BUSY)
+            raise libusb_error(BUSY)
         dev_handle.port.kernel_driver = True
 
     def reset_device(self, dev_handle: _Plugged) -> None:
@@ -213,7 +213,7 @@ class GsUsbBackend(usb.backend.IBackend):
             else:
                 answer = adapter.request_in(bRequest)
         except StalledError as error:
-            raise _error(PIPE) from error
+            raise libusb_error(PIPE) from error
         answer = answer[: len(data)]
         data[: len(answer)] = array("B", answer)
         return len(answer)
@@ -224,9 +224,9 @@ class GsUsbBackend(usb.backend.IBackend):
         data = adapter.fetch(timeout / 1000 if timeout else None)
         if data is None:
             dev_handle.check()  # the cable may have come out meanwhile
-            raise _error(TIMEOUT)
+            raise libusb_error(TIMEOUT)
         if len(data) > len(buff):
-            raise _error(OVERFLOW)
+            raise libusb_error(OVERFLOW)
         buff[: len(data)] = array("B", data)
         return len(data)
 
@@ -234,12 +234,12 @@ class GsUsbBackend(usb.backend.IBackend):
         adapter = dev_handle.check()
         self._check_claim(dev_handle)
         if not adapter.take(data.tobytes()):
-            raise _error(TIMEOUT)
+            raise libusb_error(TIMEOUT)
         return len(data)
 
     def _check_claim(self, handle: _Plugged) -> None:
         if not handle.claimed_here:
-            raise _error(IO)
+            raise libusb_error(IO)
 
     def _let_go(self, handle: _Plugged) -> None:
         if handle.claimed_here:
@@ -255,6 +255,7 @@ class GsUsbBackend(usb.backend.IBackend):
         return bytes((2 + len(encoded), _TEXTS)) + encoded
 
 
-def _error(code: int) -> usb.core.USBError:
+def libusb_error(code: int) -> usb.core.USBError:
+    """Return the error that pyusb makes of one of libusb."""
     kind = usb.core.USBTimeoutError if code == TIMEOUT else usb.core.USBError
     return kind(f"libusb error {code}", code, _ERRNO[code])

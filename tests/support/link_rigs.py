@@ -1,0 +1,326 @@
+"""Devices on which every link can be tried alike: they give scans when asked, are pulled out and put back."""
+
+import errno
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
+from itertools import count
+from pathlib import Path
+
+import can
+from bridge_samples import make_counts, read_scans, write_recording
+from can.interfaces.virtual import VirtualBus
+from gs_usb_emulator import GsUsbBackend, GsUsbPort
+from gs_usb_samples import frames_of
+from server_samples import looping
+from xela_server_emulator import ServerEmulator
+
+from firmware_bridge.can.slcan import CanFrame, SlcanDecoder, encode_frame
+from firmware_bridge.emulation.pty_port import PseudoPort, listen
+from firmware_bridge.links.base import Link
+from firmware_bridge.links.can_bus import CanBusLink
+from firmware_bridge.links.demo import DemoLink
+from firmware_bridge.links.gs_usb_link import GsUsbLink
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.links.xela_server import XelaServerLink
+from firmware_bridge.scans.can_frame_scans import FrameScans
+from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.slcan_scans import SlcanScans
+from firmware_bridge.scans.xela_server_scans import ServerScans
+
+FRAME_US = 130
+
+
+class Rig:
+    """A device and links to it.
+
+    Attributes:
+        name, kind, sensor: what a link to it and its scans say.
+        lost: words of the error once it was pulled out; away: of opening a link to it then.
+        decoder: class whose counters the link passes on.
+    """
+
+    name: str
+    kind = "emulated"
+    sensor = "4"
+    lost = away = ""
+    decoder: type
+
+    def link(self, **settings) -> Link:
+        raise NotImplementedError
+
+    def give(self, link: Link, scans: int) -> list[Scan]:
+        """Return the next scans, at least so many."""
+        return read_scans(link, scans)
+
+    def lose(self) -> None:
+        """Pull it out."""
+
+    def put_back(self) -> None:
+        """Put it back."""
+
+    def close(self) -> None:
+        """Release what it holds."""
+
+
+class CanRig(Rig):
+    """An adapter that hears exactly the frames that a test sends, at the times of a bus without pauses."""
+
+    def __init__(self) -> None:
+        self._seeds = count()
+        self._bus_us = 0
+
+    def hear(self, *frames: CanFrame) -> None:
+        """Receive frames, one after the other however long this machine takes."""
+        for frame in frames:
+            self._bus_us += FRAME_US
+            self.hear_at(frame, self._bus_us)
+
+    def hear_at(self, frame: CanFrame, bus_us: int) -> None:
+        raise NotImplementedError
+
+    def sent(self, frames: int) -> list[CanFrame]:
+        """Return the frames that a link has sent, so many."""
+        raise NotImplementedError
+
+    def after_next_frame(self, action: Callable[[], object]) -> None:
+        """Do something in the reader's thread, once, between a frame and what the reader makes of it."""
+        raise NotImplementedError
+
+    def give(self, link: Link, scans: int) -> list[Scan]:
+        given = []
+        for _ in range(scans):
+            self._bus_us = max(self._bus_us + 1000, time.monotonic_ns() // 1000)  # a pause, and the clock is one
+            given += self.read(link, frames_of(1, seed=next(self._seeds)))
+        return given
+
+    def read(self, link: Link, frames: Sequence[CanFrame]) -> list[Scan]:
+        """Return the scans of these frames, few of which wait at a time."""
+        scans = []
+        for some in (frames[at : at + 32] for at in range(0, len(frames), 32)):
+            until = link.counters()["frames"] + len(some)
+            self.hear(*some)
+            end_s = time.monotonic() + 60
+            while link.counters()["frames"] < until:
+                assert time.monotonic() < end_s, link.counters()
+                scans += link.read(0.005)
+        return scans
+
+
+class SlcanRig(CanRig):
+    """A pseudo-terminal behind a link that the user named, as udev makes it."""
+
+    lost, away = "link lost, the cable or the adapter is gone", "no such port"
+    decoder = SlcanScans
+
+    def __init__(self, folder: Path, monkeypatch) -> None:
+        super().__init__()
+        self._port = PseudoPort(folder / "skin")
+        self._port.plug()
+        self.name = f"slcan:{self._port.path}"
+
+    def link(self, **settings):
+        return SlcanSerialLink(self._port.path, **settings)
+
+    def hear_at(self, frame, bus_us):
+        line = encode_frame(frame._replace(timestamp_ms=bus_us // 1000 % 60_000))
+        assert self._port.write(line) == len(line)
+
+    def sent(self, frames):
+        decoder, end_s = SlcanDecoder(), time.monotonic() + 60
+        heard = decoder.feed(b"".join(listen([self._port], 0.1).values()))
+        while len(heard) < frames:
+            assert time.monotonic() < end_s, heard
+            heard += decoder.feed(b"".join(listen([self._port], 0.1).values()))
+        return heard
+
+    def lose(self):
+        self._port.unplug()
+
+    def put_back(self):
+        self._port.plug(elsewhere=True)
+
+    def close(self):
+        self._port.unplug()
+
+
+class GsUsbRig(CanRig):
+    """A candleLight on pretended USB."""
+
+    name, kind = "gs_usb", "device"
+    lost, away = "link lost, the cable or the adapter is gone", "no gs_usb adapter"
+    decoder = GsUsbScans
+
+    def __init__(self, folder, monkeypatch) -> None:
+        super().__init__()
+        self._port = GsUsbPort()
+        self._backend = GsUsbBackend(self._port)
+
+    def link(self, **settings):
+        return GsUsbLink(backend=self._backend, **settings)
+
+    def hear_at(self, frame, bus_us):
+        self._port.adapter.hear(frame, stamp_us=bus_us)
+
+    def sent(self, frames):
+        return self._port.adapter.sent
+
+    def after_next_frame(self, action):
+        _after_next(self._port.adapter, "fetch", action)
+
+    def lose(self):
+        self._port.adapter.unplug()
+
+    def put_back(self):
+        self._port.plug()
+
+
+class PulledBus(VirtualBus):
+    """The virtual bus with a cable: its drivers tell at once that it is out."""
+
+    def __init__(self, plugged: threading.Event, **settings) -> None:
+        if not plugged.is_set():
+            raise can.CanInitializationError("no such channel")
+        self._plugged = plugged
+        super().__init__(**settings)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        assert timeout is not None, "a link that waits for ever"
+        end_s = time.monotonic() + timeout
+        while True:
+            if not self._plugged.is_set():
+                raise can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
+            message = super().recv(max(0.0, min(end_s - time.monotonic(), 0.01)))
+            if message is not None or time.monotonic() >= end_s:
+                return message
+
+
+class PythonCanRig(CanRig):
+    """The virtual bus of python-can, with somebody else on it."""
+
+    lost, away = "link lost, the interface is gone or down: .*Network is down", "cannot be opened: no such channel"
+    decoder = FrameScans
+
+    def __init__(self, folder: Path, monkeypatch) -> None:
+        super().__init__()
+        self._channel = folder.name
+        self.name = f"can:virtual:{self._channel}"
+        self._far = VirtualBus(channel=self._channel, preserve_timestamps=True)
+        self._plugged = threading.Event()
+        self._plugged.set()
+        monkeypatch.setattr(can, "Bus", self._open)
+
+    def _open(self, *, channel, **_):
+        self._near = PulledBus(self._plugged, channel=channel)
+        return self._near
+
+    def link(self, **settings):
+        return CanBusLink("virtual", self._channel, **settings)
+
+    def hear_at(self, frame, bus_us):
+        self._far.send(message_of(frame, timestamp=bus_us / 1e6))
+
+    def sent(self, frames):
+        heard = [self._far.recv(1.0) for _ in range(frames)]
+        return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
+
+    def after_next_frame(self, action):
+        _after_next(self._near, "recv", action)
+
+    def lose(self):
+        self._plugged.clear()
+
+    def put_back(self):
+        self._plugged.set()
+
+    def close(self):
+        self._far.shutdown()
+
+
+def message_of(frame: CanFrame, **settings) -> can.Message:
+    """Return a frame as python-can has it."""
+    settings = {"is_extended_id": frame.extended, "is_remote_frame": frame.remote} | settings
+    return can.Message(arbitration_id=frame.can_id, data=frame.data, **settings)
+
+
+class ServerRig(Rig):
+    """The vendor's server, emulated."""
+
+    sensor = "1"
+    lost, away = "link lost: the server is gone", "connection refused"
+    decoder = ServerScans
+
+    def __init__(self, folder, monkeypatch) -> None:
+        self._server = ServerEmulator(looping())
+        self._server.__enter__()
+        self.name = f"xela-server:{self._server.url}"
+        self.lose, self.put_back = self._server.kill, self._server.start_again
+
+    def link(self, **settings):
+        return XelaServerLink(self._server.url, **settings)
+
+    def close(self):
+        self._server.__exit__()
+
+
+class DemoRig(Rig):
+    """The emulator in a process of its own."""
+
+    name = "demo"
+    lost = "link lost, the cable or the adapter is gone"
+
+    def __init__(self, folder: Path, monkeypatch) -> None:
+        self._recording = write_recording(folder / "demo.csv", make_counts(30), rate_hz=100)
+
+    def link(self, **settings):
+        return DemoLink(self._recording, loop=True)
+
+    def lose(self):
+        (process_id,) = processes_playing(self._recording)
+        os.kill(process_id, signal.SIGKILL)
+
+    def close(self):
+        assert processes_playing(self._recording) == []
+
+
+class ReplayRig(Rig):
+    """A recording, which nobody can pull out."""
+
+    kind, sensor = "replay", "finger"
+
+    def __init__(self, folder: Path, monkeypatch) -> None:
+        self._recording = write_recording(folder / "finger.csv", make_counts(200), rate_hz=100)
+        self.name = f"replay:{self._recording}"
+
+    def link(self, **settings):
+        return ReplayLink([self._recording])
+
+
+def _after_next(device: object, fetching: str, action: Callable[[], object]) -> None:
+    fetch = getattr(device, fetching)
+
+    def fetch_and_act(timeout_s):
+        setattr(device, fetching, fetch)
+        fetched = fetch(timeout_s)
+        action()
+        return fetched
+
+    setattr(device, fetching, fetch_and_act)
+
+
+def processes_playing(path: Path) -> list[int]:
+    """Return the processes of emulators that play a recording."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                command = (entry / "cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if b"firmware_bridge.emulation.robot_main" in command and str(path).encode() in command:
+                found.append(int(entry.name))
+    return found
