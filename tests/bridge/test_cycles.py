@@ -62,19 +62,11 @@ def test_a_lost_frame_costs_its_own_cycle_alone(reader, lost):
 
 
 @every_reader
-@pytest.mark.parametrize("share", [0.0001, 0.0005, 0.005, 0.05])
+@pytest.mark.parametrize("share", [0.0005, 0.05])
 def test_no_scan_is_of_two_cycles_at_any_share_of_loss(reader, share):
     worth = read(losing(share, seed=1)(bus(400)), reader)
     assert worth.mixed == 0 and worth.whole > 400 * (1 - share) ** 16 * 0.8
     assert max(worth.waits_ms) < LONGEST_WAIT_MS or reader is PLAIN_BURSTS
-
-
-@every_reader
-@pytest.mark.parametrize("count", [16, 32, 48])
-def test_no_scan_is_of_two_cycles_where_as_many_frames_are_lost_as_a_cycle_has(reader, count):
-    frames = [frame for place, frame in enumerate(bus(600)) if place < 800 or place % 407 >= count]
-    worth = read(frames, reader)
-    assert worth.mixed == 0 and worth.whole > (250 if reader is PLAIN_BURSTS else 400)
 
 
 @every_reader
@@ -86,7 +78,7 @@ def test_doubles_and_swaps_mix_nothing(reader):
 
 
 @every_reader
-@pytest.mark.parametrize("stall_ms", [5, 20, 70, 200, 500])
+@pytest.mark.parametrize("stall_ms", [5, 70, 500])
 def test_a_reader_that_stands_still_mixes_nothing(reader, stall_ms):
     stalls = [(0.9 * n + 0.0131 * (n % 7), stall_ms / 1000) for n in range(1, 6)]
     worth = read(bus(600), reader, stalls=stalls)
@@ -95,21 +87,11 @@ def test_a_reader_that_stands_still_mixes_nothing(reader, stall_ms):
 
 
 @sharp_reader
-@pytest.mark.parametrize("pause_ms", [2, 5, 10, 16, 30, 60, 200])
+@pytest.mark.parametrize("pause_ms", [2, 10, 30, 200])
 def test_a_bus_that_pauses_mixes_nothing(reader, pause_ms):
     every_s = 0.13 if pause_ms < 100 else 0.5
-    for seed in range(2):
-        worth = read(pausing(pause_ms / 1000, every_s, seed)(bus(600)), reader)
-        assert worth.mixed == 0 and worth.whole > (250 if reader.stamped else 190)
-
-
-@sharp_reader
-@pytest.mark.parametrize(("rate_hz", "frame_us"), [(50, 130), (100, 500), (200, 130), (470, 130), (1000, 20)])
-def test_no_rate_mixes_anything(reader, rate_hz, frame_us):
-    frames = bus(600, (rate_hz,), frame_s=frame_us / 1e6, jitter_s=min(0.001, 0.1 / rate_hz))
-    for fault in (losing(0.005), pausing(0.003, 0.07)):
-        worth = read(fault(frames), reader)
-        assert worth.mixed == 0 and worth.whole > 400
+    worth = read(pausing(pause_ms / 1000, every_s, seed=1)(bus(600)), reader)
+    assert worth.mixed == 0 and worth.whole > (250 if reader.stamped else 190)
 
 
 @every_reader
@@ -146,18 +128,15 @@ def test_other_layouts_are_cut_alike(model):
 
 
 @pytest.mark.parametrize("old_canable", [True, False], ids=["plain", "stamped"])
-@pytest.mark.parametrize("first_frame", [0, 5, 11, 15])
-def test_a_link_that_is_opened_in_mid_cycle_gives_scans_of_one(first_frame, old_canable):
+def test_a_link_opened_in_mid_cycle_gives_scans_of_one(old_canable):
     """The real serial path is used, as its reader waits for the bytes of a cycle and could sleep through one."""
     recording = numbered(60, first=FIRST)
     with (
-        Emulator([recording], first_frame=first_frame, old_canable=old_canable) as emulator,
+        Emulator([recording], first_frame=5, old_canable=old_canable) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         scans = read_until_lost(link)
-        counters = link.counters()
-    of_cycles = [set(scan.counts[2][scan.fresh].tolist()) for scan in scans]
-    assert all(len(numbers) == 1 for numbers in of_cycles)
-    assert counters["resynchronised"] >= (16 - first_frame) % 16
+        assert link.counters()["resynchronised"] >= 11
+    assert all(len(set(scan.counts[2][scan.fresh].tolist())) == 1 for scan in scans)
     # Without stamps a machine that is busy for long cannot show that no cycle was lost meanwhile.
     assert len(scans) > (20 if old_canable else 40)

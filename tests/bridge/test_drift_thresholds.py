@@ -314,12 +314,16 @@ def test_a_silent_step_that_grows_is_told_of():
 
 
 def test_a_change_of_dead_taxels_and_a_gap_are_causes():
-    for dead, gap_ns, cause in [
-        (NONE_DEAD.copy(), PERIOD_NS, "after a taxel was out"),
-        (NONE_DEAD, 6_000_000_000, "after a gap"),
+    for how, gap_ns, cause in [
+        ("dead", PERIOD_NS, "after a taxel was out"),
+        ("away", 6_000_000_000, "after a gap"),
+        ("forgotten", PERIOD_NS, "after a gap"),
     ]:
         pad = resting()
-        pad.dead = dead
+        if how == "dead":
+            pad.dead = NONE_DEAD.copy()
+        if how == "forgotten":
+            pad.tracker.forget()
         pad.push(of_z(own=40), after_ns=gap_ns)
         pad.blocks(6, of_z(own=40))
         assert cause in pad.event

@@ -19,25 +19,17 @@ def written(path: Path, text: str, **settings) -> None:
     write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), **settings)
 
 
-def test_a_new_file_has_its_name_and_nothing_lies_beside_it(tmp_path):
-    written(tmp_path / "a.json", "1")
-    assert (tmp_path / "a.json").read_text() == "1" and listing(tmp_path) == ["a.json"]
-
-
-def test_the_one_before_is_kept(tmp_path):
-    for text in "123":
-        written(tmp_path / "a.json", text)
-    assert (tmp_path / "a.json").read_text() == "3" and (tmp_path / "a.json.bak").read_text() == "2"
-    written(tmp_path / "a.json", "4", keep_before=False)
+def test_a_new_file_has_its_name_and_the_one_before_is_kept(tmp_path):
+    path, drafts = tmp_path / "a.json", []
+    written(path, "1")
+    assert path.read_text() == "1" and listing(tmp_path) == ["a.json"]
+    for text in "23":
+        written(path, text)
+    assert path.read_text() == "3" and (tmp_path / "a.json.bak").read_text() == "2"
+    written(path, "4", keep_before=False)
     assert (tmp_path / "a.json.bak").read_text() == "2" and listing(tmp_path) == ["a.json", "a.json.bak"]
-
-
-def test_a_draft_has_the_name_of_the_file(tmp_path):
-    names = []
-    write_in_place(
-        tmp_path / "a.npz", lambda draft: (names.append(draft.name), draft.touch()), lambda draft: names.append(draft)
-    )
-    assert names[0] == "a.npz" == names[1].name and names[1].parent.parent == tmp_path
+    write_in_place(path, lambda draft: (drafts.append(draft), draft.touch()), drafts.append)
+    assert drafts[0] == drafts[1] and drafts[0].name == "a.json" and drafts[0].parent.parent == tmp_path
 
 
 def broken(draft: Path) -> None:

@@ -35,11 +35,6 @@ from firmware_bridge.zeroing.baseline import save_baselines
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
 
 
-def edge_sr(*arguments, **settings):
-    settings = {"capture_output": True, "text": True, "timeout": 60, "stdin": subprocess.DEVNULL} | settings
-    return subprocess.run([*EDGE_SR, *map(str, arguments)], cwd=ROOT, env=environment(), **settings)
-
-
 def environment():
     return os.environ | {"PYTHONPATH": str(ROOT)}
 
@@ -65,13 +60,9 @@ def made(tmp_path_factory):
     for start in (120, 140):
         counts[start : start + 10, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
+    source = ["--source", f"replay:{folder}/finger.csv", "--rate-hz", "200", "--model", f"{folder}/tiny.onnx"]
     for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
-        done = edge_sr(
-            *("record", folder / "press.mcap", "--model", folder / "tiny.onnx", "--rate-hz", 200),
-            *("--source", f"replay:{folder}/finger.csv"),
-        )
-        assert done.returncode == 0, done.stderr
-        assert f"recorded {folder}/press.mcap: 160 scans, 0.8 s, " in done.stderr.splitlines()[-1]
+        assert cli.main(["record", f"{folder}/press.mcap", *source]) == 0
         if any(own for own, _ in patterns(folder / "press.mcap").values()):
             return folder
         (folder / "press.mcap").unlink()
@@ -106,13 +97,10 @@ class TestOffline:
         for topic in ("scan", "baseline", "pattern", "deviation"):
             assert again[f"/finger/{topic}"] == other[f"/finger/{topic}"] != []
         assert again["/finger/scan"] == recorded["/finger/scan"], "and at their times on the wall"
-
-    def test_patterns_are_those_that_were_recorded(self, made, tmp_path):
-        replayed(made, tmp_path / "a.jsonl", "--sink", f"mcap:{tmp_path}/a.mcap", "--every-scan")
-        again = patterns(tmp_path / "a.mcap")
+        replayed(made, tmp_path / "c.jsonl", "--sink", f"mcap:{tmp_path}/c.mcap", "--every-scan")
+        offline = patterns(tmp_path / "c.mcap")
         made_then = {scan: pattern for scan, (own, pattern) in patterns(made / "press.mcap").items() if own}
-        assert made_then
-        assert [scan for scan, pattern in made_then.items() if again[scan][1] != pattern] == []
+        assert made_then and made_then.items() <= {scan: one for scan, (_, one) in offline.items()}.items()
 
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
     def test_it_begins_with_the_baseline_of_its_first_scan_unless_told_otherwise(self, made, tmp_path, suffix):
@@ -170,48 +158,43 @@ class TestOffline:
 
 
 class TestRecord:
-    def test_a_file_that_exists_is_left_alone_and_one_without_an_ending_is_an_mcap(self, made, tmp_path, capsys):
+    def test_it_says_what_it_recorded_and_a_name_without_an_ending_is_an_mcap(self, made, tmp_path, capsys):
         source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        (tmp_path / "old.mcap").write_text("old")
-        assert cli.main(["record", f"{tmp_path}/old.mcap", *source]) == 5
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1 and "exists: give another name" in error
-        assert (tmp_path / "old.mcap").read_text() == "old"
         assert cli.main(["record", f"{tmp_path}/run.1", *source]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
-        capsys.readouterr()
-        assert cli.main(["record", f"{tmp_path}/none/x", *source]) == 5
-        assert "No such file or directory" in capsys.readouterr().err.splitlines()[-1]
+        said = capsys.readouterr().err.splitlines()[-1]
+        assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said
 
-    def test_what_is_no_name_of_a_recording_is_refused_before_anything_is_opened(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.chdir(tmp_path)
-        (tmp_path / "taken").mkdir()
-        for name, code, words in (
+    @pytest.mark.parametrize(
+        ("name", "code", "words"),
+        [
             ("taken", 5, "cannot record into taken: it is a directory"),
             ("x.csv", 2, ".csv cannot be recorded: edge-sr record x.mcap; afterwards edge-sr convert x.mcap x.csv"),
-            ("x.npz", 2, ".npz cannot be recorded: edge-sr record x.mcap; afterwards edge-sr convert x.mcap x.npz"),
             ("x.JSONL", 2, ".JSONL cannot be recorded"),
-        ):
-            assert cli.main(["record", name, "--source", "slcan:/dev/none"]) == code
-            error = capsys.readouterr().err
-            assert error.count("\n") == 1 and words in error
-        assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+            ("old.mcap", 5, "exists: give another name"),
+            ("none/x", 5, "No such file or directory"),
+        ],
+    )
+    def test_where_nothing_can_be_recorded_one_line_says_so(
+        self, made, tmp_path, monkeypatch, capsys, name, code, words
+    ):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "taken").mkdir()
+        (tmp_path / "old.mcap").write_text("old")
+        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
+        assert cli.main(["record", name, *source]) == code
+        assert words in capsys.readouterr().err.splitlines()[-1]
+        assert (tmp_path / "old.mcap").read_text() == "old" and len(list(tmp_path.iterdir())) == 2
 
     def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
         """The amount depends on the machine; docs/recordings.md gives a measured one."""
         path = tmp_path / "killed.mcap"
-        process = subprocess.Popen(
-            [
-                *(*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "20"),
-                *("--source", f"replay:{made}/finger.csv"),
-            ],
-            cwd=ROOT,
-            env=environment(),
-            stderr=subprocess.DEVNULL,
-        )
+        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "40"]
+        command += ["--source", f"replay:{made}/finger.csv"]
+        process = subprocess.Popen(command, cwd=ROOT, env=environment(), stderr=subprocess.DEVNULL)
         while len(written := scans_on_disk(path)) < 12:
             assert process.poll() is None
-            time.sleep(0.05)
+            time.sleep(0.02)
         process.kill()
         process.wait()
         seen = scans_on_disk(path)
@@ -219,22 +202,19 @@ class TestRecord:
         recording = load_recording(path)
         assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
         assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
-        done = edge_sr("replay", path, "--model", made / "tiny.onnx")
-        assert done.returncode == 0 and "breaks off" in done.stderr and f"{len(seen)} scans" in done.stderr
 
     def test_a_full_disk_ends_it_in_one_line_and_what_was_written_can_be_played(self, made, tmp_path):
-        limit = 20_000
+        limit = 40_000
 
         def small_disk():
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
         path = tmp_path / "full.mcap"
-        done = edge_sr(
-            *("record", path, "--model", made / "tiny.onnx", "--rate-hz", 60),
-            *("--source", f"replay:{made}/finger.csv"),
-            preexec_fn=small_disk,
-        )
+        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "100"]
+        command += ["--source", f"replay:{made}/finger.csv"]
+        settings = {"capture_output": True, "text": True, "timeout": 60, "preexec_fn": small_disk}
+        done = subprocess.run(command, cwd=ROOT, env=environment(), **settings)
         assert done.returncode == 5
         recording = load_recording(path)
         scans = len(recording.tracks[0].counts)

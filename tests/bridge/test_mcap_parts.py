@@ -1,6 +1,7 @@
 """Recordings that a tool has copied in part: messages alone, some of their topics, or those from some time on."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,15 +22,16 @@ from firmware_bridge.scans.scan import Scan
 PERIOD_NS = 50_000_000
 
 
-@pytest.fixture
-def turned(tmp_path):
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory):
     """Three seconds of a sensor that sits turned, and of one that does not."""
     scans = [
         make_scan(number, sensor=name, time_ns=(number + 1) * PERIOD_NS, press_counts=3000, noise=2)
         for number in range(60)
         for name in ("4", "left/6")
     ]
-    return record_into(tmp_path / "turned.mcap", make_results(scans, mountings={"4": TURNED}), mountings={"4": TURNED})
+    results = make_results(scans, mountings={"4": TURNED})
+    return record_into(tmp_path_factory.mktemp("turned") / "turned.mcap", results, mountings={"4": TURNED})
 
 
 def patterns(path):
@@ -41,17 +43,11 @@ def patterns(path):
     return [(one.scan.time_ns, one.zeroed.tobytes()) for one in results]
 
 
-def test_messages_alone_give_the_same_patterns(turned, tmp_path):
-    copy = messages_alone(turned, tmp_path / "copy.mcap")
-    assert patterns(copy) == patterns(turned)
-    assert load_recording(copy).origin == "device" and load_recording(copy).notes == ()
-
-
-def test_and_so_do_those_from_some_time_on(turned, tmp_path):
-    start_ns = OFFSET_NS + 21 * PERIOD_NS + 1
+@pytest.mark.parametrize("start_ns", [0, OFFSET_NS + 21 * PERIOD_NS + 1])
+def test_messages_alone_give_the_same_patterns_from_whatever_time_on(turned, tmp_path, start_ns):
     part = messages_alone(turned, tmp_path / "part.mcap", start_ns=start_ns)
     recording = load_recording(part)
-    assert dict(recording.mountings) == {"4": TURNED} and recording.notes == ()
+    assert recording.origin == "device" and recording.notes == () and dict(recording.mountings) == {"4": TURNED}
     assert {name: one.id for name, one in recording.baselines.items()} == {"4": BASELINE.id, "left/6": BASELINE.id}
     assert patterns(part) == [one for one in patterns(turned) if one[0] + OFFSET_NS >= start_ns]
 
@@ -69,21 +65,23 @@ def test_what_a_tool_left_out_is_named(turned, tmp_path):
     assert "the mounting of sensor 4 is not in the file" in note and "--sensor FILE" in note
 
 
-@pytest.mark.parametrize("topics", [None, "/s4/scan"])
-def test_an_emulated_sensor_stays_one_without_metadata(tmp_path, topics):
-    path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source="emulated"))
-    path = messages_alone(path, tmp_path / "part.mcap", topics)
-    for generation in range(2):
+@pytest.mark.parametrize(
+    ("kind", "copy"), [("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone)]
+)
+def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
+    path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source=kind))
+    for generation in range(3):
+        path = copy(path, tmp_path / f"{generation}-copy.mcap")
         recording = load_recording(path)
-        assert recording.origin == "emulated"
-        assert f"{path} was recorded from an emulated sensor" in recording.notes
+        assert recording.origin == kind
+        assert (f"{path} was recorded from an emulated sensor" in recording.notes) == (kind == "emulated")
         with open_recording(path) as source:
             path = tmp_path / f"{generation}.mcap"
             sink = api.open_sink(f"mcap:{path}", SURE, source)
             for result in Stream(source, Runtime(FakeModel(SURE), source=source.kind)):
+                assert result.source == "replay"
                 sink.write(result, {})
             sink.close()
-        path = messages_alone(path, tmp_path / f"{generation}-alone.mcap")
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(4, 6), (5, 5)])

@@ -2,6 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording as write_csv
+from cli_samples import write_recording as write_npz
 from edge_samples import BASELINE, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,10 +11,10 @@ from hypothesis import strategies as st
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.registry import open_source
-from firmware_bridge.recording.csv_reader import CSV_HEADER, csv_header
+from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
-from firmware_bridge.scans.scan import ABSENT, VendorReading
+from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.zeroing.baseline import deformation
 
 mountings = st.builds(
@@ -79,16 +81,12 @@ def test_forces_of_the_vendors_server_are_turned_wherever_its_sensor_is(mounting
     assert not isinstance(as_mapped, LastingLink)
 
 
-def test_what_sits_as_mapped_costs_nothing():
+def test_what_sits_as_mapped_costs_nothing_and_a_quarter_turn_is_what_it_says():
+    """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
     assert placed_map(USPA44_MAP, {"4": Mounting(swap_xy=True)}) is USPA44_MAP
     assert not Mounting().turns_axes and not Mounting().moves_taxels
     assert Mounting(signs=(1, 1, -1)).turns_axes and TURNED.moves_taxels and not TURNED.turns_axes
-
-
-def test_a_quarter_turn_is_what_it_says():
-    """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
-    assert TURNED.order[0] == 3
-    assert placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
+    assert TURNED.order[0] == 3 and placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
 
 
 def test_deformation_is_corrected_once_and_silent_taxels_stay_unknown():
@@ -106,8 +104,6 @@ def test_deformation_is_corrected_once_and_silent_taxels_stay_unknown():
         ({"order": (0,) * 16}, "each of 0..15 once"),
         ({"order": tuple(range(15))}, "each of 0..15 once"),
         ({"signs": (1, 0, 1)}, "three of 1 and -1"),
-        ({"signs": (1, 1)}, "three of 1 and -1"),
-        ({"gains": (0.0,) * 48}, "48 positive"),
         ({"gains": (float("nan"),) * 48}, "48 positive"),
         ({"gains": (1.0,) * 3}, "48 positive"),
     ],
@@ -127,23 +123,11 @@ def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mount
 
 def test_csv_of_the_vendors_server_is_put_in_place_and_what_edge_sr_recorded_is_not(tmp_path):
     """A CSV is as the server wrote it; edge-sr writes what it has already put in place."""
-    scan = make_scan(absent=())
-    row = ",".join(str(count) for count in scan.counts.reshape(3, 16).T.ravel())
-    (tmp_path / "4.csv").write_text("\n".join([",".join(CSV_HEADER), row, row, ""]))
-    np.savez(
-        tmp_path / "4.npz",
-        format=np.array("tactile-recording"),
-        version=np.array(1),
-        sensor=np.array(["4"]),
-        scan=np.arange(1),
-        time_ns=np.arange(1),
-        counts=scan.counts[None],
-    )
-    for name, expected in (("4.csv", TURNED.place(scan).counts), ("4.npz", scan.counts)):
+    counts = make_scan(0, noise=3).counts
+    write_csv(tmp_path / "4.csv", counts[None])
+    write_npz(tmp_path / "4.npz", [0])
+    for name, expected in (("4.csv", TURNED.place_counts(counts)), ("4.npz", counts)):
         with open_source(f"replay:{tmp_path}/{name}", 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED}) as link:
             assert isinstance(link, LastingLink) == (name == "4.csv") and link.kind == "replay"
-            scans = []
-            while not link.ended:
-                scans += link.read(1.0)
-        assert np.array_equal(scans[0].counts, expected) and ABSENT not in scans[0].counts
-        assert link.counters()["scans"] == len(scans)
+            (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
+        assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1

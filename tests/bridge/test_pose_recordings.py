@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from cli_samples import base_options, files, run, start
 from edge_samples import BASELINE, FakeModel, make_scan
-from mcap_samples import OFFSET_NS, arrays_of, messages_of
+from mcap_samples import OFFSET_NS, arrays_of
+from pose_samples import PosedModel
 
 from edge import api
 from edge.perception.runtime import Runtime
@@ -18,7 +18,6 @@ from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import POSE, decode_pose, encode_pose
 
-__all__ = ["files"]
 STEP_NS = 10_000_000
 POSES = [
     # Time, place and sensor; and the scan that was first made with it at hand, which may be earlier than its own time.
@@ -49,18 +48,13 @@ def make_scans(count=6):
     return [make_scan(number, time_ns=10**9 + number * STEP_NS, press_counts=3000, noise=3) for number in range(count)]
 
 
-def open_for(path):
-    contract = FakeModel().contract
-    return McapSink(path, contract, unix_offset_ns=OFFSET_NS)
-
-
 def record(path, poses=POSES):
     """Record scans and poses as a run would, in an npz by way of an mcap."""
     if path.suffix == ".npz":
         arrays_of(record(path.with_suffix(".mcap"), poses))
         return path
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
-    sink = open_for(path)
+    sink = McapSink(path, FakeModel().contract, unix_offset_ns=OFFSET_NS)
     for number, scan in enumerate(make_scans()):
         mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
         if mine:
@@ -98,34 +92,15 @@ def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
     again = tmp_path / "again.mcap"
     runtime = PosedRuntime()
     with api.open_recording(first) as source:
-        sink = open_for(again)
+        sink = McapSink(again, FakeModel().contract, unix_offset_ns=OFFSET_NS)
         api.pump(source, runtime, [sink], api.Statistics())
         sink.close()
     assert played(again)[0] == played(first)[0] == expected_order()
 
 
 @pytest.mark.parametrize("kind", ["mcap", "npz"])
-def test_a_recording_without_poses_has_none_and_stays_as_it_was(tmp_path, kind):
-    path = record(tmp_path / f"plain.{kind}", [])
-    assert load_recording(path).poses is None
-    if kind == "npz":
-        with np.load(path) as arrays:
-            assert not [name for name in arrays.files if name.startswith("pose")]
-    else:
-        assert "/poses" not in messages_of(path)
-
-
-def test_the_public_readers_find_the_poses(tmp_path):
-    with np.load(record(tmp_path / "posed.npz")) as arrays:
-        assert arrays["pose_time_ns"].tolist() == [pose.time_ns for pose, _ in POSES]
-        assert arrays["pose"].tolist() == [
-            [p.pose.x_mm, p.pose.y_mm, p.pose.turn_deg, p.pose.error_mm, p.pose.error_deg] for p, _ in POSES
-        ]
-        assert arrays["pose_sensor"].tolist() == [pose.sensor or "" for pose, _ in POSES]
-        assert arrays["pose_holds"].tolist() == [pose.holds for pose, _ in POSES]
-    messages = messages_of(tmp_path / "posed.mcap")["/poses"]
-    assert [log_ns - OFFSET_NS for log_ns, _ in messages] == [pose.time_ns for pose, _ in POSES]
-    assert [decode_pose(data).pose for _, data in messages] == [pose.pose for pose, _ in POSES]
+def test_a_recording_without_poses_has_none(tmp_path, kind):
+    assert load_recording(record(tmp_path / f"plain.{kind}", [])).poses is None
 
 
 def test_poses_of_another_program_come_in_time_to_be_interpolated(tmp_path):
@@ -145,20 +120,17 @@ def test_poses_of_another_program_come_in_time_to_be_interpolated(tmp_path):
         pose_time_ns=pose_times_ns,
         pose=values,
     )
-    places, runtime = [], PosedRuntime()
     with api.open_recording(tmp_path / "other.npz") as source:
-        for result in Stream(source, runtime):
-            track = runtime._tracks[None]
-            places.append((result.scan.time_ns, track.at(result.scan.time_ns).x_mm))
+        runtime = Runtime(PosedModel(), source="replay", baselines={"4": BASELINE})
+        places = {result.scan.time_ns: result.pose.x_mm for result in Stream(source, runtime)}
     assert len(places) == 40
-    for time_ns, x_mm in places:
+    for time_ns, x_mm in places.items():
         assert x_mm == pytest.approx((time_ns - 10**9) / 1e9 * 20)
 
 
 def test_a_paced_replay_moves_the_poses_with_the_scans(tmp_path):
-    link = ReplayLink([record(tmp_path / "posed.mcap")], clock=lambda: 77 * 10**9, sleep=lambda time_s: None)
-    link._clock = iter([70 * 10**9, *[77 * 10**9] * 9]).__next__
-    with link:
+    clock = iter([70 * 10**9, *[77 * 10**9] * 9]).__next__
+    with ReplayLink([record(tmp_path / "posed.mcap")], clock=clock, sleep=lambda time_s: None) as link:
         scans = link.read(1.0)
         poses = link.poses()
     assert [scan.time_ns - 70 * 10**9 for scan in scans] == [number * STEP_NS for number in range(6)]
@@ -180,19 +152,17 @@ class TestCsv:
 
     def poses(self, path):
         with ReplayLink([path], paced=False) as link:
-            return [(scan.number, link.poses()) for _ in range(3) for scan in link.read(0.0)]
+            return [(scan.number, link.poses()) for _ in range(3) if not link.ended for scan in link.read(0.0)]
 
-    def test_each_row_has_its_pose_or_none(self, tmp_path):
+    def test_each_row_has_its_pose_or_none_and_its_turn_may_be_left_out(self, tmp_path):
         got = self.poses(self.write(tmp_path / "finger.csv", ["1,2,3", ",,", "-4.5, 5e-1,0"]))
         assert got == [
             (0, [TimedPose(PadPose(1, 2, 3), 0, used_from_ns=0)]),
             (1, []),
             (2, [TimedPose(PadPose(-4.5, 0.5, 0), 40_000_000, used_from_ns=40_000_000)]),
         ]
-
-    def test_the_turn_may_be_left_out(self, tmp_path):
-        got = self.poses(self.write(tmp_path / "finger.csv", ["1,2", "3,4", ","], "pose_x_mm,pose_y_mm"))
-        assert [[(p.pose.x_mm, p.pose.turn_deg) for p in poses] for _, poses in got] == [[(1, 0)], [(3, 0)], []]
+        (first, *_) = self.poses(self.write(tmp_path / "finger.csv", ["1,2"], "pose_x_mm,pose_y_mm"))
+        assert [pose.pose for pose in first[1]] == [PadPose(1, 2, 0)]
 
     def test_two_files_together_keep_their_poses_apart(self, tmp_path):
         paths = [self.write(tmp_path / f"{name}.csv", [f"{x},0,0"] * 3) for name, x in (("left", 1), ("right", 2))]
@@ -213,17 +183,14 @@ class TestHostile:
         [
             {"pose": np.zeros((2, 4))},
             {"pose": np.full((2, 5), np.nan)},
-            {"pose": np.full((2, 5), -1.0)},
             {"pose": np.array([["a"] * 5] * 2)},
             {"pose_time_ns": np.array([-1, 2])},
             {"pose_time_ns": np.array([0, 2**63], np.uint64)},
-            {"pose_time_ns": np.array([0, 1, 2])},
             {"pose_sensor": np.array(["4", "\x1b"])},
             {"pose_sensor": np.array([4, 5])},
             {"pose_holds": np.array([0, 1])},
             {"pose_used_from_ns": np.array([-2, 0])},
             {"pose": None},
-            {"pose_time_ns": None},
         ],
     )
     def test_arrays_that_cannot_be_are_refused_with_one_line(self, tmp_path, change):
@@ -236,31 +203,9 @@ class TestHostile:
 
     @pytest.mark.parametrize(
         "change",
-        [
-            *({"x_mm": np.nan}, {"error_mm": -1.0}, {"holds": 2}, {"time_ns": -1}, {"used_from_ns": -2}),
-            *({"sensor": "\x1b"}, {"sensor": "4" * 65}),
-        ],
+        [{"x_mm": np.nan}, {"holds": 2}, {"time_ns": -1}, {"used_from_ns": -2}, {"sensor": "\x1b"}],
     )
     def test_a_message_that_cannot_be_is_refused(self, change):
         fields = POSE.decode(encode_pose(POSES[0][0], OFFSET_NS))
         with pytest.raises(CdrError):
             decode_pose(POSE.encode({**fields, **change}))
-
-
-def test_a_program_records_the_poses_of_stdin_and_plays_them(files, tmp_path):
-    import subprocess
-
-    out = tmp_path / "run.mcap"
-    options = ["--source", f"replay:{files / 'rest.npz'}", "--sink", f"mcap:{out}", "--sink", "jsonl:-"]
-    with start(*base_options(files), *options, stdin=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stdout is not None
-        process.stdout.readline()  # it runs
-        for number in range(5):
-            process.stdin.write(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 1, "holds": true}}\n')
-            process.stdin.flush()
-        process.stdout.read()
-        assert process.wait() == 0
-    messages = messages_of(out)["/poses"]
-    assert [decode_pose(data).pose.x_mm for _, data in messages] == [0, 1, 2, 3, 4]
-    done = run("replay", out, "--model", files / "tiny.onnx")
-    assert done.returncode == 0 and "poses: 5 received, 5 used" in done.stderr

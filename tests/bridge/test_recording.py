@@ -1,4 +1,3 @@
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -57,38 +56,33 @@ def test_csv(tmp_path):
 
 def test_csv_rate_comes_from_the_file_beside_it(tmp_path):
     path = write_csv(tmp_path, HEADER + row(0))
-    write_csv(tmp_path, "dropped,notes,frequency_hz\n0,,59.75\n", "meta_data.csv")
-    assert load_recording(path).rate_hz == 59.75
-    write_csv(tmp_path, "dropped,notes\n0,\n", "meta_data.csv")
-    assert load_recording(path).rate_hz is None
-
-
-@pytest.mark.parametrize("cell", ["fast", "0", "-1", "nan", "inf", ""])
-def test_csv_rate_that_is_no_rate(tmp_path, cell):
-    path = write_csv(tmp_path, HEADER + row(0))
-    write_csv(tmp_path, f"frequency_hz\n{cell}\n", "meta_data.csv")
-    with pytest.raises(RecordingError, match=r"meta_data\.csv.*positive"):
-        load_recording(path)
+    for text, rate_hz in (("dropped,notes,frequency_hz\n0,,59.75\n", 59.75), ("dropped,notes\n0,\n", None)):
+        write_csv(tmp_path, text, "meta_data.csv")
+        assert load_recording(path).rate_hz == rate_hz
+    for cell in ("fast", "0", "-1", "nan", "inf", ""):
+        write_csv(tmp_path, f"frequency_hz\n{cell}\n", "meta_data.csv")
+        with pytest.raises(RecordingError, match=r"meta_data\.csv.*positive"):
+            load_recording(path)
 
 
 @pytest.mark.parametrize(
-    ("written", "read"), [("65535", 65535), ("0.0", 0), ("12.", 12), (" 12.00 ", 12), ("000012", 12)]
+    ("written", "read"),
+    [
+        *(("65535", 65535), ("0.0", 0), ("12.", 12), (" 12.00 ", 12), ("000012", 12)),
+        *dict.fromkeys(
+            ("65536", "-1", "1.5", "", "nan", "inf", "1e4", "1_0", "0x10", "x", "\u0661", "9" * 5000)
+        ).items(),
+    ],
 )
-def test_csv_whole_numbers(tmp_path, written, read):
-    cells = row(0).strip().split(",")
-    cells[5] = written
-    assert load_recording(write_csv(tmp_path, HEADER + ",".join(cells) + "\n")).tracks[0].counts[0, 2, 0, 1] == read
-
-
-@pytest.mark.parametrize(
-    "written", ["65536", "-1", "1.5", "", "nan", "inf", "1e4", "1_0", "0x10", "x", "\u0661", "9" * 5000]
-)
-def test_csv_other_cells(tmp_path, written):
+def test_a_cell_of_a_csv_is_a_whole_number_of_sixteen_bits(tmp_path, written, read):
     cells = row(0).strip().split(",")
     cells[5] = written
     path = write_csv(tmp_path, HEADER + row(0) + ",".join(cells) + "\n")
-    with pytest.raises(RecordingError, match=r"finger\.csv, line 3: .*expected a whole number 0\.\.65535"):
-        load_recording(path)
+    if read is not None:
+        assert load_recording(path).tracks[0].counts[1, 2, 0, 1] == read
+    else:
+        with pytest.raises(RecordingError, match=r"finger\.csv, line 3: .*expected a whole number 0\.\.65535"):
+            load_recording(path)
 
 
 @pytest.mark.parametrize(
@@ -117,19 +111,12 @@ def test_nothing_of_a_header_reaches_a_terminal_as_a_command(tmp_path):
     assert all(text.isprintable() for text in (str(refused.value), *recording.notes)) and len(recording.notes) == 2
 
 
-def test_csv_without_a_row(tmp_path):
-    with pytest.raises(RecordingError, match=r"finger\.csv, .*expected a row of counts"):
-        load_recording(write_csv(tmp_path, HEADER))
-
-
 @pytest.mark.parametrize(
     "tail",
     [
         row(1).replace(",", "", 1),
         row(1)[:100],
         row(1)[:-3],
-        row(1)[:-5],
-        "\0" * 100,
         "\0" * 100_000,
         row(1)[:50] + "\0" * 50 + row(1)[100:],
         "\ufffd\n",
@@ -156,20 +143,14 @@ PLAIN = HEADER + row(0) + row(7)
     "text",
     [
         PLAIN[:-1],
-        PLAIN + "\n",
         PLAIN + "  \r\n" + "," * 47 + "\n\n",
         HEADER + "\n" + row(0) + "\n\n" + row(7),
-        PLAIN.replace(",", ";"),
         PLAIN.replace(",", ";").replace(".0", ",0"),
-        PLAIN.replace(",", "\t"),
         PLAIN.replace(",", " ; "),
-        "sep=,\n" + PLAIN,
         "sep=;\r\n" + PLAIN.replace(",", ";").replace("\n", "\r\n"),
         '"sep=|"\n' + PLAIN.replace(",", "|"),
-        PLAIN.replace("\n", ",\n"),
         PLAIN.replace("\n", ",,\n"),
         HEADER.replace("\n", ",\n") + row(0) + row(7),
-        PLAIN.replace("\n", "\r\n"),
         PLAIN.replace("\n", "\r"),
         "\ufeff" + PLAIN.replace("\n", "\r\n"),
         "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in PLAIN.splitlines()),
@@ -195,25 +176,18 @@ def with_columns(names: str, cells: list[str]) -> str:
     ("name", "times", "rate_hz"),
     [
         ("time", ["0.000", "0.010", "0.020", "0.031"], 100),
-        ("t", ["0", "10", "20", "31"], 100),
         ("timestamp", ["1700000000000000000", "1700000000010000000", "1700000000020000000"], 100),
         ("Timestamp", ["1700000000.01", "1700000000.02", "1700000000.03"], 100),
-        ("stamp", ["5000", "15000", "25000"], 100),
         ("time [ms]", ["0", "1", "2"], 1000),
-        ("time_ms", ["0", "1000", "2000"], 1),
         ("t (\u00b5s)", ["0", "10000", "20000"], 100),
         ("time_ns", ["0", "10000000", "20000000"], 100),
         ("datetime", ["2026-01-02 03:04:05.00", "2026-01-02 03:04:05.01", "2026-01-02T03:04:05.02"], 100),
         ("time", ["0", "0", "0", "40", "40", "40", "40", "80", "80"], 100),
         ("time", [f"{n / 100 + 30 * (n > 10):.2f}" for n in range(20)], 100),
         ("t", ["0", "1", "2", "3"], None),
-        ("time", ["0", "30", "60"], 33),
-        ("time", ["0", "600", "1200"], 1667),
-        ("time", ["0", "0.4", "0.8"], None),
         ("time", ["0.03", "0.02", "0.01"], None),
         ("time", ["0", "", "0.02"], None),
         ("time", ["00:00.0", "00:00.1", "00:00.2"], None),
-        ("time", ["5", "5", "5"], None),
         ("time", ["5"], None),
     ],
 )
@@ -256,18 +230,6 @@ def test_the_vendors_log(tmp_path):
     assert "'Message number' is left out" in recording.notes[1]
 
 
-def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(RecordingError, match=r"gone\.csv: cannot be read: No such file"):
-        load_recording(tmp_path / "gone.csv")
-    with pytest.raises(RecordingError, match=r"gone\.npz: cannot be read: No such file"):
-        load_recording(tmp_path / "gone.npz")
-    (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(RecordingError, match=r"folder\.csv: a folder with nothing in it, expected \.mcap files"):
-        load_recording(tmp_path / "folder.csv")
-    with pytest.raises(RecordingError, match=r"ends in \.csv, \.npz or \.mcap"):
-        load_recording(write_csv(tmp_path, HEADER + row(0), "finger.txt"))
-
-
 def test_npz(tmp_path):
     recording = load_recording(write_npz(tmp_path, pattern=np.zeros((4, 40, 40)), rate_hz=np.array(50.0)))
     assert recording.rate_hz == 50.0
@@ -279,17 +241,6 @@ def test_npz(tmp_path):
     assert recording.tracks[0].mean_rate_hz == pytest.approx(50.0)
 
 
-def test_npz_without_a_rate(tmp_path):
-    recording = load_recording(write_npz(tmp_path, time_ns=np.full(4, 5)))
-    assert recording.rate_hz is None and recording.tracks[0].mean_rate_hz is None
-
-
-def changed_counts(place: tuple, value: int) -> np.ndarray:
-    counts = npz_arrays()["counts"]
-    counts[place] = value
-    return counts
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -297,35 +248,27 @@ def changed_counts(place: tuple, value: int) -> np.ndarray:
         ({"format": np.array(["tactile-recording"])}, "array 'format'"),
         ({"version": np.array(2)}, "array 'version': 2, expected 1"),
         ({"version": np.array(1.0)}, "array 'version'"),
-        ({"version": np.array([1])}, "array 'version'"),
         ({"counts": None}, "array 'counts': missing"),
-        ({"scan": None}, "array 'scan': missing"),
         ({"counts": np.zeros((4, 3, 4, 4))}, "array 'counts': float64"),
-        ({"counts": np.zeros((4, 48), dtype=np.int32)}, "array 'counts'"),
         ({"counts": np.zeros((4, 4, 4, 3), dtype=np.int32)}, "array 'counts'"),
         ({"counts": np.zeros((0, 3, 4, 4), dtype=np.int32)}, "at least one scan"),
-        ({"counts": changed_counts((0, 0, 0, 0), 65536)}, r"array 'counts': counts -1\.\.65536"),
-        ({"counts": changed_counts((0, slice(None), 0, 0), -2)}, r"array 'counts': counts -2\.\."),
-        ({"counts": changed_counts((0, 0, 0, 0), -1)}, "absent on some axes"),
+        ({"counts": np.full((4, 3, 4, 4), 65536, np.int32)}, r"array 'counts': counts 65536\.\.65536"),
+        ({"counts": np.full((4, 3, 4, 4), -2, np.int32)}, r"array 'counts': counts -2\.\."),
+        ({"counts": np.full((4, 3, 4, 4), [[[-1]], [[0]], [[0]]], np.int32)}, "absent on some axes"),
         ({"sensor": np.array([4, 6, 4, 6])}, "array 'sensor': int64"),
         ({"sensor": np.array(["4"])}, "array 'sensor'"),
+        ({"sensor": np.array(["4", 6, None, {}], dtype=object)}, "plain arrays"),
         ({"scan": np.zeros(3, dtype=np.int64)}, "array 'scan'"),
         ({"time_ns": np.zeros(4)}, "array 'time_ns'"),
         ({"time_ns": np.array([5, 0, 4, 0])}, "array 'time_ns': times of sensor '4' that go back"),
         ({"rate_hz": np.array(0.0)}, "array 'rate_hz'"),
         ({"rate_hz": np.array(float("nan"))}, "array 'rate_hz'"),
         ({"rate_hz": np.array([50.0])}, "array 'rate_hz'"),
-        ({"rate_hz": np.array("50")}, "array 'rate_hz'"),
     ],
 )
 def test_npz_that_is_none(tmp_path, changes, words):
     with pytest.raises(RecordingError, match=words):
         load_recording(write_npz(tmp_path, **changes))
-
-
-def test_npz_with_objects_is_not_unpickled(tmp_path):
-    with pytest.raises(RecordingError, match="plain arrays"):
-        load_recording(write_npz(tmp_path, sensor=np.array(["4", 6, None, {}], dtype=object)))
 
 
 def test_npz_that_lost_its_end_is_read_as_far_as_its_arrays_are_whole(tmp_path):
@@ -342,15 +285,19 @@ def test_npz_that_lost_its_end_is_read_as_far_as_its_arrays_are_whole(tmp_path):
         load_recording(write_csv(tmp_path, whole[: whole.index(b"counts.npy") + 300], "finger.npz"))
 
 
-def test_npz_that_is_cut_or_something_else(tmp_path):
+def test_files_that_cannot_be_read(tmp_path):
     whole = write_npz(tmp_path).read_bytes()
-    for size in (0, 10, len(whole) // 4):
-        with pytest.raises(RecordingError, match="finger"):
-            load_recording(write_csv(tmp_path, whole[:size], "finger.npz"))
-    damaged = whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:]
-    with pytest.raises(RecordingError, match="finger"):
-        load_recording(write_csv(tmp_path, damaged, "finger.npz"))
-    np.save(tmp_path / "single.npy", np.zeros(3))
-    shutil.move(tmp_path / "single.npy", tmp_path / "single.npz")
-    with pytest.raises(RecordingError, match="not a whole"):
-        load_recording(tmp_path / "single.npz")
+    (tmp_path / "folder.csv").mkdir()
+    for name, content, words in (
+        ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
+        ("gone.npz", None, r"gone\.npz: cannot be read: No such file"),
+        ("folder.csv", None, r"folder\.csv: a folder with nothing in it, expected \.mcap files"),
+        ("finger.txt", b"", r"ends in \.csv, \.npz or \.mcap"),
+        ("finger.csv", HEADER.encode(), r"finger\.csv, .*expected a row of counts"),
+        ("finger.npz", b"", "finger"),
+        ("finger.npz", whole[: len(whole) // 4], "finger"),
+        ("finger.npz", whole[:600] + bytes([whole[600] ^ 0xFF]) + whole[601:], "finger"),
+    ):
+        path = tmp_path / name if content is None else write_csv(tmp_path, content, name)
+        with pytest.raises(RecordingError, match=words):
+            load_recording(path)

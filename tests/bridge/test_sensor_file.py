@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,33 +79,7 @@ def test_what_is_written_is_read(tmp_path, written):
     assert {name: one.id for name, one in read.baselines.items()} == {
         name: one.id for name, one in written.baselines.items()
     }
-    assert max(map(len, (tmp_path / "s.toml").read_text().splitlines())) <= 120
-
-
-def test_a_person_can_read_the_pad_in_it(tmp_path):
-    turned = Mounting(order=tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()))
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(turned)}))
-    text = (tmp_path / "s.toml").read_text()
-    assert "    [ 3,  7, 11, 15],\n    [ 2,  6, 10, 14],\n" in text and "gains = [1.0, 1.0, 1.0]" in text
-    assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
-
-
-def test_a_short_file_by_hand_is_enough(tmp_path):
-    (tmp_path / "s.toml").write_text(
-        'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.1]\nsigns = [1, -1, 1]\n'
-    )
-    read = load_sensor_file(tmp_path / "s.toml")
-    assert read.mountings == {"1": Mounting(signs=(1, -1, 1))} and read.model == "A"
-    assert read.adapter is None and not read.baselines and not read.counts_per_newton
-
-
-def test_a_baseline_by_hand_needs_no_id(tmp_path):
-    counts = "".join(f"{axis} = {[[16_000.0] * 4] * 4}\n" for axis in "xyz")
-    (tmp_path / "s.toml").write_text(
-        'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.1.baseline]\n'
-        f"created_unix_s = 1790000000\nscans = 100\n{counts}"
-    )
-    assert (load_sensor_file(tmp_path / "s.toml").baselines["1"].counts == 16_000).all()
+    assert max(map(len, (tmp_path / "s.toml").read_text().splitlines())) <= 120, "for people, too"
 
 
 GRID = "[[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11], [12, 13, 14, 15]]"
@@ -125,32 +100,21 @@ def text_of(**changes):
     ("key", "value", "expected"),
     [
         ("format", '"tactile-baseline"', "'tactile-sensor'"),
-        ("format", "", "missing"),
         ("version", "2", "expected 1"),
-        ("version", "true", "expected 1"),
         ("model", '"XR9"', "'uSPa44' or 'uSPa46' or 'XR1944' or 'A' or 'B'"),
         ("adapter", '""', "printable"),
-        ("adapter", r'"a\nb"', "printable"),
-        ("adapter", "7", "printable"),
-        ("order", "[0, 1, 2]", "4 rows of 4"),
         ("order", GRID.replace("15", "14"), "each of 0..15 once"),
-        ("order", GRID.replace("15", "15.0"), "each of 0..15 once"),
         ("order", GRID.replace("[12,", "[12, 13,"), "4 rows of 4"),
         ("swap_xy", "1", "true or false"),
         ("signs", "[1, 1, 2]", "1 or -1 for each of x, y, z"),
-        ("signs", "[1, 1]", "1 or -1"),
         ("signs", "[1, 1, true]", "1 or -1"),
         ("gains", "[1, 1, 0]", "positive numbers, 3, or 3 x 4 x 4"),
-        ("gains", "[1, 1, inf]", "positive numbers"),
         ("gains", f"[{GRID}, {GRID}]", "positive numbers, 3, or 3 x 4 x 4"),
         ("counts_per_newton", "nan", "a number from 0.001 to 1e+06"),
-        ("counts_per_newton", "true", "a number from 0.001 to 1e+06"),
-        ("counts_per_newton", "1e9", "a number from 0.001 to 1e+06"),
         ("id", '"ffff"', "which the counts give, or none; the baseline was changed"),
         ("created_unix_s", "0", "a number from 1 to 1e+11"),
         ("scans", "1.0", "a whole number from 1"),
         ("x", GRID.replace("15", "65536"), "numbers 0..65535"),
-        ("z", GRID.replace("15", "nan"), "numbers 0..65535"),
         ("y", "", "missing"),
     ],
 )
@@ -162,72 +126,88 @@ def test_what_cannot_be_is_refused_in_one_line_that_names_the_key(tmp_path, key,
     assert str(refused.value).startswith(f"{tmp_path}/s.toml, '")
 
 
-def pad_text(*lines):
-    head = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n[sensors.4.pad]\n'
-    return head + "".join(f"{line}\n" for line in lines)
-
-
-def test_a_pad_by_hand_is_read(tmp_path):
-    gains = [1.0, 0.5, *[1.0] * 46]
-    lines = ("thickness_mm = 4", "poisson = 0", "poisson_interval = [0, 0.49]", f"gains = {gains}")
-    (tmp_path / "s.toml").write_text(pad_text(*lines))
-    entry = load_sensor_file(tmp_path / "s.toml").sensors["4"]
-    assert entry.pad == Pad(thickness_mm=4, poisson=0, intervals={"poisson": (0, 0.49)}, gains=tuple(gains))
-    assert entry.counts_per_newton is None and entry.mounting == Mounting()
+HEAD = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n'
+PAD = f"{HEAD}[sensors.4.pad]\n"
+FRAME = f"{HEAD}[sensors.4]\n[sensors.4.frame]\n"
+OF_GAINS, PLACE = f"gains = {[1.0] * 48}\n", "place_mm = [0, 0, 0]\n"
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("text", "words"),
     [
-        (
-            "thickness = 4.5",
-            "'sensors.4.pad.thickness': not known, expected one of thickness_mm, thickness_mm_interval",
-        ),
-        ("thickness_mm = 0", "'sensors.4.pad.thickness_mm': 0, expected a number from 0.1 to 100"),
-        ("thickness_mm = true", "a number from 0.1 to 100"),
-        ("poisson = 0.5", "a number from 0 to 0.4999"),
-        ("poisson = nan", "a number from 0 to 0.4999"),
-        ("counts_per_newton = 1e9", "a number from 0.001 to 1e+06"),
-        ("in_plane_share_interval = 1", "two numbers from 0 to 10, the lower first"),
-        ("in_plane_share_interval = [2, 1]", "the lower first"),
-        ("in_plane_share_interval = [1, 2, 3]", "two numbers"),
-        ("in_plane_share_interval = [1, inf]", "two numbers"),
-        ("gains_interval = [1, 2]", "'sensors.4.pad.gains_interval': not known"),
-        ("gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
-        (f"gains = {[0.0] * 48}", "48 numbers from 0.01 to 100"),
-        (f"gains = {[[1.0] * 48]}", "48 numbers"),
-        (f"gain_half_widths = {[0.1] * 48}", "'sensors.4.pad.gain_half_widths': without gains, expected both, or none"),
-        (f"gains = {[1.0] * 48}\ngain_half_widths = {[1.5] * 48}", "48 numbers from 0 to 1"),
-        (f"gains = {[1.0] * 48}\ngain_half_widths = [0.1]", "48 numbers from 0 to 1"),
+        (text_of() + "colour = 1\n", "'sensors.4.baseline.colour': not known, expected one of id, created_unix_s"),
+        (text_of(swap_xy="false\nswap = true"), "'sensors.4.swap': not known"),
+        ("offset = 1\n" + text_of(), "'offset': not known"),
+        (HEAD + "sensors = 4\n", "a table for each sensor"),
+        (HEAD, "'sensors': missing"),
+        (HEAD + '[sensors."4\\n"]\n', "names of 1 to 64 printable characters"),
+        (HEAD + f"[sensors.{'x' * 65}]\n", "names of 1 to 64 printable characters"),
+        ("format = ", "not TOML"),
+        ("\udc80", "not TOML"),
+        (None, "cannot be read: No such file"),
+        (PAD + "thickness = 4.5", "'sensors.4.pad.thickness': not known, expected one of thickness_mm, thickness_mm_"),
+        (PAD + "thickness_mm = 0", "'sensors.4.pad.thickness_mm': 0, expected a number from 0.1 to 100"),
+        (PAD + "thickness_mm = true", "a number from 0.1 to 100"),
+        (PAD + "poisson = nan", "a number from 0 to 0.4999"),
+        (PAD + "in_plane_share_interval = 1", "two numbers from 0 to 10, the lower first"),
+        (PAD + "in_plane_share_interval = [2, 1]", "the lower first"),
+        (PAD + "in_plane_share_interval = [1, 2, 3]", "two numbers"),
+        (PAD + "gains_interval = [1, 2]", "'sensors.4.pad.gains_interval': not known"),
+        (PAD + "gains = [1, 1, 1]", "48 numbers from 0.01 to 100: x of all places, then y, then z"),
+        (PAD + f"gains = {[0.0] * 48}", "48 numbers from 0.01 to 100"),
+        (PAD + f"gain_half_widths = {[0.1] * 48}", "'sensors.4.pad.gain_half_widths': without gains, expected both"),
+        (PAD + OF_GAINS + f"gain_half_widths = {[1.5] * 48}", "48 numbers from 0 to 1"),
+        (FRAME + 'parent = "tool0"\nplace_mm = [0, 0]', "expected three numbers"),
+        (FRAME + 'parent = "tool0"\nplace_mm = [0, 0, 1e6]', "expected three numbers up to 100000"),
+        (FRAME + PLACE + 'parent = "/tool0"', "parent is '/tool0', expected the name of a frame"),
+        (FRAME + PLACE, "'sensors.4.frame.parent': missing"),
+        (FRAME + PLACE + 'parent = "a"\nquaternion = [1, 1, 0, 0]', "expected x, y, z, w of norm 1"),
+        (FRAME + PLACE + 'parent = "a"\nplace_m = [0, 0, 0]', "'sensors.4.frame.place_m': not known"),
     ],
 )
-def test_a_pad_that_cannot_be_is_refused_by_its_key(tmp_path, line, words):
-    (tmp_path / "s.toml").write_text(pad_text(line))
+def test_what_is_no_sensor_file_is_refused(tmp_path, text, words):
+    path = tmp_path / "s.toml"
+    if text is not None:
+        path.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(SensorFileError, match=re.escape(words)):
-        load_sensor_file(tmp_path / "s.toml")
+        load_sensor_file(path)
+
+
+def test_a_short_file_by_hand_is_enough(tmp_path):
+    gains = [1.0, 0.5, *[1.0] * 46]
+    counts = "".join(f"{axis} = {[[16_000.0] * 4] * 4}\n" for axis in "xyz")
+    (tmp_path / "s.toml").write_text(
+        f"{HEAD}[sensors.1]\nsigns = [1, -1, 1]\n[sensors.4.pad]\nthickness_mm = 4\npoisson = 0\n"
+        f"poisson_interval = [0, 0.49]\ngains = {gains}\n"
+        f"[sensors.6.baseline]\ncreated_unix_s = 1790000000\nscans = 100\n{counts}"
+    )
+    read = load_sensor_file(tmp_path / "s.toml")
+    assert read.mountings["1"] == Mounting(signs=(1, -1, 1)) and read.sensors["4"].mounting == Mounting()
+    assert read.sensors["4"].pad == Pad(thickness_mm=4, poisson=0, intervals={"poisson": (0, 0.49)}, gains=tuple(gains))
+    assert (read.baselines["6"].counts == 16_000).all() and read.adapter is None and not read.counts_per_newton
 
 
 @pytest.mark.parametrize(
     ("by_hand", "by_itself", "used"),
     [(None, 0.04, 0.04), (0.03, None, 0.03), (0.03, 0.04, 0.03), (0.04, 0.03, 0.03), (0.03, 0.03, 0.03)],
 )
-def test_of_gains_by_hand_and_of_gains_by_itself_the_surer_ones_are_used(by_hand, by_itself, used, tmp_path):
-    def with_gains(width, gain):
-        return None if width is None else Pad(gains=(gain,) * 48, gain_half_widths=(width,) * 48)
+def test_of_gains_by_hand_and_learned_the_surer_are_used(by_hand, by_itself, used, tmp_path):
+    """Of constants those by hand."""
 
-    one = SensorEntry(pad=with_gains(by_hand, 0.9), learned=with_gains(by_itself, 1.1))
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": one}))
+    def pad(width, gain, **constants):
+        gains = {} if width is None else {"gains": (gain,) * 48, "gain_half_widths": (width,) * 48}
+        return Pad(**constants, **gains)
+
+    learned = pad(by_itself, 1.1, poisson=0.42, thickness_mm=5.0)
+    learned = replace(learned, intervals={"poisson": (0.41, 0.43), "thickness_mm": (4.8, 5.2)})
+    one = SensorEntry(pad=pad(by_hand, 0.9, thickness_mm=4.0), learned=learned)
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": one, "6": SensorEntry(learned=learned)}))
     read = load_sensor_file(tmp_path / "s.toml")
-    assert read.sensors["4"] == one and read.path == tmp_path / "s.toml"
+    assert read.sensors["4"] == one and read.path == tmp_path / "s.toml" and read.pads["6"] == learned
     assert read.pads["4"].gain_half_widths == (used,) * 48
     assert read.pads["4"].gains == ((0.9 if used == by_hand else 1.1),) * 48
-
-
-def test_constants_by_hand_stay_where_gains_by_itself_are_surer():
-    learned = Pad(gains=(1.1,) * 48, gain_half_widths=(0.03,) * 48)
-    entry = SensorEntry(pad=Pad(thickness_mm=4.0), learned=learned)
-    used = SensorFile(sensors={"4": entry}).pads["4"]
-    assert used.thickness_mm == 4.0 and used.gains == learned.gains
+    assert read.pads["4"].constants == {"thickness_mm": 4.0, "poisson": 0.42}
+    assert read.pads["4"].intervals == {"poisson": (0.41, 0.43)}
 
 
 def test_that_text_is_refused_for_its_id_alone(tmp_path):
@@ -241,27 +221,6 @@ def test_that_text_is_refused_for_its_id_alone(tmp_path):
     assert read.baseline is not None and read.baseline.counts[2, 3, 3] == 15
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (text_of() + "colour = 1\n", "'sensors.4.baseline.colour': not known, expected one of id, created_unix_s"),
-        (text_of(swap_xy="false\nswap = true"), "'sensors.4.swap': not known"),
-        ("offset = 1\n" + text_of(), "'offset': not known"),
-        ('format = "tactile-sensor"\nversion = 1\nmodel = "A"\nsensors = 4\n', "a table for each sensor"),
-        ('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n', "'sensors': missing"),
-        ("format = ", "not TOML"),
-        ("\udc80", "not TOML"),
-        (None, "cannot be read: No such file"),
-    ],
-)
-def test_what_is_no_sensor_file_is_refused(tmp_path, text, words):
-    path = tmp_path / "s.toml"
-    if text is not None:
-        path.write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(SensorFileError, match=re.escape(words)):
-        load_sensor_file(path)
-
-
 def test_a_file_that_cannot_be_replaced_stays_and_leaves_nothing_beside_it(tmp_path, monkeypatch):
     path = tmp_path / "s.toml"
     path.write_text("old")
@@ -273,13 +232,6 @@ def test_a_file_that_cannot_be_replaced_stays_and_leaves_nothing_beside_it(tmp_p
     assert path.read_text() == "old" and [one.name for one in tmp_path.iterdir()] == ["s.toml"]
 
 
-@pytest.mark.parametrize("name", ["", "4\\n", "x" * 65])
-def test_names_that_no_sensor_may_have_are_refused(tmp_path, name):
-    (tmp_path / "s.toml").write_text(f'format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors."{name}"]\n')
-    with pytest.raises(SensorFileError, match="names of 1 to 64 printable characters"):
-        load_sensor_file(tmp_path / "s.toml")
-
-
 def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp_path):
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(counts_per_newton=np.float64(1180.0))}))
     assert load_sensor_file(tmp_path / "s.toml").sensors["4"].counts_per_newton == 1180.0
@@ -289,35 +241,3 @@ def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp
     with pytest.raises(SensorFileError, match="a taxel of sensor 4 was silent while zeroing: zero again"):
         save_sensor_file(tmp_path / "t.toml", SensorFile(sensors={"4": SensorEntry(baseline=silent)}))
     assert not (tmp_path / "t.toml").exists()
-
-
-def test_learned_constants_are_used_where_there_are_none_by_hand():
-    gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.05,) * 48}
-    learned = Pad(
-        poisson=0.42, thickness_mm=5.0, intervals={"poisson": (0.41, 0.43), "thickness_mm": (4.8, 5.2)}, **gains
-    )
-    by_hand = Pad(thickness_mm=4.0, gains=(0.9,) * 48, gain_half_widths=(0.01,) * 48)
-    used = SensorFile(sensors={"4": SensorEntry(pad=by_hand, learned=learned)}).pads["4"]
-    assert used.constants == {"thickness_mm": 4.0, "poisson": 0.42} and used.intervals == {"poisson": (0.41, 0.43)}
-    assert used.gains == by_hand.gains and used.gain_half_widths == by_hand.gain_half_widths
-    assert SensorFile(sensors={"4": SensorEntry(learned=learned)}).pads["4"] == learned
-
-
-@pytest.mark.parametrize(
-    ("lines", "words"),
-    [
-        ('parent = "tool0"\nplace_mm = [0, 0]', r"'sensors.4.frame.place_mm': .*expected three numbers"),
-        ('parent = "tool0"\nplace_mm = [0, 0, 1e6]', r"place_mm is .*expected three numbers up to 100000"),
-        ('parent = "/tool0"\nplace_mm = [0, 0, 0]', r"parent is '/tool0', expected the name of a frame"),
-        ('parent = "tool 0"\nplace_mm = [0, 0, 0]', r"expected the name of a frame"),
-        ("place_mm = [0, 0, 0]", r"'sensors.4.frame.parent': missing"),
-        ('parent = "a"\nplace_mm = [0, 0, 0]\nquaternion = [1, 1, 0, 0]', r"expected x, y, z, w of norm 1"),
-        ('parent = "a"\nplace_m = [0, 0, 0]\nplace_mm = [0, 0, 0]', r"'sensors.4.frame.place_m': not known"),
-    ],
-)
-def test_a_frame_that_cannot_be_is_refused(tmp_path, lines, words):
-    path = tmp_path / "s.toml"
-    head = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n[sensors.4]\n[sensors.4.frame]\n'
-    path.write_text(head + lines + "\n")
-    with pytest.raises(SensorFileError, match=words):
-        load_sensor_file(path)

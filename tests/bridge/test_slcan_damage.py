@@ -64,24 +64,23 @@ def test_every_cut_of_a_line():
             assert got == ([GOLDEN_FRAME, OTHER_FRAME] if start == end else [OTHER_FRAME]), (start, end)
 
 
-def test_a_whole_frame_behind_a_wreck_is_kept():
-    assert decode(GOLDEN[:12] + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 12})
-    assert decode(GOLDEN[:-1] + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 21})
+@pytest.mark.parametrize(
+    ("stream", "frames", "counted"),
+    [
+        (GOLDEN[:12] + OTHER, 1, {"skipped_bytes": 12}),
+        (GOLDEN[:-1] + OTHER, 1, {"skipped_bytes": 21}),
+        (OTHER + GOLDEN[:9] + b"\xb1" + GOLDEN[10:] + OTHER, 2, {"non_ascii_lines": 1, "skipped_bytes": 21}),
+        (b"\xff\xfe" + OTHER, 1, {"skipped_bytes": 2}),
+        (b"A" * 10_000 + OTHER, 1, {"skipped_bytes": 10_000}),
+        (b"A" * 10_000 + b"\r" + OTHER, 1, {"bad_lines": 1, "skipped_bytes": 10_000}),
+    ],
+)
+def test_damage_spoils_the_frame_it_falls_into_and_no_other(stream, frames, counted):
+    assert decode(stream) == ([OTHER_FRAME] * frames, {"frames": frames} | counted)
 
 
-def test_non_ascii_spoils_the_frame_it_falls_into_and_no_other():
-    spoilt = GOLDEN[:9] + b"\xb1" + GOLDEN[10:]
-    got = decode(OTHER + spoilt + OTHER)
-    assert got == ([OTHER_FRAME] * 2, {"frames": 2, "non_ascii_lines": 1, "skipped_bytes": 21})
-    assert decode(b"\xff\xfe" + OTHER) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 2})
-
-
-def test_a_line_without_end_is_bounded_and_counted():
-    got, counters = decode(b"A" * 10_000 + OTHER)
-    assert (got, counters) == ([OTHER_FRAME], {"frames": 1, "skipped_bytes": 10_000})
-    got, counters = decode(b"A" * 10_000, b"\r", OTHER)
-    assert (got, counters) == ([OTHER_FRAME], {"frames": 1, "bad_lines": 1, "skipped_bytes": 10_000})
-    # Counted while it goes on: a line at the wrong speed may never end.
+def test_a_line_without_end_is_counted_while_it_goes_on():
+    """A line at the wrong speed may never end."""
     assert decode(b"A" * 10_000)[1] == {"skipped_bytes": 10_000 - LONGEST_LINE}
 
 
@@ -100,18 +99,14 @@ def test_a_million_random_bytes():
     assert decoder.feed(b"\r" + GOLDEN) == [GOLDEN_FRAME]
 
 
-def test_every_byte_is_a_frame_a_reply_or_skipped():
-    noise = random.Random(3)
-    stream = b"".join(noise.choice([GOLDEN, OTHER[:9], b"\xff", b"z\r", b"\r", b"\a", b"junk"]) for _ in range(2000))
-    decoder = SlcanDecoder()
-    got = decoder.feed(stream + b"\r")
-    text = stream.replace(b"\a", b"\r").split(b"\r")
-    told = sum(line in (b"z", b"") for line in text)
-    assert len(got) == decoder.counters()["frames"]
-    ends = stream.count(b"\r") + stream.count(b"\a") + 1
-    frame_bytes = 21 * len(got)
-    assert decoder.counters()["skipped_bytes"] == len(stream) + 1 - ends - frame_bytes - text.count(b"z")
-    assert decoder.counters()["replies"] + decoder.counters()["refusals"] >= told
+@given(st.lists(st.sampled_from([GOLDEN, OTHER[:9], b"\xff", b"z\r", b"\r", b"\a", b"junk"]), max_size=60))
+@settings(deadline=None)
+def test_every_byte_is_a_frame_a_reply_or_skipped(pieces):
+    stream = b"".join(pieces) + b"\r"
+    got, counters = decode(stream)
+    ends, lone_z = stream.count(b"\r") + stream.count(b"\a"), stream.replace(b"\a", b"\r").split(b"\r").count(b"z")
+    assert counters.get("frames", 0) == len(got)
+    assert len(stream) == counters.get("skipped_bytes", 0) + 21 * len(got) + ends + lone_z
 
 
 def test_what_no_decoder_can_tell():

@@ -1,3 +1,5 @@
+"""Status of an slcan adapter: its words, what of them is trouble, and when it is asked."""
+
 import pytest
 
 from firmware_bridge.can.slcan_status import (
@@ -27,6 +29,7 @@ def counted(status: AdapterStatus) -> dict[str, int]:
 
 def test_every_flag_by_itself_and_all_together():
     """Lawicel CAN232 manual: 0 receive queue full, 1 transmit queue full, 2 warning, 3 overrun, 5..7 of the bus."""
+    assert STATUS_FLAGS == b"F\r"
     names = ["rx_full", "tx_full", "error_warning", "overrun", "-", "error_passive", "arbitration_lost", "bus_error"]
     assert [FLAGS.get(1 << bit, "-") for bit in range(8)] == names
     for bit, name in enumerate(names):
@@ -34,22 +37,6 @@ def test_every_flag_by_itself_and_all_together():
         assert counted(told(b"F%02X" % (1 << bit))) == expected
     assert set(counted(told(b"Fff", b"F00"))) == {"status_answers", *(f"adapter_{name}" for name in FLAGS.values())}
     assert told(b"Fff", b"F00").answers == 2
-
-
-def test_states_and_errors_are_counted_by_sort():
-    status = told(b"sa000000", b"sw096000", b"sp128000", b"sb256256", b"e3oOs", b"e2fa")
-    assert counted(status) == {
-        "status_lines": 6,
-        "adapter_error_active": 1,
-        "adapter_error_warning": 1,
-        "adapter_error_passive": 1,
-        "adapter_bus_off": 1,
-        "adapter_overrun": 1,
-        "adapter_tx_overrun": 1,
-        "adapter_stuff_error": 1,
-        "adapter_form_error": 1,
-        "adapter_ack_error": 1,
-    }
 
 
 @pytest.mark.parametrize(
@@ -60,43 +47,36 @@ def test_what_is_none_of_these(line):
     assert not status.hear(line, 0) and counted(status) == {} and status.trouble(0) is None
 
 
-def test_bus_off_is_trouble_until_another_state_or_a_frame():
-    status = told(b"sb256256", frames=7)
-    assert status.trouble(7) == BUS_OFF and "bus-off" in BUS_OFF and "termination" in BUS_OFF
-    assert status.trouble(8) is None
-    for state in b"awp":
-        assert told(b"sb256256", b"s%c000000" % state).trouble(0) is None
+SOON, LATER = 100 + FRAMES_TO_FORGET - 1, 100 + FRAMES_TO_FORGET
 
 
-def test_flags_of_lost_frames_are_trouble_until_they_are_clear():
-    for flag in (b"F01", b"F08"):
-        status = told(flag, frames=3)
-        assert status.trouble(3) == status.trouble(10**6) == FRAMES_LOST
-        assert status.hear(b"F00", 10**6) and status.trouble(10**6) is None
-    assert told(b"F02").trouble(0) is None, "a transmit queue is no loss of ours"
+@pytest.mark.parametrize(
+    ("lines", "frames", "in_silence", "trouble"),
+    [
+        ([b"sb256256"], 100, False, BUS_OFF),
+        ([b"sb256256"], 101, False, None),
+        *[([b"sb256256", b"s%c000000" % state], 100, False, None) for state in b"awp"],
+        *[([flag], frames, False, FRAMES_LOST) for flag in (b"F01", b"F08") for frames in (100, 10**6)],
+        ([b"F08", b"F00"], 100, False, None),
+        ([b"F02"], 100, False, None),  # a transmit queue is no loss of ours
+        ([b"e1o"], SOON, False, FRAMES_LOST),
+        ([b"e1o"], LATER, False, None),
+        ([b"e1O"], 100, False, None),
+        ([b"e1s"], 100, False, None),
+        *[([flag], 100, silent, BUS_ERRORS if silent else None) for flag in (b"F80", b"F20") for silent in (0, 1)],
+        ([b"F44"], 100, True, None),
+    ],
+)
+def test_what_is_trouble_and_until_when(lines, frames, in_silence, trouble):
+    status = told(*lines, frames=100)
+    assert status.trouble(frames, flags_of_a_silence=in_silence) == trouble
 
 
-def test_an_overrun_told_by_itself_is_trouble_for_a_while():
-    status = told(b"e1o", frames=100)
-    assert status.trouble(100 + FRAMES_TO_FORGET - 1) == FRAMES_LOST
-    assert status.trouble(100 + FRAMES_TO_FORGET) is None
-    assert told(b"e1O").trouble(0) is None and told(b"e1s").trouble(0) is None
-
-
-def test_errors_on_the_bus_are_trouble_only_in_a_silence():
-    for flag in (b"F80", b"F20"):
-        assert told(flag).trouble(0) is None
-        assert told(flag).trouble(0, flags_of_a_silence=True) == BUS_ERRORS
-    assert told(b"F44").trouble(0, flags_of_a_silence=True) is None
-
-
-def test_what_is_forgotten():
+def test_flags_are_forgotten_on_request():
     status = told(b"F08")
     status.forget()
     assert status.trouble(0) is None and counted(status)["adapter_overrun"] == 1
 
-
-# When to ask.
 
 MS = 1_000_000
 T0 = 10**12
@@ -115,33 +95,29 @@ def times_asked(until_ns: int, *, scans=lambda ns: True, answer=lambda status: s
     return asked
 
 
-def silent(status):
-    return None
+def third():
+    """Answer every third question."""
+    numbers = iter(range(100))
+    return lambda status: next(numbers) % 3 == 0 and status.hear(b"F00", 0)
 
 
-def test_a_running_sensor_is_asked_about_seldom():
-    assert times_asked(20_000 * MS) == [5000, 10_000, 15_000]
-
-
-def test_a_silent_one_is_asked_about_at_once():
-    assert times_asked(12_000 * MS, scans=lambda ns: False) == [500, 5500, 10_500]
-    gone = times_asked(12_000 * MS, scans=lambda ns: ns < 6000 * MS)
-    assert gone == [5000, 6490, 11_490]
-    # Half a second apart even if scans come and go.
-    hiccups = times_asked(4000 * MS, scans=lambda ns: ns % (600 * MS) == 0)
-    assert hiccups == [500, 1100, 1700, 2300, 2900, 3500]
-
-
-def test_who_does_not_answer_is_asked_no_more():
-    assert len(times_asked(60_000 * MS, answer=silent)) == MOST_UNANSWERED
-    assert len(times_asked(60_000 * MS, answer=silent, refuse=True)) == 1
-    assert len(times_asked(60_000 * MS, refuse=True)) > 5, "a BEL beside an answer was of something else"
-
-
-def test_one_answer_in_time_keeps_the_asking():
-    count = iter(range(100))
-    asked = times_asked(100_000 * MS, answer=lambda status: next(count) % 3 == 0 and status.hear(b"F00", 0))
-    assert len(asked) == 19
+@pytest.mark.parametrize(
+    ("until_s", "how", "asked_ms"),
+    [
+        (20, {}, [5000, 10_000, 15_000]),
+        (12, {"scans": lambda ns: False}, [500, 5500, 10_500]),
+        (12, {"scans": lambda ns: ns < 6000 * MS}, [5000, 6490, 11_490]),
+        # Half a second apart even if scans come and go.
+        (4, {"scans": lambda ns: ns % (600 * MS) == 0}, [500, 1100, 1700, 2300, 2900, 3500]),
+        (60, {"answer": lambda status: None}, [5000, 10_000, 15_000]),
+        (60, {"answer": lambda status: None, "refuse": True}, [5000]),
+        (60, {"refuse": True}, list(range(5000, 60_000, 5000))),  # a BEL beside an answer was of something else
+        (60, {"answer": third()}, list(range(5000, 60_000, 5000))),
+    ],
+)
+def test_when_it_is_asked(until_s, how, asked_ms):
+    """Seldom while the sensor runs, at once where it is silent, and no more if it does not answer."""
+    assert times_asked(until_s * 1000 * MS, **how) == asked_ms and MOST_UNANSWERED == 3
 
 
 def test_what_was_said_last_does_not_outlive_the_answering():
@@ -184,7 +160,3 @@ def test_a_new_opening_is_a_new_chance_for_who_has_ever_answered():
         assert sum(asked) == MOST_UNANSWERED
         questions.reopened()
         assert questions.due(1, 0, next(times)) == ever
-
-
-def test_the_command():
-    assert STATUS_FLAGS == b"F\r"

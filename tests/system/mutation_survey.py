@@ -76,7 +76,7 @@ SUBJECTS = {
     ),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_tap_numbers.py", "tests/runtime/test_taps.py")),
     "baseline": Subject(
-        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline_limits.py", "tests/bridge/test_baseline.py")
+        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py", "tests/bridge/test_baseline_files.py")
     ),
     "drift": Subject(
         "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
