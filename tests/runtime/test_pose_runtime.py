@@ -261,6 +261,10 @@ class TestSession:
         for taps in range(1, 8):
             window, poses = random_taps(taps)
             np.testing.assert_allclose(session.run(window, poses=poses), posed_pattern(window, poses), atol=1e-5)
+            for count in range(1, 8):  # and of any number of pads, more shapes than arrays are kept for
+                windows, rows = zip(*[random_taps(taps, seed) for seed in range(count)], strict=True)
+                made = session.run_together(windows, None, rows)
+                np.testing.assert_allclose(made[-1], posed_pattern(windows[-1], rows[-1]), atol=1e-5)
         window, poses = random_taps(4)
         expected = session.run(window, poses=poses).copy()
         for order in permutations((1, 2, 3)):
