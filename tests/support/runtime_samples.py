@@ -37,7 +37,7 @@ class Pushed:
         """Press twice and release; return the result of the second scan."""
         if pose is not None:
             self.place(pose)
-        self.push(press / 2, **changes)
+        self.push(0.6 * press, **changes)
         result = self.push(press, **changes)
         self.push()
         return result
