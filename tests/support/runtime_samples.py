@@ -1,8 +1,14 @@
 """Runtime with a fake model, and a sensor that is pressed and moved scan by scan."""
 
+import threading
+
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_scan
 
 from edge.perception.runtime import Runtime
+from edge.pipeline.pump import pump
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
+from firmware_bridge.zeroing.baseline import Baseline
 
 PRESS = 3000
 
@@ -49,3 +55,18 @@ class Pushed:
     @property
     def kinds(self):
         return [event.kind for event in self.events]
+
+
+def pumped(link, *sinks, model=None, runtime=None, statistics=None, capacity_scans=CAPACITY_SCANS, rate_hz=None, **how):
+    """Pump a link through a runtime of sensors 4 and 6 into sinks until it ends, and return the statistics."""
+    baselines = {name: Baseline.of(name, BASELINE.counts, 1000.0, 100, "file") for name in "46"}
+    runtime = runtime or make_runtime(model, source=link.kind, baselines=baselines)
+    statistics = statistics or Statistics()
+    with Source(link, capacity_scans=capacity_scans, rate_hz=rate_hz) as source:
+        pump(source, runtime, sinks, statistics, **{"stop": threading.Event()} | how)
+    return statistics
+
+
+def presses(numbers, sensor="4"):
+    """Return scans that press a little more each, so that each needs a pattern of its own."""
+    return [make_scan(number, sensor=sensor, press_counts=PRESS + 20 * number) for number in numbers]
