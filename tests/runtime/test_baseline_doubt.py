@@ -1,4 +1,5 @@
 """Drift, warming and old baselines, which look like a touch, are no contact; what begins as a touch is one."""
+# pyright: reportArgumentType=false
 
 import itertools
 from dataclasses import replace
@@ -20,7 +21,7 @@ NOISE_COUNTS = 2.5
 TAKEN = replace(BASELINE, origin="start-up")
 ROW, COL = np.mgrid[-1.5:2:1, -1.5:2:1] / 1.5
 GRIP = np.zeros((3, 4, 4))
-"""A flat grip: as even as real ones, whose taxels differ from their median by .55 of it and more."""
+"""A flat grip: as even as real ones, whose taxels differ from their median by 0.55 of it and more."""
 GRIP[2] = 700 + 300 * ROW + 60 * COL
 GRIP[0] = -180 + 60 * ROW
 LOCAL = np.zeros((3, 4, 4))
@@ -43,28 +44,30 @@ def drift_field(seed, hours):
 class Pad:
     """A sensor that reads what it is told to, and its runtime; keeps the results."""
 
-    def __init__(self, baseline=BASELINE, model=None, **options):
-        self.runtime = make_runtime(
-            model or FakeModel(make_trusted_contract()), baselines={"4": baseline}, options=RuntimeOptions(**options)
-        )
+    def __init__(self, baseline=BASELINE, **options):
+        model = FakeModel(make_trusted_contract())
+        self.runtime = make_runtime(model, baselines={"4": baseline}, options=RuntimeOptions(**options))
         self.results = []
         self._rng = np.random.default_rng(0)
         self._series = ScanSeries("4", USPA44)
-        self._time_ns = PERIOD_NS
+        self.time_ns = PERIOD_NS
+
+    def scan(self, felt):
+        counts = BASELINE.counts + felt + self._rng.normal(0, NOISE_COUNTS, (3, 4, 4))
+        self.time_ns += PERIOD_NS
+        return self._series.close(np.rint(counts).astype(np.int32), self.time_ns - PERIOD_NS)
 
     def read(self, seconds, felt=0.0):
         """Return the results of readings over the rest level, or of what it gives for each time in [s]."""
         begun = len(self.results)
         for number in range(max(1, round(seconds * 1e9 / PERIOD_NS))):
             now = felt(number * PERIOD_NS / 1e9) if callable(felt) else felt
-            counts = BASELINE.counts + now + self._rng.normal(0, NOISE_COUNTS, (3, 4, 4))
-            scan = self._series.close(np.rint(counts).astype(np.int32), self._time_ns)
-            self.results.append(self.runtime.push(scan))
-            self._time_ns += PERIOD_NS
+            self.results.append(self.runtime.push(self.scan(now)))
         return self.results[begun:]
 
-    def away(self, seconds):
-        self._time_ns += round(seconds * 1e9)
+    @property
+    def kinds(self):
+        return [event.kind for result in self.results for event in result.events]
 
 
 def states(results):
@@ -79,15 +82,11 @@ def doubted(results):
     return str(results[0].note)
 
 
-@pytest.mark.parametrize("hours", [4, 22])
-@pytest.mark.parametrize("seed", range(12))
-def test_a_free_pad_with_an_old_baseline_is_in_doubt_from_the_first_scan(hours, seed):
-    doubted(Pad().read(0.5, drift_field(seed, hours)))
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_of_an_hours_drift_no_scan_is_a_contact(seed):
-    assert states(Pad().read(0.5, drift_field(seed, 1))) <= {"idle", "baseline_in_doubt"}
+@pytest.mark.parametrize("seed", range(6))
+def test_a_free_pad_with_an_old_baseline_is_in_doubt_from_the_first_scan(seed):
+    for hours in (4, 22):
+        doubted(Pad().read(0.3, drift_field(seed, hours)))
+    assert states(Pad().read(0.3, drift_field(seed, 1))) <= {"idle", "baseline_in_doubt"}, "of an hour's drift"
 
 
 @pytest.mark.parametrize("counts", [-900, -60, 60, 100, 900])
@@ -95,111 +94,106 @@ def test_of_an_hours_drift_no_scan_is_a_contact(seed):
 def test_a_common_change_of_any_size_sign_and_axis_is_in_doubt(counts, axis):
     felt = np.zeros((3, 4, 4))
     felt[axis] = counts * (1 + 0.2 * ROW)
-    note = doubted(Pad().read(0.5, felt))
+    note = doubted(Pad().read(0.3, felt))
     assert f"{'xyz'[axis]} {counts:+d}"[:3] in note and "(baseline 60 s old)" in note
 
 
-def test_a_grip_from_a_rest_that_was_seen_is_a_contact_and_ends_as_one():
-    pad = Pad()
-    assert states(pad.read(0.5)) == {"idle"}
-    held = pad.read(2, lambda t: GRIP * min(t / 0.1, 1))[5:]
-    assert states(held) == {"contact"}
-    assert states(pad.read(2, lambda t: GRIP * max(0.04 - t / 10, 0))) == {"idle"}
-    assert all(result.event is None for result in pad.results)
+FREE, HELD, DOUBT = {"idle"}, {"contact"}, {"baseline_in_doubt"}
+FIELD = np.zeros((3, 4, 4))
+FIELD[2] = 300 * (1 + 0.2 * COL)
 
 
-def test_a_recording_that_begins_gripped_is_one_with_its_own_baseline_alone():
-    assert states(Pad(TAKEN).read(0.5, GRIP)) == {"contact"}
-    pad = Pad()
-    doubtful = pad.read(0.5, GRIP)
-    doubted(doubtful)
-    assert doubtful[-1].pattern is not None and doubtful[-1].taps_used == 1 and doubtful[-1].traction is None
-    assert states(pad.read(0.5)) == {"idle"} and states(pad.read(0.5, GRIP)) == {"contact"}
-    events = [event.kind for result in pad.results for event in result.events]
-    assert events == ["baseline_doubted", "baseline_cleared"]
+@pytest.mark.parametrize(
+    ("baseline", "told"),
+    [
+        # A grip from a rest that was seen is a contact, which ends as one, and is one again where it is tightened.
+        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.6, HELD), (GRIP * 0.04, FREE), (GRIP, HELD)]),
+        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.15, DOUBT), (GRIP, HELD)]),
+        # A recording that begins gripped is one with its own baseline alone.
+        (TAKEN, [(GRIP, HELD)]),
+        (BASELINE, [(GRIP, DOUBT), (0.0, FREE), (GRIP, HELD)]),
+        # A local press needs no rest before it, but for an old baseline.
+        (BASELINE, [(LOCAL, HELD)]),
+        (BASELINE, [(LOCAL + drift_field(0, 4), DOUBT)]),
+        # All taxels alike at once are a field and no touch.
+        (BASELINE, [(0.0, FREE), (FIELD, DOUBT), (0.0, FREE)]),
+        # A baseline that was taken under load shows at the release, and the pad was not seen at rest since.
+        (TAKEN, [(0.0, FREE), (-GRIP, DOUBT), (GRIP, DOUBT), (0.0, FREE)]),
+    ],
+)
+def test_what_is_felt_is_a_contact_or_in_doubt(baseline, told):
+    pad = Pad(baseline)
+    for felt, expected in told:
+        assert states(pad.read(0.4, felt)[15:]) == expected, pad.kinds
+        if expected == DOUBT:
+            doubted(pad.results[-25:])
+    doubts = sum(expected == DOUBT for _, expected in told) > 0
+    assert set(pad.kinds) == {*["baseline_doubted"] * doubts, *["baseline_cleared"] * (doubts and len(told) > 1)}
 
 
-def test_a_local_press_needs_no_rest_before_it():
-    assert states(Pad().read(0.5, LOCAL)) == {"contact"}
-    assert states(Pad().read(0.5, LOCAL + drift_field(0, 4))) == {"baseline_in_doubt"}
+def test_a_note_tells_why_it_is_in_doubt():
+    for baseline, felt, why in (
+        (BASELINE, FIELD, "alike"),
+        (TAKEN, -GRIP, "far below the baseline on all taxels"),
+        (TAKEN, -GRIP, "while something pressed"),
+    ):
+        pad = Pad(baseline)
+        pad.read(0.5)
+        assert why in doubted(pad.read(0.2, felt))
+    doubtful = Pad().read(0.2, GRIP)[-1]
+    assert doubtful.pattern is not None and doubtful.taps_used == 1 and doubtful.traction is None
 
 
 def test_what_a_release_leaves_is_no_contact():
     """A pad that warmed by 3 K under a grip, and cools by a time constant of ten seconds."""
     pad = Pad()
     pad.read(0.5)
-    pad.read(3, GRIP)
-    left = pad.read(30, lambda t: WARM * np.exp(-t / 10))
-    assert states(left[:12]) <= {"contact", "baseline_in_doubt"} and states(left[12:]) == {"baseline_in_doubt", "idle"}
-    assert "after a release" in str(left[12].note) and states(left[-500:]) == {"idle"}
-    assert states(pad.read(1, GRIP)) == {"contact"}
-
-
-def test_a_grip_that_is_loosened_and_tightened_is_a_contact_again():
-    pad = Pad()
-    pad.read(0.5)
-    pad.read(0.5, GRIP)
-    assert states(pad.read(0.5, GRIP * 0.6)) == {"contact"}
-    assert states(pad.read(0.5, GRIP * 0.15)[15:]) == {"baseline_in_doubt"}
-    assert states(pad.read(0.5, GRIP)) == {"contact"}
+    assert states(pad.read(2, lambda t: GRIP * min(t / 0.1, 1))[5:]) == HELD
+    left = pad.read(20, lambda t: WARM * np.exp(-t / 5))
+    assert states(left[:12]) <= HELD | DOUBT and states(left[12:]) == DOUBT | FREE
+    assert "after a release" in str(left[12].note) and states(left[-300:]) == FREE
+    assert states(pad.read(1, GRIP)) == HELD
 
 
 @pytest.mark.parametrize("follow_drift", [True, False])
-@pytest.mark.parametrize("counts_per_s", [5, 10, 20, -20])
+@pytest.mark.parametrize("counts_per_s", [10, 20, -20])
 def test_drift_that_creeps_over_the_threshold_is_no_contact(counts_per_s, follow_drift):
     pad = Pad(follow_drift=follow_drift)
     pad.read(1)
-    crept = pad.read(
-        min(200 / abs(counts_per_s), 40), lambda t: counts_per_s * t * np.array([0, 0, 1])[:, None, None] * PADS
-    )
-    assert states(crept) <= {"idle", "baseline_in_doubt"}
+    shape = np.array([0, 0, 1])[:, None, None] * PADS
+    crept = pad.read(200 / abs(counts_per_s), lambda t: counts_per_s * t * shape)
+    assert states(crept) <= FREE | DOUBT
     if counts_per_s > 0 and not follow_drift:
         assert crept[-1].state == "baseline_in_doubt" and "rose slowly" in str(crept[-1].note)
-        assert states(pad.read(0.5, GRIP * 2)) == {"contact"}, "drift does not explain it any more"
+        assert states(pad.read(0.5, GRIP * 2)) == HELD, "drift does not explain it any more"
 
 
 def test_a_press_slower_than_drift_is_a_contact_where_it_is_local():
     pad = Pad(follow_drift=False)
     pad.read(1)
-    assert states(pad.read(20, lambda t: LOCAL * t / 20)) == {"idle", "contact"}
+    assert states(pad.read(20, lambda t: LOCAL * t / 20)) == FREE | HELD
 
 
-def test_all_taxels_alike_at_once_are_a_field_and_no_touch():
+OTHER = np.random.default_rng(9).integers(150, 700, (3, 4, 4))
+
+
+@pytest.mark.parametrize("lost", [True, False])
+@pytest.mark.parametrize(
+    ("before", "felt", "state"),
+    [(0.0, 0.0, FREE), (GRIP, GRIP, HELD), (0.0, GRIP, DOUBT), (0.0, OTHER, DOUBT), (0.0, -OTHER, DOUBT)],
+)
+def test_after_an_outage_rest_levels_are_compared(before, felt, state, lost):
     pad = Pad()
     pad.read(0.5)
-    felt = np.zeros((3, 4, 4))
-    felt[2] = 300 * (1 + 0.2 * COL)
-    note = doubted(pad.read(0.5, felt))
-    assert "alike" in note and states(pad.read(0.5)) == {"idle"}
-
-
-def test_a_baseline_that_was_taken_under_load_shows_at_the_release():
-    pad = Pad(TAKEN)
-    pad.read(0.5)
-    note = doubted(pad.read(0.5, -GRIP))
-    assert "far below the baseline on all taxels" in note and "while something pressed" in note
-    doubted(pad.read(0.5, GRIP)), "the pad was not seen at rest since"
-    assert states(pad.read(0.5)) == {"idle"}
-
-
-def test_after_an_outage_rest_levels_are_compared():
-    other = np.random.default_rng(9).integers(150, 700, (3, 4, 4))
-    for felt, state in ((0.0, "idle"), (GRIP, "contact"), (other, "baseline_in_doubt"), (-other, "baseline_in_doubt")):
-        for forget in (lambda pad: pad.runtime.lose_touch(), lambda pad: pad.away(60)):
-            pad = Pad()
-            pad.read(0.5)
-            pad.read(0.2, GRIP if state == "contact" else 0.0)
-            forget(pad)
-            assert states(pad.read(0.5, felt)) == {state}
-            assert ("another pad" in str(pad.results[-1].note)) == (felt is other)
-
-
-def test_a_grip_that_began_during_an_outage_is_in_doubt_until_its_release():
-    pad = Pad()
-    pad.read(0.5)
-    pad.runtime.lose_touch()
-    doubted(pad.read(0.5, GRIP))
-    assert states(pad.read(0.2)) == {"idle"} and states(pad.read(0.2, GRIP)) == {"contact"}
+    pad.read(0.2, before)
+    if lost:
+        pad.runtime.lose_touch()
+    else:
+        pad.time_ns += 60_000_000_000
+    assert states(pad.read(0.5, felt)) == state
+    assert ("another pad" in str(pad.results[-1].note)) == (state == DOUBT and np.mean(felt) > 0)
+    pad.read(0.2)
+    assert states(pad.read(0.2, GRIP)) == HELD
 
 
 def test_a_free_pad_in_doubt_is_zeroed_without_force():
@@ -208,7 +202,7 @@ def test_a_free_pad_in_doubt_is_zeroed_without_force():
     pad.runtime.zero()
     last = pad.read(1.5, field)[-1]
     assert last.state == "idle" and last.baseline.origin == "demand" and last.note is None
-    assert states(pad.read(0.5, field + GRIP)) == {"contact"}
+    assert states(pad.read(0.5, field + GRIP)) == HELD
 
 
 def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
@@ -216,7 +210,7 @@ def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
     for _ in range(3):
         pad.read(0.2, GRIP)
         pad.read(0.2, GRIP + drift_field(2, 22))
-    assert states(pad.results) == {"baseline_in_doubt"}
+    assert states(pad.results) == DOUBT
     pad.read(0.2)
     assert {one.taps_used for one in pad.read(0.2, GRIP)} == {1}
     assert {one.drift.common_counts for one in pad.results[:-1]} == {(0.0, 0.0, 0.0)}
@@ -224,9 +218,8 @@ def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
 
 def test_a_scan_in_doubt_that_is_overtaken_stays_in_doubt():
     pad = Pad()
-    scan, newer = (pad._series.close((BASELINE.counts + GRIP).astype(np.int32), n * PERIOD_NS) for n in (1, 2))
-    assert pad.runtime.take(scan) == []
-    (overtaken,) = pad.runtime.take(newer)
+    assert pad.runtime.take(pad.scan(GRIP)) == []
+    (overtaken,) = pad.runtime.take(pad.scan(GRIP))
     assert (overtaken.state, overtaken.trusted, overtaken.pattern) == ("baseline_in_doubt", False, None)
 
 
@@ -255,9 +248,9 @@ class TestRealGrips:
     @pytest.mark.parametrize("finger", [1, 2])
     def test_with_the_baseline_of_another_trial_nothing_is_a_contact(self, finger):
         for trial, other in itertools.permutations(TRIALS, 2):
-            counts = self.counts(trial, finger)
-            for rest in (self.lowest(self.counts(other, finger)), self.lowest(self.counts(other, finger)) - 1350):
-                results = self.played(counts, rest)
+            lowest = self.lowest(self.counts(other, finger))
+            for rest in (lowest, lowest - 1350)[: 1 + (trial == TRIALS[0])]:
+                results = self.played(self.counts(trial, finger), rest)
                 assert states(results) == {"baseline_in_doubt"}, (trial.name, other.name)
                 assert not any(one.trusted for one in results)
 

@@ -26,34 +26,27 @@ def followed(intervals_ms, rate_hz=None):
     return cadence
 
 
-def test_the_period_is_the_median_of_what_came():
-    assert followed([10] * (FEWEST_INTERVALS - 1)).period_ns is None
-    assert followed([10] * FEWEST_INTERVALS).period_ns == 10 * MS
-    assert followed([9, 11, 10, 10, 900, 10, 1, 9, 11]).period_ns == 10 * MS
-    assert followed([20] * 40 + [5] * 31).period_ns == 5 * MS
-
-
-def test_scans_that_were_held_up_and_come_in_a_burst_change_no_period():
-    assert followed([10] * 40 + [400] + [0.3] * 39 + [10] * 5).period_ns == 10 * MS
-
-
-def test_a_sensor_that_has_become_much_faster_is_believed_in_the_end():
-    assert followed([10] * 40 + [0.5] * (LONGEST_BURST + 40)).period_ns == MS // 2
-
-
-def test_scans_of_one_read_are_no_interval():
-    assert followed([10, 0, 10, 0, 10, 0, 10, 0, 10]).period_ns == 10 * MS
-
-
-def test_a_given_rate_is_the_period_from_the_start():
-    assert Cadence(100).period_ns == followed([3] * 50, rate_hz=100).period_ns == 10 * MS
+@pytest.mark.parametrize(
+    ("intervals_ms", "period_ms"),
+    [
+        ([10] * (FEWEST_INTERVALS - 1), None),
+        ([10] * FEWEST_INTERVALS, 10),
+        ([9, 11, 10, 10, 900, 10, 1, 9, 11], 10),  # the median of what came
+        ([20] * 40 + [5] * 31, 5),
+        ([10] * 40 + [400] + [0.3] * 39 + [10] * 5, 10),  # scans that were held up come in a burst
+        ([10] * 40 + [0.5] * (LONGEST_BURST + 40), 0.5),  # a sensor that has become much faster
+        ([10, 0, 10, 0, 10, 0, 10, 0, 10], 10),  # scans of one read
+    ],
+)
+def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
+    period_ns = followed(intervals_ms).period_ns
+    assert period_ns == (None if period_ms is None else period_ms * MS)
+    assert Cadence(100).period_ns == followed(intervals_ms, rate_hz=100).period_ns == 10 * MS
 
 
 def test_a_pattern_is_late_after_one_period_and_not_before():
     cadence = followed([10] * 9)
-    assert not cadence.late(10_000)
-    assert cadence.late(10_000.001)
-    assert not Cadence().late(1e9)
+    assert not cadence.late(10_000) and cadence.late(10_000.001) and not Cadence().late(1e9)
 
 
 def missed(*scans):

@@ -1,13 +1,13 @@
 """Estimates for dead taxels: exact where they must be, better than none where they are measured, and reported."""
 
-import json
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract
 from numpy.typing import NDArray
+from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.errors import EdgeError
 from edge.evaluation.metrics import psnr_db
@@ -16,14 +16,12 @@ from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
-from edge.perception.runtime import Runtime
-from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, STUCK_SCANS
-from edge.sinks.jsonl import record_line
+from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)
-PRESS = 3000
+TAKEN = replace(BASELINE, origin="start-up")
 
 
 @cache
@@ -43,9 +41,6 @@ def pushed(runtime, rows):
     return [runtime.push(series.close(row.astype(np.int32), n * PERIOD_NS)) for n, row in enumerate(rows)]
 
 
-TAKEN = replace(BASELINE, origin="start-up")
-
-
 def noisy(scans, *, z_counts=0.0, seed=0):
     """A pad pressed with so much on nearly every taxel: nothing that a simulated tap looks like."""
     rows = REST + np.rint(np.random.default_rng(seed).normal(0, 2, (scans, *REST.shape)))
@@ -60,22 +55,16 @@ def one_way(shape) -> NDArray[np.float64]:
     return np.kron(np.diag([1.0, 1.0, 4.0]), np.outer(shape, shape)).astype(np.float64)
 
 
-def test_readings_drawn_from_a_covariance_are_estimated_without_error_where_the_others_tell_all():
-    shape = np.random.default_rng(0).uniform(500, 1500, 16)
-    filler = TaxelEstimator(one_way(shape)[None], GRID).filler(dead(1, 6, 11))
-    counts = np.outer([0.3, -0.2, 2.0], shape).astype(np.float32).reshape(3, 4, 4)
-    told = filler(np.where(dead(1, 6, 11), 1e6, counts).astype(np.float32))
+@pytest.mark.parametrize(("taxels", "kind"), [((1, 6, 11), 0), ((1, 6), 1)])
+def test_the_dead_are_estimated_by_the_kind_of_contact_that_the_living_show(taxels, kind):
+    """Without error, where the others tell all."""
+    shapes = np.random.default_rng(0).uniform(500, 1500, (2, 16)) * [[1], [-1]]
+    filler = TaxelEstimator(np.stack([one_way(shape) for shape in shapes]), GRID).filler(dead(*taxels))
+    counts = np.outer([0.3, -0.2, 2.0], shapes[kind]).astype(np.float32).reshape(3, 4, 4)
+    told = filler(np.where(dead(*taxels), 1e6, counts).astype(np.float32))
     assert told.filled == "neighbours" and told.z_counts == pytest.approx(counts[2].sum(), rel=0.01)
     np.testing.assert_allclose(told.counts, counts, rtol=0.02)
-    np.testing.assert_array_equal(told.counts[:, ~dead(1, 6, 11)], counts[:, ~dead(1, 6, 11)])
-
-
-@pytest.mark.parametrize("kind", [0, 1])
-def test_what_dead_taxels_read_is_estimated_by_the_kind_of_contact_that_the_living_ones_show(kind):
-    shapes = np.random.default_rng(0).uniform(-1500, 1500, (2, 16))
-    filler = TaxelEstimator(np.stack([one_way(shape) for shape in shapes]), GRID).filler(dead(1, 6))
-    counts = np.outer([0.3, -0.2, 2.0], shapes[kind]).astype(np.float32).reshape(3, 4, 4)
-    np.testing.assert_allclose(filler(counts).counts, counts, rtol=0.02)
+    np.testing.assert_array_equal(told.counts[:, ~dead(*taxels)], counts[:, ~dead(*taxels)])
 
 
 @pytest.mark.parametrize("taxels", [(5,), (0,), (5, 6), (0, 3, 9, 14)])
@@ -83,19 +72,12 @@ def test_a_field_that_varies_little_is_estimated_from_neighbours(taxels):
     rows, cols = np.indices(GRID)
     z = 1000 + 40 * rows - 60 * cols
     counts = np.stack([0 * z, 0 * z, z]).astype(np.float32)
-    told = estimator().filler(dead(*taxels))(np.where(dead(*taxels), np.nan, counts).astype(np.float32))
-    assert told.filled == "neighbours"
+    counts[:, dead(*taxels)] = np.nan
+    told, twice = (estimator().filler(dead(*taxels))(factor * counts) for factor in (1, 2))
     np.testing.assert_allclose(told.counts[2], z, atol=150)
     assert told.z_counts == pytest.approx(float(told.counts[2].sum()))
-
-
-def test_an_estimate_grows_with_what_it_is_made_of():
-    counts = np.random.default_rng(1).normal(0, 300, (3, *GRID)).astype(np.float32)
-    filler = estimator().filler(dead(3, 8))
-    once, twice = filler(counts), filler(2 * counts)
-    assert once.filled == twice.filled
-    np.testing.assert_allclose(twice.counts, 2 * once.counts, rtol=1e-5)
-    assert filler(0 * counts).z_counts == 0
+    np.testing.assert_allclose(twice.counts, 2 * told.counts, rtol=1e-5)
+    assert told.filled == twice.filled == "neighbours"
 
 
 def test_of_simulated_taps_the_force_is_told_better_than_with_nothing_in_place_of_the_dead():
@@ -119,84 +101,51 @@ def test_covariances_that_are_none_are_refused(covariances):
         TaxelEstimator(covariances, GRID)
 
 
-def test_a_file_that_is_none_is_refused(tmp_path):
+def test_a_file_that_is_none_and_a_pad_without_a_living_taxel_are_refused(tmp_path):
     with pytest.raises(EdgeError, match=r"taxels\.npz cannot be read"):
         load_estimator(tmp_path / "taxels.npz", GRID)
-
-
-def test_with_no_taxel_alive_nothing_is_estimated():
     with pytest.raises(EdgeError, match="16 dead taxels"):
         estimator().filler(dead(*range(16)))
 
 
-def test_a_record_says_what_the_pattern_was_made_without():
-    runtime = Runtime(FakeModel(), source="device", baselines={"4": TAKEN}, estimator=estimator())
-    rows = noisy(2 * STUCK_SCANS + 1, z_counts=1000)
-    rows[1:, :, 0, 3] = rows[0, :, 0, 3] + 300
-    *_, last = pushed(runtime, rows)
-    record = json.loads(record_line(last, {}))
-    assert record["state"] == "contact" and record["pattern"] is not None
-    assert record["dead"] == {"3": "stuck"} and record["filled"] == "neighbours"
-    assert record["note"] == "taxel 3 stuck: estimated from its neighbours; not checked: the model has no checks"
-    assert record["force_counts"] == pytest.approx(16_000, rel=0.02)
-    assert last.pattern is not None and last.pattern[5, 35] == pytest.approx(1, rel=0.15)
-
-
 @pytest.mark.parametrize(("stuck", "state"), [(1, "contact"), (8, "contact"), (9, "incomplete"), (16, "incomplete")])
 def test_more_than_half_dead_and_no_pattern_is_made(stuck, state):
-    runtime = Runtime(FakeModel(), source="device", baselines={"4": TAKEN}, estimator=estimator())
     rows = noisy(FROZEN_SCANS + 5, z_counts=1000)
     rows.reshape(len(rows), 3, 16)[:, :, :stuck] = rows[0].reshape(3, 16)[:, :stuck]
-    *_, last = pushed(runtime, rows)
+    *_, last = pushed(make_runtime(baselines={"4": TAKEN}, estimator=estimator()), rows)
     assert (last.state, len(last.dead)) == (state, stuck) and set(last.dead.values()) == {"stuck"}
     assert (last.pattern is None) == (state != "contact")
     assert ("no pattern" in str(last.note)) == (state != "contact")
 
 
 def test_deviations_are_wider_the_more_taxels_are_dead():
-    runtime = Runtime(
-        FakeModel(make_contract(interval_factor=1.6)), source="device", baselines={"4": BASELINE}, estimator=estimator()
-    )
-    whole = runtime.push(make_scan(0, press_counts=PRESS))
-    lost = range(1, HOLD_SCANS + 2)
-    less = [runtime.push(make_scan(number, press_counts=PRESS, absent=(0, 15))) for number in lost][-1]
-    assert whole.deviation is not None and less.deviation is not None and less.pattern is not None
+    pad = Pushed(make_runtime(FakeModel(make_contract(interval_factor=1.6)), estimator=estimator()))
+    pad.push(PRESS)
+    less = [pad.push(PRESS, absent=(0, 15)) for _ in range(HOLD_SCANS + 1)][-1]
+    assert less.deviation is not None and less.pattern is not None
     np.testing.assert_allclose(less.deviation, WIDENING[2] * 0.01 * (1 + np.abs(less.pattern)), rtol=1e-5)
     assert list(WIDENING) == sorted(WIDENING) and WIDENING[0] == 1 and len(WIDENING) == 9
 
 
 def test_earlier_taps_are_forgotten_when_a_taxel_dies_and_when_it_is_believed_again():
     """A window never holds readings of an undetected dead taxel, or filled in ones, without a note."""
-    runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE}, estimator=estimator())
-    used: list[int] = []
-    presses = [PRESS, PRESS, 0] * 12
-    for number, press in enumerate(presses):
-        absent = (0,) if 10 <= number < 10 + HOLD_SCANS + 1 else ()
-        used.append(runtime.push(make_scan(number, press_counts=press, absent=absent)).taps_used)
-    dies, lives = 10 + HOLD_SCANS, 10 + HOLD_SCANS + BACK_SCANS
-    assert used[dies - 3 : dies] == [4, 4, 0][dies % 3 :] + [4, 4, 0][: dies % 3]
-    assert max(used[dies : dies + 3]) == 1
+    pad, dies = Pushed(make_runtime(estimator=estimator())), 10 + HOLD_SCANS
+    for number, press in enumerate([PRESS, PRESS, 0] * 12):
+        pad.push(press, absent=(0,) if 10 <= number <= dies else ())
+    used, lives = [result.taps_used for result in pad.results], dies + BACK_SCANS
+    assert max(used[dies - 3 : dies]) == 4 and max(used[dies : dies + 3]) == 1
     assert max(used[lives : lives + 3]) == 1 < max(used[lives - 3 : lives])
 
 
 def test_patterns_with_dead_taxels_found_are_better_than_with_what_they_send():
     frozen, model = load_frozen_set(BUNDLE_DIR / "frozen.npz"), ModelSession(find_model(DEFAULT_MODEL))
-    frames = np.arange(15, len(frozen), 16)[::2]
     found, unfound = [], []
-    for frame in frames:
-        held = REST + frozen.newest[frame]
-        rows = held + np.rint(np.random.default_rng(frame).normal(0, 1, (STUCK_SCANS + 3, *REST.shape)))
+    for frame in np.arange(15, len(frozen), 16)[::4]:
+        rows = REST + frozen.newest[frame] + np.rint(np.random.default_rng(frame).normal(0, 1, (23, *REST.shape)))
         rows[1:, :, 1, 2] = [16_300, 16_500, 40_000]
         for told, use in ((found, estimator()), (unfound, None)):
-            runtime = Runtime(
-                model,
-                source="replay",
-                baselines={"4": BASELINE},
-                estimator=use,
-                options=RuntimeOptions(every_scan=True),
-            )
-            results = pushed(runtime, rows)
-            result = results[-1] if use else results[2]
+            runtime = make_runtime(model, estimator=use, options=RuntimeOptions(every_scan=True))
+            result = pushed(runtime, rows[: 23 if use else 3])[-1]
             assert result.pattern is not None and bool(result.dead) == (use is not None)
             truth = frozen.unit_patterns[frozen.tap[frame]] * np.float32(frozen.indentation_mm[frame])
             told.append(psnr_db(result.pattern[None], truth[None].astype(np.float32), frozen.full_scale_mm)[0])

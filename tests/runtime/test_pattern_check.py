@@ -34,48 +34,37 @@ def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> Verdict:
     return check.judge(number, tap, pattern, deviation, model.traction, repeats)
 
 
+LEAST = LEAST_COUNTS / CONTRACT.counts_per_unit[2]
+
+
 class TestReasons:
-    def test_a_pattern_that_explains_familiar_readings_is_believed(self):
-        verdict = judge(make_check(), make_tap())
-        assert verdict.trusted is True and verdict.reason is None and verdict.checked
-        assert verdict.mismatch == pytest.approx(0, abs=1e-6)
-
-    def test_a_contact_that_is_too_light_is_not_checked(self):
-        least = LEAST_COUNTS / CONTRACT.counts_per_unit[2]
-        light = judge(make_check(), make_tap(0.99 * least, x=3), factor=5)
-        assert (light.trusted, light.reason, light.mismatch, light.checked) == (None, None, None, False)
-        assert judge(make_check(), make_tap(1.01 * least, x=3)).trusted is False
-
-    def test_a_taxel_is_stuck_from_the_fifth_repeat_on(self):
-        assert judge(make_check(), make_tap(), repeats=REPEATS - 1).trusted is True
-        stuck = judge(make_check(), make_tap(), repeats=REPEATS)
-        assert (stuck.trusted, stuck.reason) == (False, "stuck") and REPEATS == 5
-
-    def test_a_taxel_is_stuck_in_a_light_contact_too(self):
-        stuck = judge(make_check(), make_tap(0.01), repeats=REPEATS)
-        assert (stuck.trusted, stuck.reason) == (False, "stuck")
-
-    def test_readings_of_no_contact_are_unfamiliar_whatever_the_force(self):
-        for z in (0.5, 2.0, 3.5):
-            assert judge(make_check(), make_tap(z, x=0.4)).trusted is True
-            strange = judge(make_check(), make_tap(z, x=0.6))
-            assert (strange.trusted, strange.reason) == (False, "unfamiliar")
-
-    def test_a_pattern_that_does_not_explain_its_readings_is_told(self):
-        wrong = judge(make_check(), make_tap(), factor=2)
-        assert (wrong.trusted, wrong.reason) == (False, "unexplained")
-        assert wrong.mismatch is not None and wrong.mismatch > MOST_MISMATCH
-
-    @pytest.mark.parametrize(("z", "limit"), [(0.2, 0.519), (1.0, 0.61), (3.0, 0.681)])
-    def test_a_pattern_that_the_model_is_not_sure_of_is_told_the_sooner_the_lighter_it_is(self, z, limit):
-        assert judge(make_check(), make_tap(z), doubt=limit - 0.01).trusted is True
-        unsure = judge(make_check(), make_tap(z), doubt=limit + 0.01)
-        assert (unsure.trusted, unsure.reason) == (False, "uncertain")
+    @pytest.mark.parametrize(
+        ("tap", "how", "trusted", "reason"),
+        [
+            (make_tap(), {}, True, None),
+            (make_tap(0.99 * LEAST, x=3), {"factor": 5}, None, None),  # too light to be checked
+            (make_tap(1.01 * LEAST, x=3), {}, False, "unfamiliar"),
+            (make_tap(), {"repeats": REPEATS - 1}, True, None),
+            (make_tap(), {"repeats": REPEATS}, False, "stuck"),
+            (make_tap(0.01), {"repeats": REPEATS}, False, "stuck"),  # in a light contact, too
+            *((make_tap(z, x=0.4), {}, True, None) for z in (0.5, 2.0, 3.5)),
+            *((make_tap(z, x=0.6), {}, False, "unfamiliar") for z in (0.5, 2.0, 3.5)),  # whatever the force
+            (make_tap(), {"factor": 2}, False, "unexplained"),
+            # The lighter it is, the sooner it is told that the model is not sure.
+            *((make_tap(z), {"doubt": limit - 0.01}, True, None) for z, limit in ((0.2, 0.519), (3.0, 0.681))),
+            *((make_tap(z), {"doubt": limit + 0.01}, False, "uncertain") for z, limit in ((0.2, 0.519), (3.0, 0.681))),
+        ],
+    )
+    def test_a_pattern_is_believed_or_not_for_a_reason(self, tap, how, trusted, reason):
+        verdict = judge(make_check(), tap, **how)
+        assert (verdict.trusted, verdict.reason) == (trusted, reason) and REPEATS == 5
+        if trusted:
+            assert verdict.checked and verdict.mismatch == pytest.approx(0, abs=1e-6)
+        if reason == "unexplained":
+            assert verdict.mismatch is not None and verdict.mismatch > MOST_MISMATCH
 
     def test_without_traction_readings_are_still_checked(self):
-        check, tap = make_check(), make_tap(x=1)
-        pattern = np.ones((40, 40), dtype=np.float32)
-        verdict = check.judge(0, tap, pattern, None, None, 0)
+        verdict = make_check().judge(0, make_tap(x=1), np.ones((40, 40), dtype=np.float32), None, None, 0)
         assert (verdict.mismatch, verdict.reason) == (None, "unfamiliar")
 
     @pytest.mark.parametrize("low", [0.0, 0.5])
@@ -88,18 +77,21 @@ class TestReasons:
             tap[2][place] = 2
             assert judge(make_check(), tap).trusted is True
 
-    @pytest.mark.parametrize(("z", "taxels"), [(6.6, 1), (3.7, 16)])
-    def test_a_press_stronger_than_in_training_is_told(self, z, taxels):
-        for factor, reason in ((1.0, "beyond"), (0.95, None)):
-            tap = make_tap()
-            tap[2] = 0
-            tap[2].flat[:taxels] = factor * z
-            assert judge(make_check(make_trusted_contract(output_full_scale=10.0)), tap).reason == reason
-
-    def test_a_pattern_deeper_than_in_training_is_told(self):
-        for full_scale, reason in ((1.8, "beyond"), (1.9, None)):
-            check = make_check(make_trusted_contract(output_full_scale=full_scale))
-            assert judge(check, make_tap(2.0)).reason == reason
+    @pytest.mark.parametrize(
+        ("z", "taxels", "full_scale", "reason"),
+        [
+            (6.6, 1, 10.0, "beyond"),
+            (6.27, 1, 10.0, None),
+            (3.7, 16, 10.0, "beyond"),
+            (3.5, 16, 10.0, None),
+            (2.0, 16, 1.8, "beyond"),
+            (2.0, 16, 1.9, None),
+        ],
+    )
+    def test_a_press_stronger_or_deeper_than_in_training_is_told(self, z, taxels, full_scale, reason):
+        tap = make_tap(0)
+        tap[2].flat[:taxels] = z
+        assert judge(make_check(make_trusted_contract(output_full_scale=full_scale)), tap).reason == reason
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_what_is_not_finite_is_never_believed(self, bad):
@@ -109,136 +101,93 @@ class TestReasons:
             kept = place.flat[-1]
             place.flat[-1] = bad
             with np.errstate(all="ignore"):
-                assert make_check().judge(0, tap, pattern, deviation, traction, 0).trusted is not True
+                verdict = make_check().judge(0, tap, pattern, deviation, traction, 0)
+            assert verdict.trusted is not True and (place is not tap or verdict.reason == "unfamiliar")
             place.flat[-1] = kept
-
-    def test_readings_that_are_not_finite_are_of_no_contact(self):
-        tap = make_tap()
-        tap[0, 0, 0] = np.nan
-        assert make_check().judge(0, tap, np.ones((40, 40), dtype=np.float32), None, None, 0).reason == "unfamiliar"
 
     @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
     def test_readings_of_any_size_give_a_verdict(self, scale):
-        verdict = judge(make_check(), make_tap(2 * scale))
-        assert (verdict.trusted, verdict.reason) == ((None, None) if scale < 0.1 else (False, "beyond"))
-        assert verdict.mismatch is None or np.isfinite(verdict.mismatch)
-        wrong = judge(make_check(), make_tap(2 * scale), factor=3)
-        assert wrong.trusted is (None if scale < 0.1 else False)
+        for factor in (1, 3):
+            verdict = judge(make_check(), make_tap(2 * scale), factor=factor)
+            assert verdict.trusted is (None if scale < 0.1 else False)
+            assert verdict.mismatch is None or np.isfinite(verdict.mismatch)
 
     def test_gains_that_are_certain_leave_less_unexplained(self):
         tap = make_tap()
         tap[2, 1, 1] *= 1.2
-        sure, unsure = make_check(), make_check()
-        certain = PatternCheck(make_trust(), CONTRACT)
+        certain, unsure = make_check(), make_check()
         certain.use_pad(np.append(PAD_ROW[:-1], np.float32(1)))
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)
-        shares = [check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, sure, unsure)]
-        assert shares[0] > shares[1] == shares[2]
+        of_certain, of_unsure = (
+            check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, unsure)
+        )
+        assert of_certain is not None and of_unsure is not None and of_certain > of_unsure
+
+
+ODD, GOOD = make_tap(x=2), make_tap()
+
+
+def suspected_after(taps, check=None, first=0):
+    """Return whether the sensor is suspected after each contact, of one scan or of several."""
+    check, told = check or make_check(), []
+    for number, tap in enumerate(taps, first):
+        for scan in tap if isinstance(tap, tuple) else (tap,):
+            judge(check, scan, number)
+        told.append(check.suspected)
+    return told
 
 
 class TestSensor:
     def test_it_is_suspected_after_several_odd_contacts_and_cleared_by_good_ones(self):
         check = make_check()
-        odd, good = make_tap(x=2), make_tap()
-        suspected = []
-        for number in range(6):
-            judge(check, odd, number)
-            suspected.append(check.suspected)
-        assert suspected[:3] == [False] * 3 and suspected[-1]
-        verdict = judge(check, good, 6)
+        told = suspected_after([ODD] * 6, check)
+        assert told[:3] == [False] * 3 and told[-1]
+        verdict = judge(check, GOOD, 6)
         assert (verdict.trusted, verdict.reason) == (False, "sensor")
-        for number in range(7, 7 + _CONTACTS):
-            judge(check, good, number)
-        assert not check.suspected and judge(check, good, 99).trusted is True
+        assert not suspected_after([GOOD] * _CONTACTS, check, first=7)[-1] and judge(check, GOOD, 99).trusted is True
 
-    def test_one_odd_contact_proves_nothing_however_long_it_goes_on(self):
-        check = make_check()
-        for _ in range(500):
-            judge(check, make_tap(x=5), 0)
-        judge(check, make_tap(), 1)
-        assert not check.suspected
+    @pytest.mark.parametrize(
+        ("taps", "suspected"),
+        [
+            ([(make_tap(x=5),) * 500, GOOD], False),  # one odd contact, however long it goes on
+            ([ODD if number % 5 == 0 else GOOD for number in range(200)], False),  # odd contacts far between
+            ([make_tap(0.05, x=5)] * 50, False),  # light touches
+            # A contact counts by its strongest scan.
+            ([(make_tap(1, x=2), make_tap(3))] * 8, False),
+            ([(make_tap(3), make_tap(1, x=2))] * 8, False),
+            ([(make_tap(3, x=2), make_tap(1))] * 8, True),
+            ([make_tap(x=np.nan)] * 3 + [ODD] * 6, True),  # what is not finite leaves the evidence as it was
+        ],
+    )
+    def test_it_takes_several_odd_contacts_in_a_row(self, taps, suspected):
+        assert any(suspected_after(taps)) == suspected
 
-    def test_odd_contacts_far_between_prove_nothing(self):
-        check = make_check()
-        for number in range(200):
-            judge(check, make_tap(x=2 if number % 5 == 0 else 0), number)
-            assert not check.suspected
-
-    def test_a_contact_counts_by_its_strongest_scan(self):
-        def suspected(*scans):
+    def test_an_hour_of_contacts_hides_nothing_longer_than_a_minute_of_them(self):
+        def contacts_until(suspected, before, count):
             check = make_check()
-            for number in range(8):
-                for tap in scans:
-                    judge(check, tap, number)
-            return check.suspected
+            suspected_after([before] * count, check)
+            after = suspected_after([ODD if suspected else GOOD] * _CONTACTS, check, first=count)
+            return after.index(suspected)
 
-        assert not suspected(make_tap(1, x=2), make_tap(3))
-        assert not suspected(make_tap(3), make_tap(1, x=2))
-        assert suspected(make_tap(3, x=2), make_tap(1))
-
-    def test_an_hour_of_odd_contacts_is_forgotten_as_soon_as_a_minute_of_them(self):
-        def contacts_until_cleared(odd):
-            check = make_check()
-            for number in range(odd):
-                judge(check, make_tap(x=2), number)
-            for number in range(_CONTACTS):
-                if not check.suspected:
-                    return number
-                judge(check, make_tap(), odd + number)
-            return None
-
-        assert contacts_until_cleared(3600) == contacts_until_cleared(20) is not None
-        assert contacts_until_cleared(20) >= 9  # it does not flicker about one level
-
-    def test_an_hour_of_good_contacts_does_not_hide_a_fault(self):
-        def contacts_until_suspected(good):
-            check = make_check()
-            for number in range(good):
-                judge(check, make_tap(), number)
-            for number in range(_CONTACTS):
-                if check.suspected:
-                    return number
-                judge(check, make_tap(x=2), good + number)
-            return None
-
-        assert contacts_until_suspected(3600) == contacts_until_suspected(1) is not None
-
-    def test_what_is_not_finite_leaves_the_evidence_as_it_was(self):
-        check, bad = make_check(), make_tap()
-        bad[0, 0, 0] = np.nan
-        for number in range(3):
-            judge(check, bad, number)
-        for number in range(3, 9):
-            judge(check, make_tap(x=2), number)
-        assert check.suspected
-
-    def test_light_touches_show_nothing(self):
-        check = make_check()
-        for number in range(50):
-            judge(check, make_tap(0.05, x=5), number)
-        assert not check.suspected
+        assert contacts_until(False, ODD, 1000) == contacts_until(False, ODD, 20) >= 8, "no flicker about one level"
+        assert contacts_until(True, GOOD, 1000) == contacts_until(True, GOOD, 1)
 
 
 class TestBelonging:
-    def test_an_earlier_tap_that_was_elsewhere_does_not_belong(self):
+    def test_an_earlier_tap_that_was_elsewhere_or_is_not_finite_does_not_belong(self):
         window = np.zeros((4, 3, 4, 4), dtype=np.float32)
         window[:, 2].reshape(4, -1)[:, FOREIGN_TAXEL] = 3, 3, 0, 3
         window[2, 2, 3, 3] = 3
         shares = make_check().belonging(window, 4)
-        assert [share >= 0.5 for share in shares] == [False, True, False]
-        assert strangers(shares, posed=True) == [2], "a tap with a pose of its own goes alone"
-        assert strangers(shares, posed=False) == [2, 3]
-        assert all(0 <= share <= 1 for share in shares)
-
-    def test_only_taps_that_are_there_are_asked_for(self):
-        window = np.ones((4, 3, 4, 4), dtype=np.float32)
+        assert [share >= 0.5 for share in shares] == [False, True, False] and all(0 <= one <= 1 for one in shares)
         assert len(make_check().belonging(window, 3)) == 2 and make_check().belonging(window, 1) == []
-        for posed in (False, True):
-            assert strangers([], posed=posed) == strangers([0.1, 0.49], posed=posed) == []
-            assert strangers([0.5], posed=posed) == [1]
-
-    def test_a_tap_that_is_not_finite_does_not_belong(self):
-        window = np.ones((4, 3, 4, 4), dtype=np.float32)
         window[1, 0, 0, 0] = np.nan
-        assert strangers(make_check().belonging(window, 4), posed=True)[0] == 1
+        assert make_check().belonging(window, 4)[0] >= 0.5
+
+    @pytest.mark.parametrize(
+        ("shares", "alone", "with_those_before"),
+        [([0.1, 0.9, 0.2], [2], [2, 3]), ([], [], []), ([0.1, 0.49], [], []), ([0.5], [1], [1])],
+    )
+    def test_a_tap_with_a_pose_of_its_own_goes_alone(self, shares, alone, with_those_before):
+        assert strangers(shares, posed=True) == alone and strangers(shares, posed=False) == with_those_before

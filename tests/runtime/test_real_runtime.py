@@ -1,34 +1,26 @@
-"""Real recordings through the whole road: emulated controller, pseudo-terminal, `edge-sr`, records."""
+"""A real recording through the whole road: emulated controller, pseudo-terminal, `edge-sr`, records."""
+# pyright: reportArgumentType=false
 
 import json
-import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from bridge_samples import undisturbed
+from bridge_samples import REAL_RECORDINGS, undisturbed
 from edge_samples import ROOT, write_model
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
-RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
-TRIALS = sorted(path.name for path in RECORDINGS.glob("data_sample_*")) if RECORDINGS.is_dir() else []
-RELEASED = "data_sample_2022-02-22-08-10-01"
+TRIAL = REAL_RECORDINGS / "data_sample_2022-02-22-08-10-01"
+"""Two fingers that grip from the start and let go at the end."""
 SENSORS = ("4", "6")
 BASELINE_ROWS = 20
 
-pytestmark = pytest.mark.skipif(not TRIALS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
-
-
-def counts_of(trial):
-    """Raw counts (n, 3, 4, 4) of both fingers."""
-    return [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv").tracks[0].counts for n in (1, 2)]
+pytestmark = pytest.mark.skipif(not TRIAL.is_dir(), reason=f"no real recordings at {TRIAL} (TACTILE_RECORDINGS)")
 
 
 class Played(NamedTuple):
@@ -36,17 +28,9 @@ class Played(NamedTuple):
     lost_frames: int
 
 
-def play(trial, folder) -> Played:
-    """Records of `edge-sr` for one trial, both fingers at once at the recorded rate."""
-    baselines = [
-        Baseline.from_counts(sensor, counts[-BASELINE_ROWS:], created_unix_s=1.0)
-        for sensor, counts in zip(SENSORS, counts_of(trial), strict=True)
-    ]
-    save_baselines(folder / f"{trial}.json", baselines)
-    tracks = [load_recording(RECORDINGS / trial / f"xela_sensor{n}.csv") for n in (1, 2)]
-    with Emulator(tracks, controllers=[4, 6]) as emulator:
-        options = ["--model", folder / "tiny.onnx", "--baseline", folder / f"{trial}.json", "--sink", "jsonl:-"]
-        options += ["--give-up-s", "0"]
+def play(tracks, options) -> Played:
+    """Return the records of `edge-sr` by sensor, at twice the recorded rate."""
+    with Emulator(tracks, controllers=[4, 6], rate_hz=120) as emulator:
         done = subprocess.run(
             [sys.executable, "-m", "edge.cli.main", "--source", f"slcan:{emulator.port}", *map(str, options)],
             cwd=ROOT,
@@ -63,54 +47,35 @@ def play(trial, folder) -> Played:
     return Played(by_sensor, lost_frames)
 
 
-@pytest.fixture(scope="module")
-def played(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("real")
-    write_model(folder / "tiny.onnx")
-    with ThreadPoolExecutor(len(TRIALS)) as pool:
-        told = pool.map(lambda trial: undisturbed(lambda: play(trial, folder)), TRIALS)
-        return dict(zip(TRIALS, told, strict=True))
-
-
-@pytest.mark.parametrize("trial", TRIALS)
-def test_one_record_for_every_row_none_lost_none_invented(played, trial):
-    records = played[trial].records
-    assert played[trial].lost_frames == 0, "this machine was too busy to read in time"
-    for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
-        mine = records[sensor]
-        assert [record["scan"] for record in mine] == list(range(len(counts)))
-        np.testing.assert_array_equal([record["counts"] for record in mine], counts)
-        assert {record["source"] for record in mine} == {"emulated"}
-        assert {record["fresh"] for record in mine} == {0xFFFF}
-
-
-@pytest.mark.parametrize("trial", TRIALS)
-def test_torn_and_repeated_rows_are_reported(played, trial):
-    records = played[trial].records
+def test_every_row_is_a_record_and_the_grip_ends_where_it_was_let_go(tmp_path):
+    tracks = [load_recording(TRIAL / f"xela_sensor{number}.csv") for number in (1, 2)]
+    counts_of = dict(zip(SENSORS, (one.tracks[0].counts for one in tracks), strict=True))
+    baselines = [Baseline.from_counts(sensor, counts_of[sensor][-BASELINE_ROWS:], 1.0) for sensor in SENSORS]
+    save_baselines(tmp_path / "zero.json", baselines)
+    options = ["--model", write_model(tmp_path / "tiny.onnx"), "--baseline", tmp_path / "zero.json"]
+    played = undisturbed(lambda: play(tracks, [*options, "--sink", "jsonl:-", "--give-up-s", "0"]))
+    assert played.lost_frames == 0, "this machine was too busy to read in time"
     torn = repeated = 0
-    for sensor, counts in zip(SENSORS, counts_of(trial), strict=True):
+    for sensor, counts in counts_of.items():
+        mine = played.records[sensor]
+        assert [record["scan"] for record in mine] == list(range(len(counts))), "none lost, none invented"
+        np.testing.assert_array_equal([record["counts"] for record in mine], counts)
+        assert {(record["source"], record["fresh"]) for record in mine} == {("emulated", 0xFFFF)}
         changed = (np.diff(counts, axis=0) != 0).any(axis=1).reshape(len(counts) - 1, 16)
         masks = [0xFFFF, *(int(sum(1 << int(taxel) for taxel in np.flatnonzero(row))) for row in changed)]
-        assert [record["renewed"] for record in records[sensor]] == masks
+        assert [record["renewed"] for record in mine] == masks
         torn += sum(mask not in (0, 0xFFFF) for mask in masks)
         repeated += masks.count(0)
-    counted = [one["counters"] for mine in records.values() for one in mine if "counters" in one]
-    last = max(counted, key=lambda counters: counters["scans"])
-    assert (last["torn_source"], last["repeated"], last["torn_wire"]) == (torn, repeated, 0)
-    assert torn > 0 and repeated > 0
-
-
-@pytest.mark.skipif(RELEASED not in TRIALS, reason=f"{RELEASED} is not there")
-def test_a_grip_from_the_start_is_in_doubt_and_its_end_is_seen_within_five_scans_of_the_release(played):
-    """No scan has shown the pad at rest near the stored baseline before the release, and then all are."""
-    records = played[RELEASED].records
-    for sensor, counts in zip(SENSORS, counts_of(RELEASED), strict=True):
+        # No scan has shown the pad at rest near the stored baseline before the release, and then all do.
         z_counts = (counts[:, 2] - np.median(counts[-BASELINE_ROWS:, 2], axis=0)).sum(axis=(1, 2))
-        # Released: the first row with less than half of the grip that the trial starts with.
         release = int(np.argmax(z_counts < z_counts[0] / 2))
-        states = [record["state"] for record in records[sensor]]
+        states = [record["state"] for record in mine]
         end = states.index("idle")
         assert 0 <= end - release <= 5
         assert set(states[:end]) <= {"baseline_in_doubt", "contact"} and set(states[end:]) == {"idle"}
         assert set(states[: release - 1]) == {"baseline_in_doubt"}
-        assert not any(record["trusted"] for record in records[sensor][: release - 1])
+        assert not any(record["trusted"] for record in mine[: release - 1])
+    counted = [one["counters"] for mine in played.records.values() for one in mine if "counters" in one]
+    last = max(counted, key=lambda counters: counters["scans"])
+    assert (last["torn_source"], last["repeated"], last["torn_wire"]) == (torn, repeated, 0)
+    assert torn > 0 and repeated > 0

@@ -1,12 +1,14 @@
-"""Dead taxels: detected, named, trusted again; and what is not one."""
+"""Dead taxels: detected, named, held for a while, trusted again; and what is not one."""
+# pyright: reportOperatorIssue=false, reportOptionalMemberAccess=false
 
-import os
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from bridge_samples import REAL_RECORDINGS
 from chaos_judge import HELD_CYCLES, RATE_HZ
-from edge_samples import BASELINE, PERIOD_NS, REST, ROOT
+from edge_samples import BASELINE, PERIOD_NS, REST, make_scan
+from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.inference.bundled import demo_recording
 from edge.perception.event import joined
@@ -18,6 +20,7 @@ from edge.perception.taxel_health import (
     HOLD_NS,
     HOLD_SCANS,
     LONE_COUNTS,
+    RANGE_ENDS,
     REST_COUNTS,
     STUCK_SCANS,
     TAXEL_SILENT_SCANS,
@@ -27,10 +30,8 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
-from firmware_bridge.zeroing.baseline import Baseline, deformation
+from firmware_bridge.zeroing.baseline import Baseline
 
-RECORDINGS = Path(os.environ.get("TACTILE_RECORDINGS", ROOT / "../shared/recordings/imanlab"))
-NOISE_COUNTS = 2.0
 SPHERE_SHARE = 0.030
 """Reading of the largest neighbour as a share of the taxel under a sphere of 1.5 mm, simulated."""
 
@@ -38,7 +39,7 @@ SPHERE_SHARE = 0.030
 class Pad:
     """A watched pad with noise; `faults` change a scan's counts (3, 16) in place."""
 
-    def __init__(self, baseline=BASELINE, seed=0, noise_counts=NOISE_COUNTS):
+    def __init__(self, baseline=BASELINE, seed=0, noise_counts=2.0):
         self.watch = TaxelWatch((4, 4))
         self._baseline = baseline
         self._series = ScanSeries("4", USPA44)
@@ -57,6 +58,9 @@ class Pad:
             self.watch.push(self._series.close(counts, self._number * PERIOD_NS), self._baseline)
             told.append(dict(self.watch.reasons))
         return told
+
+    def note(self, filled=None):
+        return joined(self.watch.notes(filled)) or ""
 
 
 def at(taxel, *readings):
@@ -84,123 +88,129 @@ def shifted(taxel, z_counts):
     return pressed(taxel, z_counts, share=0)
 
 
-@pytest.mark.parametrize(
-    ("fault", "reason", "after"),
-    [
-        (silent(7), "silent", HOLD_SCANS),
-        (at(7, 16_000, 16_000, 65535), "saturated", HOLD_SCANS),
-        (at(7, 16_100, 16_500, 38_900), "stuck", STUCK_SCANS),
-        (shifted(7, -8000), "far", FAR_SCANS - 1),
-    ],
-)
-def test_a_dead_taxel_is_named_after_so_many_scans_and_believed_after_good_ones(fault, reason, after):
-    pad = Pad()
-    assert not any(pad.read(50))
-    assert pad.read(after, fault) == [{}] * after
-    assert pad.read(30, fault) == [{7: reason}] * 30
-    assert pad.watch.dead.ravel().tolist() == [taxel == 7 for taxel in range(16)]
-    back = pad.read(BACK_SCANS + 5)
-    assert back[: BACK_SCANS - 1] == [{7: reason}] * (BACK_SCANS - 1)
-    assert back[-1] == {}
+STUCK = (16_000, 16_400, 38_700)
 
 
-@pytest.mark.parametrize("reason", ["silent", "stuck"])
-def test_one_that_comes_and_goes_does_not_flicker(reason):
-    fault = silent(3) if reason == "silent" else at(3, 1, 2, 3)
-    pad = Pad()
-    pad.read(5)
-    pad.read(40, fault)
-    for _ in range(10):
-        assert pad.read(BACK_SCANS - 2) + pad.read(2, fault) == [{3: reason}] * BACK_SCANS
-
-
-def test_a_sensor_that_sends_one_scan_for_ever_is_frozen_after_ten():
-    pad = Pad(noise_counts=0)
-    assert not any(pad.read(FROZEN_SENSOR_SCANS))
-    assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
-    assert not pad.watch.may_be_estimated
-    assert joined(pad.watch.notes(None)) == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
-
-
-@pytest.mark.parametrize(
-    ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, FROZEN_SCANS)]
-)
-def test_the_stuck_are_found_among_the_few_that_are_left(stuck, after):
-    pad = Pad()
-    pad.read(5)
-    told = pad.read(after + 5, *(at(taxel, 16_000, 16_400, 38_700) for taxel in range(stuck)))
-    # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
-    assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
-    assert pad.watch.may_be_estimated == (stuck <= 8)
-
-
-def test_the_dead_do_not_count_among_those_that_should_be_new():
-    pad = Pad()
-    pad.read(5)
-    dead = [silent(taxel) for taxel in range(8)]
-    pad.read(STUCK_SCANS, *dead)
-    stuck = [at(taxel, 16_000, 16_400, 38_700) for taxel in range(8, 14)]
-    assert len(pad.read(STUCK_SCANS + 5, *dead, *stuck)[-1]) == 14
-
-
-def test_half_of_the_taxels_silent_are_a_wrong_id_map():
-    pad = Pad()
-    pad.read(TAXEL_SILENT_SCANS, *(silent(taxel) for taxel in range(8)))
-    assert not pad.watch.may_be_estimated
-    assert joined(pad.watch.notes(None)) == "no pattern, taxel 0, 1, 2, 3, 4, 5, 6, 7 silent: try another --id-map"
-
-
-def test_a_taxel_alone_far_from_rest_is_not_pressed():
-    pad = Pad()
-    assert pad.read(FAR_SCANS, shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far"}
-    # While something is touched it may be as it should; it is believed once it is seen at rest.
-    assert pad.read(50, pressed(5, 3 * REST_COUNTS))[-1] == {5: "far"}
-    assert pad.read(BACK_SCANS)[-1] == {}
-
-
-def test_what_a_dead_taxel_last_read_hides_no_other_one():
-    pad = Pad()
-    pad.read(5, pressed(7, 8000))
-    pad.read(HOLD_SCANS + 1, silent(7))
-    assert pad.read(FAR_SCANS, silent(7), shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far", 7: "silent"}
-
-
-@pytest.mark.parametrize("taxel", [0, 5, 15])
-def test_a_small_sphere_on_one_taxel_is_not_a_fault(taxel):
-    assert not any(Pad().read(3 * FAR_SCANS, pressed(taxel, 3000, share=SPHERE_SHARE)))
-
-
-def test_a_taxel_that_was_never_heard_is_waited_for_then_given_up():
-    pad = Pad()
-    pad.read(1, silent(2))
-    assert pad.watch.waiting
-    assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"}
-    assert not pad.watch.waiting
-
-
-def test_a_taxel_without_rest_is_never_believed():
-    counts = BASELINE.counts.copy()
-    counts[:, 1, 2] = np.nan
-    pad = Pad(Baseline.of("4", counts, 0.0, 100, "start-up"))
-    assert pad.read(50)[-1] == {6: "unzeroed"}
-
-
-def test_an_hour_of_noise_raises_nothing():
-    """Ten thousand scans stand for it: no taxel came nearer to stuck than four scans in a row."""
-    pad = Pad(seed=3)
-    assert not any(pad.read(10_000))
-
-
-def test_what_is_told():
-    pad = Pad()
-    pad.read(STUCK_SCANS + 3, at(3, 1, 2, 3), silent(7))
-    (estimated,) = pad.watch.notes("neighbours")
-    assert estimated.kind == "estimated" and estimated.text in (
-        "taxel 7 silent, taxel 3 stuck: estimated from their neighbours",
-        "taxel 3 stuck, taxel 7 silent: estimated from their neighbours",
+class TestWatch:
+    @pytest.mark.parametrize(
+        ("fault", "reason", "after"),
+        [
+            (silent(7), "silent", HOLD_SCANS),
+            (at(7, 16_000, 16_000, 65535), "saturated", HOLD_SCANS),
+            (at(7, 16_100, 16_500, 38_900), "stuck", STUCK_SCANS),
+            (shifted(7, -8000), "far", FAR_SCANS - 1),
+        ],
     )
-    told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
-    assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
+    def test_a_dead_taxel_is_named_after_so_many_scans_and_believed_after_good_ones(self, fault, reason, after):
+        pad = Pad()
+        assert not any(pad.read(50))
+        assert pad.read(after, fault) == [{}] * after
+        assert pad.read(30, fault) == [{7: reason}] * 30
+        assert pad.watch.dead.ravel().tolist() == [taxel == 7 for taxel in range(16)]
+        back = pad.read(BACK_SCANS + 5)
+        assert back[: BACK_SCANS - 1] == [{7: reason}] * (BACK_SCANS - 1) and back[-1] == {}
+
+    @pytest.mark.parametrize(("fault", "reason"), [(silent(3), "silent"), (at(3, 1, 2, 3), "stuck")])
+    def test_one_that_comes_and_goes_does_not_flicker(self, fault, reason):
+        pad = Pad()
+        pad.read(5)
+        pad.read(40, fault)
+        for _ in range(10):
+            assert pad.read(BACK_SCANS - 2) + pad.read(2, fault) == [{3: reason}] * BACK_SCANS
+
+    def test_a_sensor_that_sends_one_scan_for_ever_is_frozen_after_ten(self):
+        pad = Pad(noise_counts=0)
+        assert not any(pad.read(FROZEN_SENSOR_SCANS))
+        assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
+        assert not pad.watch.may_be_estimated
+        assert pad.note() == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
+
+    @pytest.mark.parametrize(
+        ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, FROZEN_SCANS)]
+    )
+    def test_the_stuck_are_found_among_the_few_that_are_left(self, stuck, after):
+        pad = Pad()
+        pad.read(5)
+        told = pad.read(after + 5, *(at(taxel, *STUCK) for taxel in range(stuck)))
+        # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
+        assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
+        assert pad.watch.may_be_estimated == (stuck <= 8)
+
+    def test_the_dead_do_not_count_among_those_that_should_be_new(self):
+        pad = Pad()
+        pad.read(5)
+        dead = [silent(taxel) for taxel in range(8)]
+        pad.read(STUCK_SCANS, *dead)
+        assert len(pad.read(STUCK_SCANS + 5, *dead, *(at(taxel, *STUCK) for taxel in range(8, 14)))[-1]) == 14
+
+    def test_a_taxel_alone_far_from_rest_is_not_pressed(self):
+        pad = Pad()
+        assert pad.read(FAR_SCANS, shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far"}
+        # While something is touched it may be as it should; it is believed once it is seen at rest.
+        assert pad.read(50, pressed(5, 3 * REST_COUNTS))[-1] == {5: "far"}
+        assert pad.read(BACK_SCANS)[-1] == {}
+
+    def test_what_a_dead_taxel_last_read_hides_no_other_one(self):
+        pad = Pad()
+        pad.read(5, pressed(7, 8000))
+        pad.read(HOLD_SCANS + 1, silent(7))
+        assert pad.read(FAR_SCANS, silent(7), shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far", 7: "silent"}
+
+    def test_a_taxel_without_reading_or_rest_from_the_start_is_never_believed(self):
+        pad = Pad()
+        pad.read(1, silent(2))
+        assert pad.watch.waiting
+        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and not pad.watch.waiting
+        counts = BASELINE.counts.copy()
+        counts[:, 1, 2] = np.nan
+        assert Pad(Baseline.of("4", counts, 0.0, 100, "start-up")).read(50)[-1] == {6: "unzeroed"}
+
+    @pytest.mark.parametrize("taxel", [0, 5, 15])
+    def test_a_small_sphere_on_one_taxel_is_not_a_fault(self, taxel):
+        assert not any(Pad().read(3 * FAR_SCANS, pressed(taxel, 3000, share=SPHERE_SHARE)))
+
+    def test_noise_raises_nothing(self):
+        """In an hour no taxel came nearer to stuck than four scans in a row."""
+        assert not any(Pad(seed=3).read(3000))
+
+    def test_what_is_told(self):
+        pad = Pad()
+        pad.read(STUCK_SCANS + 3, at(3, 1, 2, 3), silent(7))
+        (estimated,) = pad.watch.notes("neighbours")
+        assert estimated.kind == "estimated" and estimated.text in (
+            "taxel 7 silent, taxel 3 stuck: estimated from their neighbours",
+            "taxel 3 stuck, taxel 7 silent: estimated from their neighbours",
+        )
+        told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
+        assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
+
+    def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_scan(self):
+        pad = Pad()
+        pad.read(3)
+        pad.read(1, pressed(0, 5000, share=1))
+        before = pad.watch.held[2, 1, 1]
+        assert 65535 - BASELINE.counts[2, 1, 1] < 27_000, "as a contact might read"
+        pad.read(1, pressed(0, 5000, share=1), at(5, 16_185, 16_585, 65535))
+        assert pad.watch.held[2, 1, 1] == before
+        assert "its last reading is held, taxel 5 at the end of its range" in pad.note()
+
+    def test_no_reading_is_held_for_longer_than_the_judge_of_faults_allows(self):
+        """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
+        assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
+
+    @pytest.mark.parametrize(("pause_ns", "held"), [(HOLD_NS, True), (HOLD_NS + 1, False)])
+    @pytest.mark.parametrize("torn_before", [False, True])
+    def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
+        """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
+        watch, series = TaxelWatch((4, 4)), ScanSeries("4", USPA44)
+        for number, (time_ns, taxel) in enumerate(
+            [(0, None), (PERIOD_NS, 0 if torn_before else None), (2 * PERIOD_NS, None), (2 * PERIOD_NS + pause_ns, 7)]
+        ):
+            counts = REST + number
+            if taxel is not None:
+                counts.reshape(3, 16)[:, taxel] = ABSENT
+            watch.push(series.close(counts, time_ns), BASELINE)
+        assert watch.reasons == ({} if held else {7: "silent"})
 
 
 def raised(counts, baseline):
@@ -212,66 +222,88 @@ def raised(counts, baseline):
     return [reasons for reasons in found if reasons]
 
 
-def test_the_demo_raises_nothing():
-    counts = load_recording(demo_recording()).tracks[0].counts
-    assert raised(counts, Baseline.from_counts("4", counts[:100], 0.0)) == []
+@pytest.mark.parametrize("path", [demo_recording(), *sorted(REAL_RECORDINGS.glob("*/xela_*.csv"))], ids=str)
+def test_neither_the_demo_nor_real_grips_raise_anything(path):
+    counts = load_recording(path).tracks[0].counts
+    # Zeroed in the grip, as a robot may, and where the grip has been let go.
+    for rest in (counts[:100], counts[-20:])[: 1 + (path.suffix == ".csv")]:
+        assert raised(counts, Baseline.from_counts("4", rest, 0.0)) == []
 
 
-@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
-def test_real_grips_raise_nothing():
-    paths = sorted(RECORDINGS.glob("*/xela_*.csv"))
-    assert paths
-    for path in paths:
-        counts = load_recording(path).tracks[0].counts
-        # Zeroed in the grip, as a robot may, and where the grip has been let go.
-        for rest in (counts[:100], counts[-20:]):
-            assert raised(counts, Baseline.from_counts("4", rest, 0.0)) == [], path
+def saturated(pad, counts, press=PRESS, **changes):
+    """Return the result of a scan in which taxel 5 reads so much."""
+    scan = pad.scan(press, **changes)
+    scan.counts[2].flat[5] = counts
+    return pad.runtime.push(scan)
 
 
-def test_readings_over_the_baseline_come_with_it():
-    watch, series = TaxelWatch((4, 4)), ScanSeries("4", USPA44)
-    scan = series.close(REST + 9, PERIOD_NS)
-    assert watch.push(scan, None) is None
-    np.testing.assert_array_equal(watch.push(scan, BASELINE), deformation(scan.counts, BASELINE))
+class TestRuntime:
+    def test_a_taxel_silent_from_the_start_spoils_no_zeroing_but_half_of_them_do(self):
+        pad = Pushed(make_runtime(baselines=None), noise=4)
+        states = [pad.push(absent=(0,)).state for _ in range(TAXEL_SILENT_SCANS + 100)]
+        assert states == ["zeroing"] * (TAXEL_SILENT_SCANS + 98) + ["incomplete"] * 2
+        np.testing.assert_array_equal(np.flatnonzero(np.isnan(pad.results[-1].baseline.counts[2])), [0])
+        back = [pad.push() for _ in range(2 * BACK_SCANS)][-1]
+        assert (back.state, back.dead) == ("incomplete", {0: "unzeroed"})
+        assert back.note == "no pattern, taxel 0 not zeroed: zero again"
+        pad = Pushed(make_runtime(baselines=None), noise=4)
+        assert {pad.push(absent=tuple(range(8))).state for _ in range(400)} == {"zeroing"}
 
+    def test_an_absent_taxel_keeps_its_newest_reading_for_a_while(self):
+        pad = Pushed()
+        pad.push(PRESS / 2)
+        pad.push(PRESS)
+        for _ in range(HOLD_SCANS):
+            result = pad.push(PRESS, absent=(5,))
+            assert result.state == "contact" and result.force_counts == PRESS
+        result = pad.push(PRESS, absent=(5,))
+        assert result.state == "incomplete" and result.baseline is BASELINE
+        assert result.pattern is result.contact is result.force_counts is None
+        states = [pad.push(PRESS).state for _ in range(BACK_SCANS)]
+        assert states == ["incomplete"] * (BACK_SCANS - 1) + ["contact"]
 
-def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_scan():
-    pad = Pad()
-    pad.read(3)
+    @pytest.mark.parametrize("stamped", [True, False])
+    def test_a_reading_that_came_late_is_held_since_it_was_taken(self, stamped):
+        """Readings that a delayed reader fetches together were not taken together."""
+        runtime = make_runtime()
+        runtime.push(make_scan(0, press_counts=PRESS))
+        came_ns, late_ns = 50 * PERIOD_NS, 35 * PERIOD_NS
+        late = make_scan(1, press_counts=PRESS, time_ns=came_ns)
+        taken = {"device_ns": came_ns - late_ns} if stamped else {"unread_ns": late_ns}
+        assert "old when it arrived" in runtime.push(replace(late, **taken)).note
+        torn = make_scan(2, press_counts=PRESS, absent=(0, 1), time_ns=came_ns + PERIOD_NS)
+        result = runtime.push(replace(torn, device_ns=torn.time_ns if stamped else None))
+        assert result.pattern is None and result.dead == {0: "silent", 1: "silent"}
 
-    def press(counts):
-        counts[2] += 5000
+    @pytest.mark.parametrize(
+        ("taxels", "remedy"), [(tuple(range(8, 16)), "try another --id-map"), ((5,), "it may be broken")]
+    )
+    def test_a_taxel_that_stays_silent_is_named(self, taxels, remedy):
+        pad = Pushed(make_runtime(baselines={}))
+        notes = [pad.push(absent=taxels).note for _ in range(TAXEL_SILENT_SCANS)]
+        named = f"no pattern, taxel {', '.join(map(str, taxels))} silent"
+        assert notes[HOLD_SCANS - 1] is None and notes[HOLD_SCANS] == named
+        assert notes[-1] == f"{named}: {remedy}"
+        assert [pad.push().note for _ in range(BACK_SCANS)][-1] is None
 
-    def at_the_end(counts):
-        counts[2, 5] = 65535
+    @pytest.mark.parametrize("counts", RANGE_ENDS)
+    def test_a_chip_at_the_end_of_its_range_has_no_reading(self, counts):
+        """The last reading is held for a while, as of a silent taxel; then there is no pattern."""
+        pad = Pushed()
+        pattern = pad.push(PRESS).pattern
+        why = "taxel 5 at the end of its range: overloaded, too near a magnet, or broken"
+        for _ in range(HOLD_SCANS):
+            held = saturated(pad, counts)
+            np.testing.assert_array_equal(held.pattern, pattern)
+            assert held.notes[0].text == f"its last reading is held, {why}"
+        gone = saturated(pad, counts)
+        assert (gone.state, gone.pattern, gone.contact, gone.note) == ("incomplete", None, None, f"no pattern, {why}")
+        back = [pad.push(PRESS) for _ in range(BACK_SCANS)][-1]
+        assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
+        assert [saturated(pad, 65534).state for _ in range(HOLD_SCANS + 2)][-1] == "contact", "a count from the end"
 
-    assert 65535 - BASELINE.counts[2, 1, 1] < 27_000, "as a contact might read"
-    pad.read(1, press)
-    before = pad.watch.held[2, 1, 1]
-    pad.read(1, press, at_the_end)
-    assert pad.watch.held[2, 1, 1] == before
-    assert "its last reading is held, taxel 5 at the end of its range" in (joined(pad.watch.notes(None)) or "")
-
-
-def test_no_reading_is_held_for_longer_than_the_judge_of_faults_allows():
-    """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
-    assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
-
-
-@pytest.mark.parametrize(("pause_ns", "held"), [(HOLD_NS, True), (HOLD_NS + 1, False)])
-@pytest.mark.parametrize("torn_before", [False, True])
-def test_a_reading_from_before_a_pause_is_not_held(pause_ns, held, torn_before):
-    """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: what was pressed before is another press."""
-    watch, series = TaxelWatch((4, 4)), ScanSeries("4", USPA44)
-    missing = REST.copy()
-    missing[:, 1, 3] = ABSENT
-
-    def push(number, counts, time_ns):
-        watch.push(series.close((counts + number * (counts != ABSENT)).astype(np.int32), time_ns), BASELINE)
-
-    for number in range(3):
-        other = REST.copy()
-        other[:, 0, 0] = ABSENT if torn_before and number == 1 else REST[:, 0, 0]
-        push(number, other, number * PERIOD_NS)
-    push(3, missing, 2 * PERIOD_NS + pause_ns)
-    assert watch.reasons == ({} if held else {7: "silent"})
+    def test_taxels_that_are_silent_are_named_with_one_at_the_end_of_its_range(self):
+        pad, half = Pushed(), tuple(range(8, 16))
+        note = [saturated(pad, RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
+        assert "taxel 5 at the end of its range" in note
+        assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")

@@ -1,13 +1,26 @@
+"""Zeroing: of a source by itself, on demand in the runtime, the ages of baselines, and what records tell of it."""
+# pyright: reportArgumentType=false
+
 import threading
 
 import numpy as np
 import pytest
-from edge_samples import REST, FakeLink, make_scan
+from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, make_contract, make_scan
+from mcap_samples import arrays_of
+from runtime_samples import make_runtime
 
+from edge.perception.zeroing import GIVE_UP_NS
 from edge.pipeline.baseline_capture import take_baselines
 from edge.pipeline.scan_reader import Source
+from edge.sinks.json_encoding import record
+from edge.sinks.mcap import McapSink
+from edge.sinks.status_line import StatusSink
 from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Notice
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.zeroing.baseline import deformation
+
+DAY_S = 86_400.0
 
 
 def rest_scans(count, *sensors, start=0):
@@ -19,115 +32,273 @@ def take(link, **settings):
         return take_baselines(source, **settings)
 
 
-def test_every_sensor_heard_gets_its_baseline():
-    baselines = take(FakeLink(rest_scans(150, "4", "6"), endless=True))
-    assert sorted(baselines) == ["4", "6"]
-    assert np.abs(baselines["6"].counts - REST).max() <= 2 and baselines["6"].sensor == "6"
-    assert baselines["6"].scans == 100
+class Script:
+    """Source that gives what it is told to for each take, every one of which takes 0.1 s."""
+
+    name, kind, taken = "fake", "device", 0
+
+    def __init__(self, given):
+        self._given = given
+
+    def lend(self):
+        """Has no other stream."""
+
+    def counters(self):
+        return {}
+
+    def take(self, timeout_s):
+        self.taken += 1
+        return self._given(self.taken)
+
+    def now_s(self):
+        return 0.1 * self.taken
 
 
-def test_the_first_scans_can_be_left_out():
-    touched = [[make_scan(n, press_counts=5000)] for n in range(20)]
-    link = FakeLink(touched + rest_scans(120, start=20), endless=True)
-    assert np.abs(take(link, skip=20)["4"].counts - REST).max() <= 2
+class Lost(FakeLink):
+    """Link that was away before its ninetieth read."""
+
+    def notices(self):
+        return [Notice(0, "lost", "gone")] if self.reads == 90 else []
 
 
-def test_a_refusal_names_the_sensor():
-    scans = [[make_scan(n, noise=3, press_counts=10 * n)] for n in range(100)]
-    with pytest.raises(BaselineRefusedError, match=r"sensor 4: taxel \(1, 1\) z moved"):
-        take(FakeLink(scans, endless=True))
-
-
-def test_a_source_that_ends_too_soon_is_told():
-    with pytest.raises(BaselineRefusedError, match="ended before 100 complete scans"):
-        take(FakeLink(rest_scans(99)))
-
-
-def test_silence_is_told_and_measured_from_the_last_scan():
-    class Script:
-        """Gives 30 scans, then nothing; every take takes a second."""
-
-        name, kind, taken = "fake", "device", 0
-
-        def lend(self):
-            """Has no other stream."""
-
-        def counters(self):
-            return {}
-
-        def take(self, timeout_s):
-            self.taken += 1
-            return [make_scan(self.taken, noise=3)] if self.taken <= 30 else []
-
-    source = Script()
-    with pytest.raises(DeviceError, match=r"no scan from fake for 10 s"):
-        take_baselines(source, clock_s=lambda: float(source.taken))
-    assert source.taken == 30 + 11
-
-
-@pytest.mark.parametrize(
-    ("heard", "skip"),
-    [
-        (lambda n: [make_scan(n, noise=3, absent=(3,))], 0),  # a silent taxel, or another id map
-        (lambda n: [make_scan(n, noise=3)] + ([make_scan(n, sensor="6", noise=3)] if n < 30 else []), 0),
-        (lambda n: [make_scan(n, noise=3)] + ([make_scan(n, sensor="6", noise=3)] if n < 30 else []), 50),
-        (lambda n: [make_scan(0, stale=range(16))], 0),  # frozen: the same readings again and again
-    ],
-)
-def test_a_sensor_that_gives_no_whole_scan_is_told_though_scans_come(heard, skip):
-    class Script:
-        name, kind, taken = "fake", "device", 0
-
-        def lend(self):
-            """Has no other stream."""
-
-        def counters(self):
-            return {}
-
-        def take(self, timeout_s):
-            self.taken += 1
-            assert self.taken < 5000
-            return heard(self.taken)
-
-    source = Script()
-    with pytest.raises(DeviceError, match=r"no whole new scan from sensor [46] for 10 s: .*edge-sr doctor"):
-        take_baselines(source, skip=skip, clock_s=lambda: 0.1 * source.taken)
-    assert source.taken < 200
-
-
-def test_a_sensor_that_is_done_may_move_while_another_is_not():
-    scans = [
-        [
-            make_scan(n, noise=3, press_counts=0 if n < 100 else 50 * n),
-            make_scan(n, sensor="6", noise=3, absent=(1,) if n < 150 else ()),
+class TestCapture:
+    def test_every_sensor_that_is_read_gets_its_baseline(self):
+        baselines = take(FakeLink(rest_scans(150, "4", "6"), endless=True))
+        assert [(name, one.sensor, one.scans) for name, one in sorted(baselines.items())] == [
+            ("4", "4", 100),
+            ("6", "6", 100),
         ]
-        for n in range(300)
-    ]
-    baselines = take(FakeLink(scans))
-    assert sorted(baselines) == ["4", "6"]
-    assert np.abs(baselines["4"].counts - REST).max() <= 2
+        assert np.abs(baselines["6"].counts - REST).max() <= 2
+
+    def test_the_first_scans_can_be_left_out(self):
+        touched = [[make_scan(n, press_counts=5000)] for n in range(20)]
+        link = FakeLink(touched + rest_scans(120, start=20), endless=True)
+        assert np.abs(take(link, skip=20)["4"].counts - REST).max() <= 2
+
+    @pytest.mark.parametrize(
+        ("link", "error", "match"),
+        [
+            (
+                FakeLink([[make_scan(n, noise=3, press_counts=10 * n)] for n in range(100)], endless=True),
+                BaselineRefusedError,
+                r"sensor 4: taxel \(1, 1\) z moved",
+            ),
+            (FakeLink(rest_scans(99)), BaselineRefusedError, "ended before 100 complete scans"),
+            (Lost(rest_scans(188)), BaselineRefusedError, "ended before 100"),
+            (FakeLink(rest_scans(5), error=LinkLostError("gone")), LinkLostError, "gone"),
+        ],
+    )
+    def test_why_there_is_none_is_told(self, link, error, match):
+        with pytest.raises(error, match=match):
+            take(link)
+
+    @pytest.mark.parametrize(
+        ("given", "skip", "match"),
+        [
+            (lambda n: [make_scan(n, noise=3)] if n <= 30 else [], 0, "no scan from fake for 10 s"),
+            (lambda n: [make_scan(n, noise=3, absent=(3,))], 0, ""),  # a silent taxel, or another id map
+            (lambda n: [make_scan(n, noise=3), *[make_scan(n, sensor="6", noise=3)] * (n < 30)], 0, ""),
+            (lambda n: [make_scan(n, noise=3), *[make_scan(n, sensor="6", noise=3)] * (n < 30)], 50, ""),
+            (lambda n: [make_scan(0, stale=range(16))], 0, ""),  # frozen: the same readings again and again
+        ],
+    )
+    def test_a_sensor_that_gives_no_whole_scan_is_told_though_scans_come(self, given, skip, match):
+        source = Script(given)
+        with pytest.raises(DeviceError, match=match or "no whole new scan from sensor [46] for 10 s: .*edge-sr doctor"):
+            take_baselines(source, skip=skip, clock_s=source.now_s)
+        assert source.taken < 200
+
+    def test_a_sensor_that_is_done_may_move_while_another_is_not(self):
+        scans = [
+            [
+                make_scan(n, noise=3, press_counts=0 if n < 100 else 50 * n),
+                make_scan(n, sensor="6", noise=3, absent=(1,) if n < 150 else ()),
+            ]
+            for n in range(300)
+        ]
+        baselines = take(FakeLink(scans))
+        assert sorted(baselines) == ["4", "6"]
+        assert np.abs(baselines["4"].counts - REST).max() <= 2
+
+    def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it(self):
+        """A sensor that was powered again rests elsewhere: a baseline of both halves would fit neither."""
+        before = [[make_scan(n, press_counts=9)] for n in range(89)]
+        assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2
+
+    def test_stopped_half_way_it_keeps_nothing(self):
+        stop = threading.Event()
+        stop.set()
+        with pytest.raises(BaselineRefusedError, match="nothing is kept"):
+            take(FakeLink(rest_scans(100)), stop=stop)
 
 
-def test_a_lost_link_is_told():
-    with pytest.raises(LinkLostError):
-        take(FakeLink(rest_scans(5), error=LinkLostError("gone")))
+LOCAL = np.zeros((4, 4))
+LOCAL[1, 2] = 3000
 
 
-def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it():
-    """A sensor that was powered again rests elsewhere: a baseline of both halves would fit neither."""
+class Bench:
+    """A runtime, and scans that come to it one after another."""
 
-    class Lost(FakeLink):
-        def notices(self):
-            return [Notice(0, "lost", "gone")] if self.reads == 90 else []
+    def __init__(self, **settings):
+        self.runtime = make_runtime(**settings)
+        self.number = 0
 
-    before = [[make_scan(n, press_counts=9)] for n in range(89)]
-    assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2
-    with pytest.raises(BaselineRefusedError, match="ended before 100"):
-        take(Lost(rest_scans(188)))
+    def play(self, count, offset=0, sensor="4"):
+        """Return the results of so many scans whose z is off by `offset` counts, which may be a function of n."""
+        results = []
+        for n in range(count):
+            scan = make_scan(self.number, sensor=sensor, noise=3)
+            counts = scan.counts.copy()
+            counts[2] += np.rint(np.broadcast_to(offset(n) if callable(offset) else offset, (4, 4))).astype(np.int32)
+            moved = Scan(sensor, scan.number, self.number * PERIOD_NS, counts, scan.fresh, scan.renewed)
+            results.append(self.runtime.push(moved))
+            self.number += 1
+        return results
+
+    def zero(self, count, offset=0, **settings):
+        """Ask for zeroing after a few scans, and return the results behind it."""
+        self.play(5, offset(0) if callable(offset) else offset)
+        self.runtime.zero(**settings)
+        return self.play(count, offset)
 
 
-def test_stopped_half_way_it_keeps_nothing():
-    stop = threading.Event()
-    stop.set()
-    with pytest.raises(BaselineRefusedError, match="nothing is kept"):
-        take(FakeLink(rest_scans(100)), stop=stop)
+def events(results):
+    return [result.event for result in results if result.event is not None]
+
+
+def sway(n):
+    return 40 * (n % 2)
+
+
+GIVEN_UP = GIVE_UP_NS // PERIOD_NS + 5
+
+
+class TestOnDemand:
+    def test_the_old_baseline_stays_in_use_until_the_new_one_is_there(self):
+        results = Bench().zero(120, 30)
+        first = next(index for index, result in enumerate(results) if result.baseline.id != BASELINE.id)
+        assert first == 99
+        assert all(result.state == "idle" and result.baseline is BASELINE for result in results[:first])
+        assert all(result.note == "zeroing: keep the pad still and free" for result in results[:first])
+        new = results[first].baseline
+        assert new.origin == "demand" and abs(new.counts[2] - REST[2] - 30).max() <= 3
+        assert results[first].note is None and abs(results[first].force_counts) < 100
+        assert events(results) == [f"sensor 4 zeroed on demand: baseline {new.id} instead of {BASELINE.id}"]
+        assert results[-1].baseline_age_s == pytest.approx((120 - 100) * PERIOD_NS / 1e9)
+
+    def test_in_contact_it_is_refused_unless_forced(self):
+        bench = Bench()
+        results = bench.zero(120, LOCAL)
+        (event,) = events(results)
+        assert [(one.kind, one.sensor) for one in results[0].events] == [("in_contact", "4")]
+        assert event.startswith("zeroing refused: sensor 4 is in contact: free the pad, or force it")
+        assert {result.baseline.id for result in results} == {BASELINE.id}
+        results = bench.zero(120, LOCAL, force=True)
+        assert "zeroed on demand" in events(results)[0]
+        assert results[-1].contact is False and abs(results[-1].force_counts) < 100
+
+    def test_motion_puts_it_off_and_a_touch_meanwhile_starts_it_over(self):
+        bench = Bench()
+        moving = bench.zero(150, sway)
+        assert events(moving) == [] and moving[-1].note.startswith("zeroing started over: taxel (")
+        bench.play(90)
+        assert bench.play(3, LOCAL)[-1].note.startswith("zeroing started over: the pad is in contact: free it")
+        results = bench.play(110)
+        # The first scan free ends the tap.
+        assert [result.event is not None for result in results].index(True) == 100
+
+    @pytest.mark.parametrize(("offset", "why"), [(sway, "tried for 15 s"), (LOCAL / 10, "counts above the baseline")])
+    def test_it_gives_up_after_a_stated_time_and_says_why(self, offset, why):
+        results = Bench().zero(GIVEN_UP, offset)
+        (event,) = [event for event in events(results) if "given up" in event]
+        assert event.startswith("sensor 4: zeroing given up, the old baseline stays: taxel (") and why in event
+        assert results[-1].baseline.id == BASELINE.id
+
+    def test_one_sensor_alone_or_all(self):
+        bench = Bench(baselines={"4": BASELINE, "6": BASELINE})
+        for sensor in ("4", "6"):
+            bench.play(2, sensor=sensor)
+        bench.runtime.zero("6")
+        assert events(bench.play(105, sensor="4")) == [] and len(events(bench.play(105, sensor="6"))) == 1
+        bench.runtime.zero("9")
+        assert events(bench.play(1)) == ["zeroing refused: no sensor 9, there are 4, 6"]
+
+    def test_before_there_is_a_baseline_there_is_nothing_to_zero_again(self):
+        results = Bench(baselines={}).zero(100)
+        assert events(results) == ["sensor 4: no baseline yet, zeroing since the start"]
+        assert results[-1].baseline.origin == "start-up"
+
+    def test_earlier_taps_are_forgotten_since_they_were_read_over_another_rest_level(self):
+        bench = Bench()
+        for _ in range(2):
+            bench.play(3, LOCAL)
+            bench.play(3)
+        assert bench.play(1, LOCAL)[0].taps_used == 3
+        bench.play(3)
+        bench.zero(105)
+        assert bench.play(2, LOCAL)[1].taps_used == 1
+
+
+class TestAge:
+    def test_it_goes_on_by_scan_time_whatever_the_wall_clock_does(self):
+        wall_s = iter([1060.0, 1060.0 - DAY_S])
+        bench = Bench(unix_time_s=lambda: next(wall_s))  # asked once: twice, it would have been set back by a day
+        assert bench.play(1)[0].baseline_age_s == 60.0
+        assert bench.play(300)[-1].baseline_age_s == pytest.approx(60.0 + 300 * PERIOD_NS / 1e9)
+
+    def test_from_a_clock_that_was_wrong_it_is_not_known(self):
+        (result,) = Bench(unix_time_s=lambda: 5.0).play(1)
+        assert result.baseline_age_s is None and result.baseline_text() == f"baseline {BASELINE.id} of unknown age"
+
+
+class TestDrift:
+    def test_what_was_subtracted_is_in_the_record_and_raw_counts_stay(self, tmp_path):
+        sink = McapSink(tmp_path / "drift.mcap", make_contract())
+        results = Bench().play(1500, 25)
+        for result in results:
+            sink.write(result, {})
+        sink.close()
+        last = results[-1]
+        assert last.baseline.id == BASELINE.id and abs(last.force_counts) < 100
+        told = record(last, {})
+        assert told["drift_counts"]["common"][2] == pytest.approx(25, abs=2) and told["drift_counts"]["step"] == 0
+        assert np.array_equal(told["counts"], last.scan.counts) and told["baseline"] == BASELINE.id
+        kept = arrays_of(tmp_path / "drift.mcap")
+        np.testing.assert_array_equal(kept["counts"][-1], last.scan.counts)
+        np.testing.assert_array_equal(kept["baseline_counts"][0], BASELINE.counts)
+        zeroed = kept["counts"][-1] - kept["baseline_counts"][-1]
+        np.testing.assert_array_equal(zeroed, deformation(last.scan.counts, last.baseline))
+        assert float(zeroed[2].sum()) == pytest.approx(last.force_counts, abs=0.1)
+
+    def test_after_a_step_the_record_and_the_live_line_tell_it(self):
+        bench = Bench()
+        bench.play(300)
+        bench.play(20, LOCAL)
+        results = bench.play(400, LOCAL / 50)
+        (event,) = events(results)
+        assert event.startswith("sensor 4: rest level 6") and "(taxel 6) after a contact" in event
+        assert event.endswith(results[-1].note) and [note.kind for note in results[-1].notes] == ["rest_level"]
+        assert record(results[-1], {})["drift_counts"]["step"] == pytest.approx(60, abs=4)
+        assert results[-1].force_counts == pytest.approx(60, abs=40)
+        status = StatusSink()
+        for result in results:
+            status.write(result, {})
+        assert "rest off by 6" in status.line()
+
+    def test_a_link_that_was_away_is_followed_by_a_comparison(self):
+        bench = Bench()
+        bench.play(300)
+        bench.runtime.lose_touch()
+        results = bench.play(400, 40)
+        assert "after a gap" in events(results)[0]
+        assert results[-1].force_counts == pytest.approx(16 * 40, abs=100)
+        bench.runtime.lose_touch()
+        assert len(events(bench.play(400))) == 1  # back where it was
+
+    def test_nothing_of_it_changes_in_contact(self):
+        bench = Bench()
+        bench.play(300)
+        grip = np.linspace(50, 400, 16).reshape(4, 4)
+        held = bench.play(1000, lambda n: grip * (1 + n / 10_000))
+        assert len({id(result.baseline) for result in held[1:]}) == 1
+        assert held[-1].force_counts == pytest.approx(grip.sum() * 1.1, abs=100)

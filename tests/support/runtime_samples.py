@@ -1,11 +1,14 @@
-"""Runtime with a fake model, and the press of its contacts."""
+"""Runtime with a fake model, and a sensor that is pressed and moved scan by scan."""
 
-from edge_samples import (
-    BASELINE,
-    FakeModel,
-)
+import threading
+
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_scan
 
 from edge.perception.runtime import Runtime
+from edge.pipeline.pump import pump
+from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
+from firmware_bridge.zeroing.baseline import Baseline
 
 PRESS = 3000
 
@@ -13,3 +16,57 @@ PRESS = 3000
 def make_runtime(model=None, **settings):
     settings = {"source": "device", "baselines": {"4": BASELINE}, "unix_time_s": lambda: 1060.0} | settings
     return Runtime(model or FakeModel(), **settings)
+
+
+class Pushed:
+    """Sensor whose scans come one by one into a runtime; `settings` are those of each scan, `results` are kept."""
+
+    def __init__(self, runtime=None, sensor="4", **settings):
+        self.runtime, self.sensor = runtime or make_runtime(), sensor
+        self.number, self.results = 0, []
+        self._settings = settings
+
+    def scan(self, press=0.0, **changes):
+        scan = make_scan(self.number, press_counts=press, sensor=self.sensor, **self._settings | changes)
+        self.number += 1
+        return scan
+
+    def push(self, press=0.0, **changes):
+        self.results.append(self.runtime.push(self.scan(press, **changes)))
+        return self.results[-1]
+
+    def place(self, pose, **settings):
+        """Hold the pad at a pose from now on, shortly before the next scan."""
+        return self.runtime.pose(pose, (self.number + 1) * PERIOD_NS - 1000, holds=True, **settings)
+
+    def tap(self, pose=None, press=PRESS, **changes):
+        """Press twice and release; return the result of the second scan."""
+        if pose is not None:
+            self.place(pose)
+        self.push(0.6 * press, **changes)
+        result = self.push(press, **changes)
+        self.push()
+        return result
+
+    @property
+    def events(self):
+        return [event for result in self.results for event in result.events]
+
+    @property
+    def kinds(self):
+        return [event.kind for event in self.events]
+
+
+def pumped(link, *sinks, model=None, runtime=None, statistics=None, capacity_scans=CAPACITY_SCANS, rate_hz=None, **how):
+    """Pump a link through a runtime of sensors 4 and 6 into sinks until it ends, and return the statistics."""
+    baselines = {name: Baseline.of(name, BASELINE.counts, 1000.0, 100, "file") for name in "46"}
+    runtime = runtime or make_runtime(model, source=link.kind, baselines=baselines)
+    statistics = statistics or Statistics()
+    with Source(link, capacity_scans=capacity_scans, rate_hz=rate_hz) as source:
+        pump(source, runtime, sinks, statistics, **{"stop": threading.Event()} | how)
+    return statistics
+
+
+def presses(numbers, sensor="4"):
+    """Return scans that press a little more each, so that each needs a pattern of its own."""
+    return [make_scan(number, sensor=sensor, press_counts=PRESS + 20 * number) for number in numbers]

@@ -2,6 +2,7 @@
 
 import numpy as np
 from edge_samples import FakeModel, make_pad_contract
+from pose_samples import make_posed_contract
 
 from edge.inference.contract import Contract
 from edge.inference.familiarity import PLACE_MM, Check, pair_width
@@ -57,6 +58,12 @@ def make_trusted_contract(**changes) -> Contract:
     return make_pad_contract(
         **({"trust": make_trust().to_json(), "interval_factor": 1.6, "output_full_scale": 10.0} | changes)
     )
+
+
+def make_checked_contract(trust: Trust) -> Contract:
+    """Return the contract of a model that takes a pad and poses, with such checks."""
+    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+    return make_posed_contract(pad_inputs=pad_inputs, takes_gains=True, traction_scale=2, trust=trust.to_json())
 
 
 class WrongModel(FakeModel):

@@ -74,7 +74,7 @@ SUBJECTS = {
             "tests/bridge/test_slcan_scans.py",
         ),
     ),
-    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_tap_numbers.py", "tests/runtime/test_taps.py")),
+    "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
     "baseline": Subject(
         "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py", "tests/bridge/test_baseline_files.py")
     ),
@@ -83,7 +83,7 @@ SUBJECTS = {
     ),
     "contract": Subject(
         "edge.inference.contract",
-        ("tests/runtime/test_contract_limits.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
+        ("tests/runtime/test_contract.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
     ),
 }
 

@@ -1,0 +1,183 @@
+"""Contract of a model: what is refused, key by key, the last values that are taken, and pads outside the training."""
+
+import json
+from dataclasses import fields, replace
+
+import pytest
+from edge_samples import make_contract, make_pad_contract
+from pose_samples import make_posed_contract
+from trust_samples import make_checked_contract, make_posed_trust, make_trust, make_trusted_contract
+
+from edge.errors import ModelError
+from edge.inference.contract import CONTRACT_VERSION, Contract
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.pad_constants import Pad
+
+BROKEN_VALUES = {
+    "version": 1,
+    "batch": 0,
+    "taps": 0,
+    "scale": "10",
+    "tap_order": "oldest first",
+    "angle_step_deg": None,
+    "counts_per_unit": [1, 2],
+    "output_unit": "",
+    "output_full_scale": -1,
+    "contact_level": 1.5,
+    "sensor": 4,
+    "rows": 4.0,
+    "cols": -4,
+    "pitch_mm": 0,
+    "arithmetic": "int4",
+    "interval_factor": 0,
+    "confidence": {"1": {"doubt": [0.1], "error": [0.1], "gain": [0.1, 0.2]}},
+    "training_sha256": None,
+    "test_set_sha256": "",
+    "test_error": [],
+    "pad_inputs": [["thickness", 4.5, 1.0]],
+    "takes_gains": 1,
+    "traction_scale": 2.0,
+    "trust": {"forward": {}},
+    "interval_levels": {"90": [1.6, 1.6, 1.6]},
+    "takes_poses": 1,
+    "reach_mm": -1,
+}
+
+
+def read(contract, **changes):
+    """Return the contract that is read from the metadata of another one, some of whose keys have other texts."""
+    metadata = contract.to_metadata() | {f"tactile.{key}": text for key, text in changes.items()}
+    return Contract.from_metadata(metadata)
+
+
+@pytest.mark.parametrize(
+    "contract",
+    [
+        make_contract(scale=64, interval_levels={"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6] * 4}),
+        make_contract(traction_scale=1),
+        make_pad_contract(),
+        make_trusted_contract(),
+        make_posed_contract(),
+    ],
+)
+def test_what_is_written_is_read(contract):
+    assert read(contract) == contract
+
+
+@pytest.mark.parametrize("key", [one.name for one in fields(Contract)])
+def test_a_key_that_is_missing_or_broken_is_named(key):
+    metadata = make_contract().to_metadata()
+    for text in ("{", json.dumps(BROKEN_VALUES[key])):
+        with pytest.raises(ModelError, match=f"'{key}'"):
+            Contract.from_metadata(metadata | {f"tactile.{key}": text})
+    del metadata[f"tactile.{key}"]
+    with pytest.raises(ModelError, match=f"'{key}' is missing"):
+        Contract.from_metadata(metadata)
+
+
+@pytest.mark.parametrize("version", [1, CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
+def test_of_another_version_the_version_is_named_not_what_it_lacks(version):
+    metadata = make_contract(version=version).to_metadata()
+    del metadata["tactile.interval_factor"]
+    with pytest.raises(
+        ModelError, match=f"'version' is {version}, expected {CONTRACT_VERSION}: export the model again"
+    ):
+        Contract.from_metadata(metadata)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "match"),
+    [
+        ("pad_inputs", '[["thickness_mm", "4", 1]]', "a list of"),
+        ("pad_inputs", '[["thickness", 1, 1]]', "a list of"),
+        ("pad_inputs", "[[7, 1, 1]]", "a list of"),
+        ("test_error", '{"1": {"psnr_db": 30.1}, "4": 33.2}', "a map from taps to metrics"),
+        ("interval_levels", '{"90": [1, 1, 1, 0]}', "for each percentage a positive number"),
+        ("interval_levels", '{"100": [1, 1, 1, 1]}', "for each percentage a positive number"),
+        ("interval_levels", '{"most": [1, 1, 1, 1]}', "for each percentage a positive number"),
+        ("interval_levels", '{"90": [1, 1, 1, "1"]}', "for each percentage a positive number"),
+        ("tap_order", f'"{"x" * 98}"', "x', expected"),  # a hundred characters of it are shown
+        ("tap_order", f'"{"x" * 99}"', r"x\.\.\., expected"),
+    ],
+)
+def test_one_wrong_value_among_right_ones_is_refused(key, text, match):
+    with pytest.raises(ModelError, match=rf"'{key}' is .*{match}"):
+        read(make_pad_contract(), **{key: text})
+
+
+SMALL = {"rows": "1", "cols": "1", "scale": "16"}
+POSED = {"takes_poses": "true"}
+
+
+@pytest.mark.parametrize(
+    ("lawful", "one_more", "match"),
+    [
+        (SMALL | {"batch": "1024"}, {"batch": "1025"}, "1 to 1024"),
+        (SMALL | {"taps": "64"}, {"taps": "65"}, "1 to 64"),
+        (SMALL | {"rows": "64"}, {"rows": "65"}, "1 to 64"),
+        (SMALL | {"cols": "64"}, {"cols": "65"}, "1 to 64"),
+        (SMALL | {"scale": "256"}, {"scale": "257"}, "1 to 256"),
+        ({"rows": "64", "cols": "64", "scale": "16"}, {"scale": "17"}, "patterns of at most 1048576 pixels"),
+        (SMALL | {"traction_scale": "256"}, {"traction_scale": "257"}, "1 to 256, or null"),
+        ({"traction_scale": "147"}, {"traction_scale": "148"}, "tractions of at most 1048576 numbers"),
+        ({"contact_level": "0.999"}, {"contact_level": "1"}, "a number below 1"),
+        ({"pad_inputs": '[["poisson", 0, 1e-6]]'}, {"pad_inputs": '[["poisson", 0, 9e-7]]'}, "spread from 1e-06"),
+        ({"pitch_mm": "1e-6"}, {"pitch_mm": "9e-7"}, "a positive number from 1e-06"),
+        ({"counts_per_unit": "[1, 1, 1e-6]"}, {"counts_per_unit": "[1, 1, 9e-7]"}, "three positive numbers from"),
+        (POSED | {"reach_mm": "1e-6"}, {"reach_mm": "0"}, "a number from 1e-06 for a model that takes poses"),
+        (POSED | {"reach_mm": "1"}, {"reach_mm": "true"}, "a number from 1e-06 for a model that takes poses"),
+        ({"output_unit": f'"{"m" * 100}"'}, {"output_unit": f'"{"m" * 101}"'}, "a printable text of 1 to 100"),
+        ({"taps": "4".ljust(1 << 20)}, {"taps": "4".ljust((1 << 20) + 1)}, "1048577 characters, expected at most"),
+    ],
+)
+def test_a_contract_is_taken_up_to_its_limits(lawful, one_more, match):
+    read(make_contract(), **lawful)
+    with pytest.raises(ModelError, match=match):
+        read(make_contract(), **lawful | one_more)
+
+
+@pytest.mark.parametrize("change", [{"name": "other"}, {"rows": 5}, {"cols": 5}, {"pitch_mm": 4.8}])
+def test_a_sensor_that_the_model_was_not_trained_for_is_refused(change):
+    make_contract().check_sensor(USPA44)
+    with pytest.raises(ModelError, match=f"contract key '{next(iter(change)).replace('name', 'sensor')}' is"):
+        make_contract().check_sensor(replace(USPA44, **change))
+
+
+@pytest.mark.parametrize(
+    ("pad", "outside"),
+    [
+        (None, False),
+        (Pad(), False),
+        (Pad(thickness_mm=5.25), False),
+        (Pad(thickness_mm=5.3), True),
+        (Pad(thickness_mm=3.75), False),
+        (Pad(thickness_mm=3.7), True),
+        (Pad(thickness_mm=5.3, intervals={"thickness_mm": (5.0, 5.6)}), False),
+        (Pad(thickness_mm=7.0, intervals={"thickness_mm": (5.5, 8.5)}), True),
+        (Pad(counts_per_newton=2000.0), True),
+    ],
+)
+def test_a_pad_far_outside_the_training_is_told(pad, outside):
+    """The sample was trained on pads of 4.5 mm, half a millimetre either way."""
+    assert make_pad_contract().is_outside(pad) is outside
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"cols": 6, "sensor": "uSPa46", "pitch_mm": 7.25}, "for 48 readings, the sensor has 72"),
+        ({"takes_gains": False}, "for a model that takes gains"),
+        ({"pad_inputs": ()}, ""),
+        ({"pad_inputs": (("thickness_mm", 4.5, 0.5),)}, ""),
+    ],
+)
+def test_checks_of_another_pad_or_input_are_refused(changes, why):
+    with pytest.raises(ModelError, match=rf"contract key 'trust' is damaged \(.*{why}.*export the model again"):
+        read(make_trusted_contract(**changes))
+
+
+def test_checks_without_poses_do_not_fit_a_model_that_takes_them():
+    with pytest.raises(ModelError, match=r"'trust' is damaged \(tap takes 100 features, expected 104\)"):
+        read(make_checked_contract(make_trust()))
+    contract = read(make_checked_contract(make_posed_trust(1.0)))
+    assert contract.read_trust() is not None and read(make_contract()).read_trust() is None

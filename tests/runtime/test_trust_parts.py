@@ -1,0 +1,259 @@
+"""Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
+# pyright: reportArgumentType=false
+
+import base64
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from edge_samples import write_model
+from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
+
+from edge.errors import ModelError
+from edge.inference.contract import Contract
+from edge.inference.familiarity import check_of, contact_features, tap_features
+from edge.inference.forward_model import GRID, KPA, condensed, features
+from edge.inference.onnx_session import ModelSession
+from edge.inference.small_network import (
+    MOST_INPUTS,
+    MOST_LAYERS,
+    MOST_UNITS,
+    SmallNetwork,
+    packed,
+    small_network,
+    unpacked,
+)
+from edge.inference.trust import trust_of
+
+GAIN_ERROR = 0.075
+
+
+def changed(change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    """Return the sample's checks as JSON after a change."""
+    value = json.loads(json.dumps(make_trust().to_json()))
+    change(value)
+    return value
+
+
+def put(*path: Any) -> Callable[[dict[str, Any]], None]:
+    """Return a change that puts the last of a path at the place that the others name."""
+    *road, last, new = path
+
+    def change(value: Any) -> None:
+        for step in road:
+            value = value[step]
+        value[last] = new
+
+    return change
+
+
+DAMAGE = {
+    "a part is missing": lambda value: value.pop("tap"),
+    "a part is too many": put("more", 1),
+    "no forward model": put("forward", None),
+    "a key of the forward model is missing": lambda value: value["forward"].pop("noise"),
+    "an operator for other constants": put("forward", "operator", packed(np.ones((2 + CONSTANTS, 48, 96)))),
+    "an operator of other features": put("forward", "operator", packed(np.ones((1 + CONSTANTS, 48, 95)))),
+    "an operator without a shape": put("forward", "operator", {"shape": [], "f2": "AAA="}),
+    "an endless shape": put("forward", "noise", "shape", [math.inf]),
+    "bytes cut short": put("forward", "noise", "f2", "AAAA"),
+    "noise below 0": put("forward", "noise", packed(np.array([1.0, 1.0, -1.0]))),
+    "more in the forward model": put("forward", "more", 1.0),
+    "a contact limit that is no number": put("contact", "limit", math.nan),
+    "a contact limit that is a whole number": put("contact", "limit", 3),
+    "a contact limit that is a text": put("contact", "limit", "3"),
+    "a contact network that is a number": put("contact", "layers", 3),
+    "a contact network without layers": put("contact", "layers", []),
+    "a contact network with a layer that is none": put("contact", "layers", [{}]),
+    "a contact network of a tap's features": lambda value: value.update(contact=value["tap"]),
+    "a tap network of a contact's features": lambda value: value.update(tap=value["contact"]),
+    "no contact check": put("contact", []),
+    "more in the contact check": put("contact", "more", 1),
+    "a list": lambda value: value.clear() or value.update(list=1),
+}
+
+
+class TestTrust:
+    def test_it_comes_back_from_a_model_file(self, tmp_path):
+        made = make_trust()
+        again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
+        assert again is not None
+        row = np.linspace(-1, 1, 100, dtype=np.float32)
+        assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
+        assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
+        for name in ("operator", "noise", "model_error"):
+            assert np.array_equal(getattr(again.forward, name), getattr(made.forward, name))
+
+    @pytest.mark.parametrize("damage", DAMAGE)
+    def test_damage_is_told_in_a_line_that_names_the_key(self, damage):
+        contract = replace(make_trusted_contract(), trust=changed(DAMAGE[damage]))
+        with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
+            Contract.from_metadata(contract.to_metadata())
+        assert "\n" not in str(told.value) and "export the model again" in str(told.value)
+
+    @pytest.mark.parametrize("value", [None, [], 3, "text"])
+    def test_what_is_no_map_is_refused(self, value):
+        with pytest.raises(ValueError, match="expected forward, contact, tap"):
+            trust_of(value, CONSTANTS)
+        with pytest.raises(ValueError, match="expected layers and a limit"):
+            check_of(value)
+
+
+def layers(*widths, seed=0):
+    rng = np.random.default_rng(seed)
+    return [(rng.standard_normal((after, before)), rng.standard_normal(after)) for before, after in pairwise(widths)]
+
+
+class TestSmallNetwork:
+    def test_it_has_a_rectifier_between_layers_and_none_at_the_end(self):
+        (first, one), (second, two) = made = layers(5, 7, 1)
+        two -= 7
+        network = SmallNetwork(made)
+        rows = np.random.default_rng(1).standard_normal((20, 5)).astype(np.float32)
+        before = rows.copy()
+        by_hand = np.maximum(rows @ first.T + one, 0) @ second[0] + two[0]
+        assert network(rows) == pytest.approx(by_hand, abs=1e-4)
+        assert by_hand.min() < 0 < by_hand.max() and network.inputs == 5 and (rows == before).all()
+
+    def test_it_is_the_same_after_json_within_half_precision(self):
+        network = SmallNetwork(layers(5, 7, 3, 1))
+        again = small_network(network.to_json())
+        row = np.linspace(-1, 1, 5, dtype=np.float32)
+        assert again(row) == pytest.approx(network(row), rel=0.01)
+        assert small_network(again.to_json())(row) == again(row)
+
+    @pytest.mark.parametrize(
+        ("made", "said"),
+        [
+            ([], "0 layers"),
+            (layers(*[2] * (MOST_LAYERS + 1), 1), "layers"),
+            (layers(MOST_INPUTS + 1, 1), "inputs"),
+            (layers(4, MOST_UNITS + 1, 1), "a layer of"),
+            ([*layers(4, 3), *layers(4, 1)], "after 3 units"),
+            (layers(4, 2), "2 outputs"),
+            ([(np.ones((1, 4)), np.ones(2))], "a layer of"),
+            ([(np.full((1, 4), np.nan), np.ones(1))], "not finite"),
+            ([(np.ones((1, 4)), np.full(1, np.inf))], "not finite"),
+        ],
+    )
+    def test_layers_that_are_none_are_refused(self, made, said):
+        with pytest.raises(ValueError, match=said):
+            SmallNetwork(made)
+
+    def test_numbers_are_packed_in_half_precision(self):
+        values = np.array([[1.0, -2.5], [1 / 3, 60_000.0]])
+        assert unpacked(packed(values)) == pytest.approx(values, rel=1e-3)
+        assert unpacked(packed(values)).dtype == np.float32
+
+    @pytest.mark.parametrize(
+        "value",
+        [
+            *({"shape": shape} for shape in ([2, 3], [0, 4], [-2, -2], [1 << 17, 1], ["two", 2], 4, None, [math.nan])),
+            *({"f2": text} for text in ("AAAA", "no base64!", "\u00e4", 7)),
+            *(
+                {"f2": base64.b64encode(np.array([1, 2, 3, bad], dtype="<f2").tobytes()).decode()}
+                for bad in (np.nan, np.inf)
+            ),
+            *(None, [], "text", 3),
+        ],
+    )
+    def test_what_is_no_array_is_refused(self, value):
+        good = packed(np.ones((2, 2)))
+        with pytest.raises(ValueError, match=r"\w"):
+            unpacked(good | value if isinstance(value, dict) else value)
+
+
+def make_maps(seed=0, size=40):
+    """Return a pattern in [mm] and a traction in [kPa], both even enough to be told apart by cells."""
+    rng = np.random.default_rng(seed)
+    pattern = np.kron(rng.uniform(0, 0.5, (8, 8)), np.ones((size // 8, size // 8))).astype(np.float32)
+    traction = np.kron(rng.normal(0, 20, (3, 4, 4)), np.ones((1, 2, 2))).astype(np.float32)
+    return pattern, traction
+
+
+def readings_of(operator, pattern, traction):
+    return (operator @ features(pattern, traction)).reshape(3, 4, 4).astype(np.float32)
+
+
+class TestMismatch:
+    @pytest.fixture
+    def forward(self):
+        made = make_forward()
+        made.operator[:] = np.random.default_rng(4).normal(0, 0.2, made.operator.shape)
+        return made
+
+    def of_pad(self, forward, value=0.0):
+        """Return an operator, maps, and the readings that it makes of them."""
+        operator = forward.of_pad(np.full(CONSTANTS, value, dtype=np.float32))
+        pattern, traction = make_maps()
+        return operator, pattern, traction, readings_of(operator, pattern, traction)
+
+    def test_readings_of_this_pad_leave_nothing_and_those_of_another_something(self, forward):
+        operator, pattern, traction, tap = self.of_pad(forward, 0.7)
+        assert forward.mismatch(operator, tap, pattern, traction, GAIN_ERROR) == pytest.approx(0, abs=1e-9)
+        other = self.of_pad(forward)[0]
+        assert forward.mismatch(other, tap, pattern, traction, 0) > 0.1
+        assert forward.mismatch(operator, tap, 0 * pattern, 0 * traction, GAIN_ERROR) == pytest.approx(1)
+
+    def test_it_grows_with_what_is_wrong(self, forward):
+        operator, pattern, traction, tap = self.of_pad(forward)
+        another = make_maps(1)[0]
+        shares = [
+            forward.mismatch(operator, tap, (1 - wrong) * pattern + wrong * another, traction, GAIN_ERROR)
+            for wrong in (0, 0.1, 0.2, 0.4, 0.8)
+        ]
+        assert shares == sorted(shares) and shares[1] > 0.001 and shares[-1] > 0.1
+
+    def test_it_does_not_depend_on_the_force_where_noise_is_small(self, forward):
+        operator, _, traction, tap = self.of_pad(forward)
+        wrong = make_maps(1)[0]
+        forward.noise[:] = 1e-4
+        light, firm = (
+            forward.mismatch(operator, force * tap, force * wrong, force * traction, GAIN_ERROR)
+            for force in (np.float32(1), np.float32(10))
+        )
+        assert light == pytest.approx(firm, rel=1e-3) and firm > 0.05
+
+    def test_readings_that_are_less_certain_count_less(self, forward):
+        operator, pattern, traction, tap = self.of_pad(forward)
+        tap[0] += 1.0
+        sure = forward.mismatch(operator, tap, pattern, traction, 0)
+        unsure = replace(forward, model_error=forward.model_error * np.float32([80, 1, 1]))
+        assert unsure.mismatch(operator, tap, pattern, traction, 0) < 0.1 * sure
+
+
+class TestFeatures:
+    def test_they_are_means_of_cells(self):
+        pattern, traction = make_maps()
+        found = features(pattern, traction)
+        assert found.shape == (GRID**2 * 3,) and found.dtype == np.float32
+        assert found[: GRID**2] == pytest.approx(pattern[::5, ::5].ravel(), rel=1e-5)
+        assert found[GRID**2 :] == pytest.approx(traction[:2].ravel() / KPA, rel=1e-5)
+        assert condensed(found[None])[0, GRID**2 :] == pytest.approx(traction[:2, ::2, ::2].ravel() / KPA, rel=1e-5)
+        for size in (12, 20, 36, 64):  # whatever the scale
+            pattern = np.random.default_rng(0).uniform(0, 1, (size, size)).astype(np.float32)
+            assert features(pattern, traction)[: GRID**2].mean() == pytest.approx(pattern.mean(), rel=1e-4)
+
+    def test_those_of_a_contact_do_not_depend_on_its_force_but_for_one(self):
+        tap = np.random.default_rng(0).uniform(0.5, 3, (3, 4, 4)).astype(np.float32)
+        pad = np.ones(5, dtype=np.float32)
+        (light,), (firm,) = contact_features(tap, pad), contact_features(20 * tap, pad)
+        assert light[:48] == pytest.approx(firm[:48], rel=0.03)
+        assert firm[48] - light[48] == pytest.approx(np.log(20), abs=0.03)
+        assert (light[49:] == pad).all() and (firm[49:] == pad).all()
+        tap[:], tap[0, 0, 0] = 0, 1e6
+        assert np.abs(contact_features(tap, pad)[0, :48]).max() <= 12, "a large reading beside none is bounded"
+
+    def test_those_of_a_pair_are_of_shapes_and_steps(self):
+        one, other = np.random.default_rng(0).uniform(1, 3, (2, 3, 4, 4)).astype(np.float32)
+        (found,) = tap_features(np.stack([one, other]), (3,))
+        assert found.shape == (100,) and found[98:].tolist() == [3, 9]
+        assert tap_features(np.stack([one, one]))[0, 48:96] == pytest.approx(0, abs=1e-6)
+        assert tap_features(np.stack([one, 10 * other]), (3,))[0, :96] == pytest.approx(found[:96], abs=0.05)
+        earlier, one_more = tap_features(np.stack([one, other, one]))
+        assert earlier[98:].tolist() == [1, 1] and one_more[98:].tolist() == [2, 4]
