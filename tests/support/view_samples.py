@@ -84,11 +84,6 @@ class Page:
             for sink in self.view.sinks:
                 sink.write(result, {"dropped": 0})
 
-    def wait(self):
-        """Call the sinks as the loop does while nothing comes."""
-        for sink in self.view.sinks:
-            sink.wait()
-
     @contextmanager
     def playing(self, shows=None, rate_hz=100.0):
         """Play results at a rate, from a thread of its own as the loop's.
@@ -114,12 +109,6 @@ class Page:
         finally:
             stop.set()
             thread.join()
-
-    def polled(self, count=1):
-        """Return the commands once so many have come."""
-        commands = []
-        wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
-        return commands
 
 
 class Mapped:
@@ -197,11 +186,12 @@ class Swallowing:
 
 
 @contextmanager
-def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT):
+def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT, name="pretended", player=None):
     commands = Commands()
     with LiveView(host, port, token, tmp_path, contract, commands) as view:
         page = Page(view, commands)
-        view.begin("pretended", "emulated", "fake", partial(open_sink, contract=contract), page.messages.append)
+        opener = partial(open_sink, contract=contract)
+        view.begin(name, "emulated", "fake", opener, page.messages.append, player)
         yield page
 
 
@@ -247,7 +237,3 @@ def refused_with(page, *arguments, **settings):
     with pytest.raises(InvalidStatus) as caught, page.viewer(*arguments, **settings):
         pass
     return caught.value.response.status_code
-
-
-def viewers(page):
-    return page.view._server.viewers

@@ -66,7 +66,7 @@ RECONNECT = """async (times) => {
     await new Promise((go_on) => window.newest().addEventListener("message", go_on, { once: true }));
   }
 }"""
-TOLD = """([text, times]) => times === [...document.querySelectorAll("#log li")]
+TOLD = """text => [...document.querySelectorAll("#log li")]
   .filter((line) => line.textContent.includes(text))
   .reduce((sum, line) => sum + Number(line.dataset.times), 0)"""
 WATCH_REFUSAL = """() => {
@@ -242,13 +242,13 @@ def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
     live(other)
     for times in (1, 2):
         other.keyboard.press("z")
-        page.wait_for_function(TOLD, arg=["zeroing refused", times])
+        wait_for(lambda times=times: page.evaluate(TOLD, "zeroing refused") == times)
     playwright.expect(page.locator("#refusal")).to_be_hidden()
     page.evaluate(WATCH_REFUSAL)
     page.evaluate(RECONNECT, 1)
     other.keyboard.press("r")
     logged(page, "earlier taps forgotten")  # after all that a newcomer is sent
-    assert page.evaluate(TOLD, ["zeroing refused", 2]) and page.evaluate("refusals") == 0
+    assert page.evaluate(TOLD, "zeroing refused") == 2 and page.evaluate("refusals") == 0
 
     # A pause freezes this page alone, and through a reconnect.
     def shown():
@@ -307,6 +307,16 @@ def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
     logged(page, "connected again")
 
 
+def zero(page, sensor, ask):
+    """Ask, and again where a busy machine left the sensor silent meanwhile, until there is a new baseline."""
+    baseline = number(page, "baseline", sensor)
+    before = baseline.inner_text()
+    while baseline.inner_text() == before:
+        given_up = page.evaluate(TOLD, "given up")
+        ask()
+        wait_for(lambda: baseline.inner_text() != before or page.evaluate(TOLD, "given up") > given_up)
+
+
 def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
     tracks = then_held(demo, pressed(demo)[0]), demo["counts"][:1] + noise(200, seed=2)
     with emulated(folder, *tracks, options=["--view-token", TOKEN]) as run:
@@ -323,12 +333,13 @@ def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
         assert top == other_top and right < other_left
 
         # Each is zeroed by its button; where it is in contact this is refused, and offered to who asked alone.
-        stored, stored_6 = (number(page, "baseline", sensor).inner_text() for sensor in "46")
+        stored = number(page, "baseline").inner_text()
         playwright.expect(page.locator("#force")).to_be_hidden()
         page.keyboard.press("Shift+Z")  # nothing was refused yet
-        part(page, "zero", "6").click()
-        playwright.expect(number(page, "baseline", "6")).not_to_have_text(stored_6)
+        zero(page, "6", part(page, "zero", "6").click)
         playwright.expect(number(page, "baseline_origin", "6")).to_have_text("on demand")
+        assert sent[0] == {"cmd": "zero", "sensor": "6"}
+        del sent[:]
         part(other, "zero").click()
         playwright.expect(other.locator("#force")).to_be_visible()
         logged(page, "zeroing refused")
@@ -339,28 +350,23 @@ def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
         playwright.expect(page.locator("#force")).to_be_visible()
         playwright.expect(page.locator("#refusal")).not_to_contain_text("sensor 6")
         assert number(page, "baseline").inner_text() == stored
-        page.keyboard.press("Shift+Z")
+
+        def force():
+            page.locator("#zero").click()
+            page.get_by_role("button", name="Zero despite contact").click()
+
+        zero(page, "4", lambda: page.keyboard.press("Shift+Z") if len(sent) < 2 else force())
         playwright.expect(page.locator("#refusal")).to_be_hidden()
         playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
-        playwright.expect(number(page, "baseline")).not_to_have_text(stored)
         word(page, "idle")
+        assert sent[:2] == [{"cmd": "zero"}, {"cmd": "zero", "sensor": "4", "force": True}]
+        del sent[:]
         page.keyboard.press("Shift+Z")  # once
-        forced = number(page, "baseline").inner_text()
-        other.get_by_role("button", name="Zero despite contact").click()
-        playwright.expect(other.locator("#refusal")).to_be_hidden()
-        playwright.expect(number(page, "baseline")).not_to_have_text(forced)
         page.keyboard.press("r")
         logged(other, "earlier taps forgotten")
         painted(page)  # after all that it has sent is known here
-        assert sent == [
-            {"cmd": "zero", "sensor": "6"},
-            {"cmd": "zero"},
-            {"cmd": "zero", "sensor": "4", "force": True},
-            {"cmd": "reset"},
-        ]
-        before = number(page, "baseline", "6").inner_text()
-        page.locator("#zero").click()
-        playwright.expect(number(page, "baseline", "6")).not_to_have_text(before)
+        assert sent == [{"cmd": "reset"}]
+        zero(page, "6", page.locator("#zero").click)
 
         for name, text in (("scale", "idle"), ("pause", "paused")):  # a pause makes no old pattern look new
             page.locator(f"#{name}").click()
