@@ -5,19 +5,25 @@ import socket
 import threading
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from map_samples import result_of
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from edge.mapping.object_map import ObjectMap
+from edge.mapping.sink import MapSink
 from edge.perception.contact_options import RuntimeOptions
+from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.sinks.binary_message import unpack
 from edge.sinks.registry import open_sink
 from edge.view.live_view import LiveView
+from firmware_bridge.poses.pad_pose import PadPose
 
 CONTRACT = make_contract(interval_factor=1.6)
 TIMEOUT_S = 60.0
@@ -78,19 +84,21 @@ class Page:
             for sink in self.view.sinks:
                 sink.write(result, {"dropped": 0})
 
-    def wait(self):
-        """Call the sinks as the loop does while nothing comes."""
-        for sink in self.view.sinks:
-            sink.wait()
-
     @contextmanager
-    def playing(self, rate_hz=100.0):
-        """Play results at a rate, from a thread of its own as the loop's."""
+    def playing(self, shows=None, rate_hz=100.0):
+        """Play results at a rate, from a thread of its own as the loop's.
+
+        With `shows`, what it returns is shown as of ever later scans; a sensor would not believe one taxel for so long.
+        """
         stop = threading.Event()
 
         def loop():
             while not stop.wait(1 / rate_hz):
                 result = self.press.next()
+                if shows is not None:
+                    now, result = result.scan, shows()
+                    scan = replace(result.scan, number=now.number, time_ns=now.time_ns)
+                    result = replace(result, scan=scan)
                 for sink in self.view.sinks:
                     sink.write(result, {"dropped": 0})
 
@@ -102,11 +110,20 @@ class Page:
             stop.set()
             thread.join()
 
-    def polled(self, count=1):
-        """Return the commands once so many have come."""
-        commands = []
-        wait_for(lambda: commands.extend(self.asked.poll()) or len(commands) >= count)
-        return commands
+
+class Mapped:
+    """Map of a figure, on a page; each touch is one scan later and is shown at once."""
+
+    def __init__(self, page, figure):
+        self.sink = MapSink(ObjectMap(), show=page.view.show_map, clock_ns=lambda: self.number * 10**9)
+        self.figure = figure
+        self.number = 0
+
+    def touch(self, x_mm, y_mm, turn_deg=0.0, *, posed=True, **changes):
+        pose = PadPose(x_mm, y_mm, turn_deg)
+        result = result_of(self.figure, pose, number=self.number, posed=posed, **changes)
+        self.number += 1
+        self.sink.write(result, {})
 
 
 class Swallowing:
@@ -169,12 +186,18 @@ class Swallowing:
 
 
 @contextmanager
-def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT):
+def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT, name="pretended", player=None):
     commands = Commands()
     with LiveView(host, port, token, tmp_path, contract, commands) as view:
         page = Page(view, commands)
-        view.begin("pretended", "emulated", "fake", partial(open_sink, contract=contract), page.messages.append)
+        opener = partial(open_sink, contract=contract)
+        view.begin(name, "emulated", "fake", opener, page.messages.append, player)
         yield page
+
+
+def tell(page, kind, sensor, detail):
+    for sink in page.view.sinks:
+        sink.tell(Event(1, kind, sensor, detail), {})
 
 
 def frame(viewer, kind=None, sensor=None):
@@ -214,7 +237,3 @@ def refused_with(page, *arguments, **settings):
     with pytest.raises(InvalidStatus) as caught, page.viewer(*arguments, **settings):
         pass
     return caught.value.response.status_code
-
-
-def viewers(page):
-    return page.view._server.viewers

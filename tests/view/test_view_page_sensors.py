@@ -1,15 +1,29 @@
-"""Sensors on the live page: zeroing by hand, two sensors, dead taxels and a cable that is out."""
+"""The live page as a person sees it: headless Chromium, and a real `edge-sr` that reads emulated sensors."""
 
 import json
+import os
+import re
+from pathlib import Path
 
+import numpy as np
+import pytest
 from browser_samples import (
+    PAINTED,
+    PHONE,
+    RGBA,
+    SIZES,
     TOKEN,
     browser,
+    colours_of,
     demo,
     emulated,
+    fits,
     folder,
+    frames_of,
+    likeness,
     live,
     logged,
+    moves,
     noise,
     number,
     open_page,
@@ -18,71 +32,314 @@ from browser_samples import (
     playwright,
     pressed,
     resize,
+    shares,
     then_held,
     word,
 )
+from view_samples import wait_for
+
+from firmware_bridge.recording.formats import load_recording
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
+HAND = ("4", "6", "8", "10")
+RECONNECTS = 50
+FIRST_RECONNECTS = 15
+"""Reconnects after which all that is made once exists."""
+
+# Unknown to the page's own program, its sockets are counted but not kept, and its waits are shortened.
+WATCH_SOCKETS = """
+  const Socket = window.WebSocket;
+  window.sockets = [];
+  window.newest = () => window.sockets.at(-1).deref();
+  window.WebSocket = class extends Socket {
+    constructor(...given) { super(...given); window.sockets.push(new WeakRef(this)); }
+  };
+  const wait = window.setTimeout;
+  window.setTimeout = (act, ms, ...given) => wait(act, ms / 50, ...given);
+"""
+RECONNECT = """async (times) => {
+  for (let time = 0; time < times; time++) {
+    const before = window.sockets.length;
+    window.newest().close();
+    while (window.sockets.length === before) await new Promise((go_on) => setTimeout(go_on, 50));
+    await new Promise((go_on) => window.newest().addEventListener("message", go_on, { once: true }));
+  }
+}"""
+TOLD = """text => [...document.querySelectorAll("#log li")]
+  .filter((line) => line.textContent.includes(text))
+  .reduce((sum, line) => sum + Number(line.dataset.times), 0)"""
+WATCH_REFUSAL = """() => {
+  window.refusals = 0;
+  const watch = { attributeFilter: ["hidden"], childList: true, subtree: true };
+  new MutationObserver(() => window.refusals++).observe(document.querySelector("#refusal"), watch);
+}"""
+# The next frame already has every canvas in its new size, and painted.
+RESIZED = f"""async (canvas) => {{
+  const before = canvas.width;
+  canvas.closest(".sensor").style.width = "700px";
+  await new Promise((go_on) => requestAnimationFrame(() => setTimeout(go_on, 0)));
+  const resized = canvas.width !== before && ({PAINTED})(canvas) > 50;
+  canvas.closest(".sensor").style.width = "";
+  return resized;
+}}"""
+INKED = """canvas => {
+  const { data, width, height } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  const ink = getComputedStyle(document.documentElement).getPropertyValue("--force").trim();
+  const want = [1, 3, 5].map((at) => parseInt(ink.slice(at, at + 2), 16));
+  const near = (at) => data[at + 3] > 100 && want.every((value, channel) => Math.abs(data[at + channel] - value) < 12);
+  return Array.from({ length: width }, (_, x) =>
+    Array.from({ length: height }, (_, y) => 4 * (y * width + x)).some(near));
+}"""
+INSIDE = """() => [...document.querySelectorAll(".pad")].map(one => one.getBoundingClientRect())
+  .every(({left, top, right, bottom, width}) =>
+    width >= 72 && left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight)"""
 SIDES = """all => all.map(one => one.getBoundingClientRect())
   .map(({left, top, right, bottom}) => [left, top, right, bottom])"""
 
 
-def sent_by(page):
-    """Return a growing list of the messages that the page's next sockets send."""
-    sent = []
-    page.on("websocket", lambda socket: socket.on("framesent", lambda text: sent.append(json.loads(text))))
-    return sent
+@pytest.fixture(scope="module")
+def held(demo, folder):
+    """A run whose pad is pressed onto the demo's figure all the time, once it was seen free, and its pattern."""
+    counts, pattern = pressed(demo)
+    with emulated(folder, then_held(demo, counts), options=["--view-record-dir", folder]) as run:
+        run.pattern, run.folder = pattern, folder
+        yield run
 
 
-def test_zero_by_button_and_by_key_with_a_token_that_is_not_left_in_the_address(demo, folder, open_page):
-    with emulated(folder, demo["counts"][:100], options=["--view-token", TOKEN]) as run:
+def test_a_held_pad_is_shown_measured_and_recorded(held, open_page):
+    page = open_page(held.url)
+    live(page)
+    word(page, "contact")
+
+    # The pattern, on the model's scale or on its own, as the page is told and keeps it.
+    scale = playwright.expect(part(page, "pattern-high"))
+    scale.to_contain_text("largest so far")
+    page.keyboard.press("s")
+    scale.to_contain_text("0.50\u202fmm, full scale")
+    shown = shares(part(page, "pattern").evaluate(RGBA))
+    assert shown.shape == (40, 40) and shown.max() < 0.7 and likeness(shown, held.pattern) > 0.99
+    assert np.sqrt(np.mean((0.5 * shown - held.pattern) ** 2)) < 0.01  # [mm], of 0.5 full scale
+    page.keyboard.press("s")
+    scale.to_contain_text("largest so far")
+    wait_for(lambda: shares(part(page, "pattern").evaluate(RGBA)).max() > 0.9)  # painted with the next frame
+    assert likeness(shares(part(page, "pattern").evaluate(RGBA)), held.pattern) > 0.99
+    page.keyboard.press("s")
+    heard = frames_of(page)
+    page.reload()
+    live(page)
+    scale.to_contain_text("full scale")
+
+    # Maps, traces and numbers are there, and move.
+    moves(page)
+    for name in ("interval_mm", "expected_rmse_mm", "run_time_us", "latency_us", "rate_hz"):
+        playwright.expect(number(page, name)).to_contain_text(re.compile(r"[1-9]"))
+    playwright.expect(number(page, "model")).to_have_text("stsr-int8")
+    playwright.expect(number(page, "baseline_origin")).to_have_text("file")
+    for name in ("shear", "force-plot", "area-plot", "over"):
+        assert part(page, name).evaluate(PAINTED) > 50, name
+    for name, shape in (("taxels", (4, 4)), ("deviation", (40, 40))):
+        rgba = colours_of(part(page, name).evaluate(RGBA))
+        assert rgba.shape[:2] == shape and len(np.unique(rgba.reshape(-1, 4), axis=0)) > 5
+    assert part(page, "over").evaluate(RESIZED)
+
+    # A value above a limit is marked, and logged once.
+    limit, marked = part(page, "force-limit"), playwright.expect(page.locator(".traces > div[data-over=yes]"))
+    limit.fill("1000000")
+    limit.press("e")  # no key of the page, as in any field
+    limit.fill("10")
+    limit.blur()
+    marked.to_have_count(1)
+    logged(page, "force above the limit of 10")
+    assert page.locator("dialog[open]").count() == 0
+    moves(page)
+    assert page.locator("#log li", has_text="above the limit").count() == 1
+    page.reload()
+    live(page)
+    marked.to_have_count(1)
+    limit.fill("")
+    limit.blur()
+    marked.to_have_count(0)
+
+    # Shear is drawn in place of the area.
+    wait_for(lambda: any(point[4] is not None for header in heard for point in header.get("trace", [])))
+    toggle, plot = part(page, "shear_toggle"), part(page, "area-plot")
+    page.keyboard.press("Space")  # else it moves by itself
+    word(page, "paused")
+    images = [plot.evaluate("canvas => canvas.toDataURL()")]
+    for state in ("true", "false"):
+        toggle.click()
+        playwright.expect(toggle).to_have_attribute("aria-pressed", state)
+        images.append(plot.evaluate("canvas => canvas.toDataURL()"))
+    assert images[0] == images[2] != images[1]
+    page.locator("#pause").click()
+    live(page)
+
+    # Arrow keys read a pixel.
+    part(page, "field").focus()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Shift+ArrowDown")
+    live_text = re.compile(r"x (\S+), y (2\.6)\u202fmm: (\S+)\u202fmm \u00b1 (\S+)\u202fmm")
+    # Shown with the next frame, which says "not live" or "no pattern" where this machine made the program pause.
+    x, y, value, doubt = wait_for(lambda: live_text.fullmatch(part(page, "readout").inner_text())).groups()
+    assert (x.replace("\u2212", "-"), y) == ("-0.2", "2.6")  # pixel 19, 25 of 40, 0.47 mm wide
+    assert abs(float(value) - held.pattern[25, 19]) < 0.02 and float(doubt) > 0
+    playwright.expect(page.locator("#live")).to_contain_text("mm")
+    page.keyboard.press("Escape")
+    playwright.expect(part(page, "readout")).to_contain_text("arrow keys")
+
+    # A recording is made, and told to all who look.
+    other = open_page(held.url)
+    playwright.expect(other.locator("#link")).to_have_text("connected, 2 viewers")
+    page.keyboard.press("Shift+R")
+    playwright.expect(other.locator("#record")).to_have_attribute("aria-pressed", "true")
+    logged(other, "recording into")
+    playwright.expect(other.locator("#record")).to_contain_text(re.compile(r"Recording [1-9]\d*\ss, \d\.\d\sMB"))
+    page.locator("#record").click()
+    playwright.expect(other.locator("#record")).to_have_attribute("aria-pressed", "false")
+    logged(page, "recorded into")
+    text = page.locator("#log li").filter(has_text="recorded into").first.inner_text()
+    path = Path(re.search(r"recorded into (\S+)", text)[1])
+    assert path.parent == held.folder and len(load_recording(path).tracks[0].counts) >= 10
+
+    # A keyboard is enough.
+    page.keyboard.press("?")
+    playwright.expect(page.locator("#manual")).to_be_visible()
+    page.keyboard.press("Escape")
+    playwright.expect(page.locator("#manual")).to_be_hidden()
+    playwright.expect(page.locator("#history")).to_be_visible()  # there is a past to look back on
+    page.locator("#zero").focus()
+    reached = ["zero"]
+    for _ in range(23):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("document.activeElement.id || document.activeElement.dataset.part"))
+    want = ["zero", "reset", "record", "pause", "scale", "relief", "save", "help", "back", "field", "span", "log"]
+    assert [name for name in reached if name in want][: len(want)] == want
+    page.locator("#scale").focus()
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    before = page.locator("#scale").inner_text()
+    page.keyboard.press("Space")  # presses the button that has the focus, and pauses nothing
+    playwright.expect(page.locator("#scale")).not_to_have_text(before)
+    word(page, "contact")
+
+    fits(page, *PHONE)
+    field = part(page, "field").bounding_box()
+    assert field["width"] > 330 and field["y"] + field["height"] < page.locator("#keys").bounding_box()["y"]
+
+
+def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
+    page, other = open_page(held.url, script=WATCH_SOCKETS), open_page(held.url)
+    heard = frames_of(page)
+    page.reload()
+
+    def ask(question):
+        """Send what is no command, and return when the program has answered it."""
+        page.evaluate("question => newest().send(question)", question)
+        logged(page, question)
+
+    # After a reconnect nothing is told twice.
+    live(page)
+    live(other)
+    for times in (1, 2):
+        other.keyboard.press("z")
+        wait_for(lambda times=times: page.evaluate(TOLD, "zeroing refused") == times)
+    playwright.expect(page.locator("#refusal")).to_be_hidden()
+    page.evaluate(WATCH_REFUSAL)
+    page.evaluate(RECONNECT, 1)
+    other.keyboard.press("r")
+    logged(page, "earlier taps forgotten")  # after all that a newcomer is sent
+    assert page.evaluate(TOLD, "zeroing refused") == 2 and page.evaluate("refusals") == 0
+
+    # A pause freezes this page alone, and through a reconnect.
+    def shown():
+        pixels = [part(page, name).evaluate(RGBA) for name in ("pattern", "force-plot")]
+        return [*pixels, part(page, "force-now").inner_text()]
+
+    live(page)
+    page.keyboard.press("Space")
+    word(page, "paused")
+    frozen = shown()
+    moves(other)
+    page.wait_for_timeout(1200)  # more than a hole that the trace would show
+    page.evaluate(RECONNECT, 1)
+    ask("is it held?")  # answered after the pause that the page asked for again
+    del heard[:]
+    moves(other)
+    ask("still?")
+    assert "result" not in [header["kind"] for header in heard]
+    assert frozen == shown()
+    assert part(page, "field").get_attribute("data-live") == "no"
+    playwright.expect(page.locator("#trouble")).to_contain_text("paused")
+    page.locator("#pause").click()
+    live(page)
+    playwright.expect(part(page, "force-now")).not_to_have_text(frozen[-1])
+    # A held pad draws a line: frames missed meanwhile leave no hole of 0.7 s in it, nor in the other page's.
+    here, there = (max(np.diff(np.flatnonzero(part(one, "force-plot").evaluate(INKED)))) for one in (page, other))
+    assert here < there + 0.07 * part(page, "force-plot").evaluate("canvas => canvas.width")
+
+    # Many reconnects leave nothing.
+    devtools = page.context.new_cdp_session(page)
+    devtools.send("Performance.enable")
+
+    def kept():
+        """Return Chromium's counts after garbage collection: the least of a few, as frames come meanwhile."""
+        counted = []
+        for _ in range(4):
+            devtools.send("HeapProfiler.collectGarbage")
+            metrics = devtools.send("Performance.getMetrics")["metrics"]
+            counted.append({metric["name"]: metric["value"] for metric in metrics})
+        return {name: min(once[name] for once in counted) for name in counted[0]}
+
+    def open_files():
+        return len(os.listdir(f"/proc/{held.pid}/fd"))  # noqa: PTH208
+
+    resize(page, 390, 300)
+    page.evaluate(RECONNECT, FIRST_RECONNECTS)
+    before, files = kept(), open_files()
+    page.evaluate(RECONNECT, RECONNECTS)
+    live(page)
+    after = kept()
+    page.wait_for_function("gc(), sockets.filter((one) => one.deref() !== undefined).length <= 2")
+    assert after["JSEventListeners"] <= before["JSEventListeners"] + 5
+    assert after["Nodes"] <= before["Nodes"] + RECONNECTS / 2
+    assert after["JSHeapUsedSize"] < before["JSHeapUsedSize"] + 500_000
+    wait_for(lambda: open_files() <= files + 2)
+    logged(page, "connected again")
+
+
+def zero(page, sensor, ask):
+    """Ask, and again where a busy machine left the sensor silent meanwhile, until there is a new baseline."""
+    baseline = number(page, "baseline", sensor)
+    before = baseline.inner_text()
+    while baseline.inner_text() == before:
+        given_up = page.evaluate(TOLD, "given up")
+        ask()
+        wait_for(lambda told=given_up: baseline.inner_text() != before or page.evaluate(TOLD, "given up") > told)
+
+
+def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
+    tracks = then_held(demo, pressed(demo)[0]), demo["counts"][:1] + noise(200, seed=2)
+    with emulated(folder, *tracks, options=["--view-token", TOKEN]) as run:
         assert TOKEN in run.url
-        page = open_page(run.url)
-        word(page, "idle")
-        assert page.url == run.url.partition("?")[0]
-        stored = number(page, "baseline").inner_text()
-        page.locator("#zero").click()
-        playwright.expect(number(page, "baseline")).not_to_have_text(stored)
-        playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
-        first = number(page, "baseline").inner_text()
-        page.keyboard.press("z")
-        playwright.expect(number(page, "baseline")).not_to_have_text(first)
-
-
-def test_zero_in_contact_is_refused_and_forced_by_another_button_alone(demo, folder, open_page):
-    with emulated(folder, then_held(demo, pressed(demo)[0])) as run:
-        page = open_page(run.url)
-        live(page)
-        stored = number(page, "baseline").inner_text()
-        playwright.expect(page.locator("#force")).to_be_hidden()
-        page.keyboard.press("Shift+Z")  # nothing was refused yet
-        page.keyboard.press("z")
-        playwright.expect(page.locator("#refusal")).to_contain_text("sensor 4 is in contact")
-        logged(page, "zeroing refused")
-        page.keyboard.press("z")
-        playwright.expect(page.locator("#force")).to_be_visible()
-        assert number(page, "baseline").inner_text() == stored
-        page.get_by_role("button", name="Zero despite contact").click()
-        playwright.expect(page.locator("#refusal")).to_be_hidden()
-        playwright.expect(number(page, "baseline")).not_to_have_text(stored)
-        word(page, "idle")
-        for pressed_key, text in (("s", "idle"), ("Space", "paused")):  # a pause makes no old pattern look new
-            page.keyboard.press(pressed_key)
-            word(page, text)
-            playwright.expect(part(page, "field")).to_have_class("field old")
-            playwright.expect(part(page, "stamp")).to_contain_text("last contact")
-
-
-def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
-    with emulated(folder, then_held(demo, pressed(demo)[0]), demo["counts"][:1] + noise(200, seed=2)) as run:
         page, other = open_page(run.url), open_page(run.url)
-        sent = sent_by(page)
+        assert page.url == run.url.partition("?")[0], "a token is not left in the address"
+        sent = []
+        page.on("websocket", lambda socket: socket.on("framesent", lambda text: sent.append(json.loads(text))))
         page.reload()
         for one in (page, other):
             live(one)
             word(one, "idle", "6")
-        part(page, "zero", "6").click()
+        (left, top, right, _), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
+        assert top == other_top and right < other_left
+
+        # Each is zeroed by its button; where it is in contact this is refused, and offered to who asked alone.
+        stored = number(page, "baseline").inner_text()
+        playwright.expect(page.locator("#force")).to_be_hidden()
+        page.keyboard.press("Shift+Z")  # nothing was refused yet
+        zero(page, "6", part(page, "zero", "6").click)
+        playwright.expect(number(page, "baseline_origin", "6")).to_have_text("on demand")
+        assert sent[0] == {"cmd": "zero", "sensor": "6"}
+        del sent[:]
         part(other, "zero").click()
         playwright.expect(other.locator("#force")).to_be_visible()
         logged(page, "zeroing refused")
@@ -92,40 +349,92 @@ def test_who_asked_may_force_and_only_what_was_refused(demo, folder, open_page):
         page.keyboard.press("z")
         playwright.expect(page.locator("#force")).to_be_visible()
         playwright.expect(page.locator("#refusal")).not_to_contain_text("sensor 6")
-        page.keyboard.press("Shift+Z")
+        assert number(page, "baseline").inner_text() == stored
+
+        def force():
+            if len(sent) < 2:
+                page.keyboard.press("Shift+Z")
+                other.get_by_role("button", name="Zero despite contact").click()
+            else:
+                page.locator("#zero").click()
+                page.locator("#force").click()
+
+        zero(page, "4", force)
+        playwright.expect(other.locator("#refusal")).to_be_hidden()
+        playwright.expect(page.locator("#refusal")).to_be_hidden()
         playwright.expect(number(page, "baseline_origin")).to_have_text("on demand")
+        word(page, "idle")
+        assert sent[:2] == [{"cmd": "zero"}, {"cmd": "zero", "sensor": "4", "force": True}]
+        del sent[:]
         page.keyboard.press("Shift+Z")  # once
         page.keyboard.press("r")
         logged(other, "earlier taps forgotten")
         painted(page)  # after all that it has sent is known here
-        assert sent == [
-            {"cmd": "zero", "sensor": "6"},
-            {"cmd": "zero"},
-            {"cmd": "zero", "sensor": "4", "force": True},
-            {"cmd": "reset"},
-        ]
+        assert sent == [{"cmd": "reset"}]
+        zero(page, "6", page.locator("#zero").click)
 
+        for name, text in (("scale", "idle"), ("pause", "paused")):  # a pause makes no old pattern look new
+            page.locator(f"#{name}").click()
+            word(page, text)
+            playwright.expect(part(page, "field")).to_have_class("field old")
+            playwright.expect(part(page, "stamp")).to_contain_text("last contact")
+        page.locator("#pause").click()
 
-def test_two_sensors_a_dead_taxel_and_a_cable_that_is_out(demo, folder, open_page):
-    counts = pressed(demo)[0]
-    broken = then_held(demo, counts)
-    broken[:, :, 1, 2] = 65_535
-    with emulated(folder, then_held(demo, counts), broken) as run:
-        page = open_page(run.url)
-        live(page)
-        live(page, "6")
-        playwright.expect(part(page, "dead", "6").filter(has_text="taxel 6 saturated")).to_be_visible()
-        playwright.expect(part(page, "dead", "4")).to_be_hidden()
-        (left, top, right, _), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
-        assert top == other_top and right < other_left
-        resize(page, 390, 844)
+        # On a phone one is below the other; both are silent without their cable.
+        resize(page, *PHONE)
         (left, _, _, bottom), (other_left, other_top, *_) = page.eval_on_selector_all(".sensor", SIDES)
         assert left == other_left and bottom < other_top
         run.emulator.hang_up()
         for sensor in "46":
             word(page, "no scan for", sensor)
             playwright.expect(part(page, "link", sensor)).to_contain_text("no scan for")
-            playwright.expect(page.locator("#link")).to_contain_text("; no scan from ")
-            playwright.expect(page.locator("#link")).to_have_attribute("data-up", "part")
             playwright.expect(part(page, "field", sensor)).to_have_attribute("data-live", "no")
+        playwright.expect(page.locator("#link")).to_contain_text("; no scan from ")
+        playwright.expect(page.locator("#link")).to_have_attribute("data-up", "part")
         logged(page, "link lost")
+
+
+def test_four_pads_of_a_hand_are_opened_one_at_a_time(demo, folder, open_page):
+    rest = demo["counts"][:1] + noise(200, seed=2)
+    quiet = np.concatenate([rest[:150], np.full_like(rest[:1], -1).repeat(400, axis=0)])
+    broken = rest.copy()
+    broken[:, :, 1, 2] = 65_535
+    with emulated(folder, then_held(demo, pressed(demo)[0]), broken, rest, quiet) as run:
+        page = open_page(run.url)
+
+        def pad(sensor):
+            return page.locator(f'[data-pad="{sensor}"]')
+
+        def opened():
+            return page.eval_on_selector_all(".sensor:not([hidden])", "all => all.map(one => one.dataset.sensor)")
+
+        def reads(sensor, yes):
+            playwright.expect(pad(sensor).locator(".link")).to_have_attribute("data-up", yes)
+
+        playwright.expect(pad("4")).to_have_attribute("data-state", "contact")
+        playwright.expect(page.locator("#hand .pad")).to_have_count(4)
+        assert page.eval_on_selector_all("#hand .pad", "all => all.map(one => one.dataset.pad)") == list(HAND)
+        assert opened() == []
+        for width, height in (PHONE, *SIZES):
+            resize(page, width, height)
+            page.wait_for_function(INSIDE)
+        colours = colours_of(pad("4").locator("canvas").evaluate(RGBA)).reshape(-1, 4)
+        assert len(np.unique(colours, axis=0)) > 20, "a pattern"
+        pad("4").click()
+        live(page)
+        playwright.expect(part(page, "dead", "4")).to_be_hidden()
+        assert opened() == ["4"]
+        page.keyboard.press("]")
+        assert opened() == ["6"] and pad("6").get_attribute("aria-pressed") == "true"
+        playwright.expect(part(page, "dead", "6").filter(has_text="taxel 6 saturated")).to_be_visible()
+        page.keyboard.press("[")
+        page.keyboard.press("[")
+        assert opened() == ["10"]
+        playwright.expect(pad("10")).to_have_attribute("data-state", "silent")
+        reads("10", "no")
+        reads("8", "yes")
+        page.keyboard.press("Escape")
+        assert opened() == []
+        run.emulator.hang_up()
+        for sensor in HAND:
+            reads(sensor, "no")

@@ -1,5 +1,6 @@
 """The live page over loopback, with real sockets."""
 
+import gc
 import http.client
 import json
 import re
@@ -12,42 +13,23 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from view_samples import (
-    CONTRACT,
-    HANDSHAKE,
-    TIMEOUT_S,
-    Press,
-    frame,
-    get,
-    live_page,
-    page,
-    refused_with,
-    viewers,
-    wait_for,
-)
+from map_samples import letter, pixels_mm
+from view_samples import HANDSHAKE, TIMEOUT_S, Mapped, Press, frame, get, live_page, page, refused_with, tell, wait_for
 from websockets.exceptions import ConnectionClosed
 
-from edge.errors import SinkError
-from edge.perception.event import Event
-from edge.pipeline.commands import Command, Commands
 from edge.view import server
-from edge.view.live_view import LiveView
 from edge.view.static_page import SCRIPTS, load_page
-from firmware_bridge.recording.formats import load_recording
 
 __all__ = ["page"]
 TOKEN = "correct-horse-battery"
 
 
 class TestPage:
-    def test_one_file_without_outside_assets_and_nothing_else(self, page):
+    def test_it_is_one_file_without_outside_assets(self, page):
         status, headers, body = get(page)
         key = re.search(rb'name="edge-sr-key" content="([\w-]{22})"', body)
-        assert (
-            status == 200
-            and body == load_page(key[1].decode()).body
-            and headers["Content-Type"].startswith("text/html")
-        )
+        assert (status, body) == (200, load_page(key[1].decode()).body)
+        assert headers["Content-Type"].startswith("text/html")
         assert b"page.css" not in body and not any(name.encode() in body for name in SCRIPTS)
         policy = headers["Content-Security-Policy"]
         assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy and "connect-src 'self'" in policy
@@ -73,7 +55,7 @@ class TestPage:
             with page.viewer(f"?token={TOKEN}") as viewer:
                 assert frame(viewer)[0]["kind"] == "hello"
 
-    def test_on_other_addresses_one_is_made(self, tmp_path):
+    def test_on_other_addresses_a_token_is_made(self, tmp_path):
         with live_page(tmp_path, host="0.0.0.0") as page:
             query = page.view.url.partition("?")[2]
             assert query.startswith("token=") and refused_with(page) == 403
@@ -83,13 +65,12 @@ class TestPage:
             assert urls[-1] == f"http://{socket.gethostname()}:{page.port}/?{query}"
             for url in urls[:-1]:  # each is opened as a person on another machine does, if there is a network
                 host = url.partition("//")[2].partition(":")[0]
-                assert not ip_address(host).is_loopback and urlopen(url, timeout=5).status == 200
+                assert not ip_address(host).is_loopback and urlopen(url, timeout=TIMEOUT_S).status == 200
 
     @pytest.mark.parametrize(
         "request_",
         [
             b"\x16\x03\x01\x02\x00\r\n\r\n",
-            b"POST / HTTP/1.1\r\nHost: localhost\r\n\r\n",
             b"GET / HTTP/1.1\r\n\r\n",
             b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
             b"GET /" + b"x" * 20_000,
@@ -101,7 +82,7 @@ class TestPage:
         assert get(page)[0] == 200
 
     @pytest.mark.parametrize("method", ["POST", "PUT", "HEAD", "G", "GETS"])
-    def test_another_method_is_answered_whatever_comes_behind_it(self, page, method):
+    def test_another_method_is_answered_whatever_follows(self, page, method):
         connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=TIMEOUT_S)
         connection.request(method, "/", body="x" * 5000)
         response = connection.getresponse()
@@ -122,33 +103,17 @@ class TestPage:
             assert stranger.recv(1000) == b""
             assert get(page)[0] == 200
 
-    def test_a_port_in_use_is_one_line(self, page, tmp_path):
-        words = (
-            rf"no live page: cannot listen on 127.0.0.1:{page.port}: address in use; "
-            "name another port with --view, or 0 for any free one"
-        )
-        with pytest.raises(SinkError, match=words):
-            LiveView("127.0.0.1", page.port, None, tmp_path, CONTRACT, Commands())
-
-    @pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
-    def test_an_address_that_is_not_ours_is_one_line(self, tmp_path, host):
-        with pytest.raises(SinkError, match=rf"no live page: {host} is not an address of this machine; name one with"):
-            LiveView(host, 0, None, tmp_path, CONTRACT, Commands())
-
 
 class TestFrames:
-    def test_hello_comes_first_and_says_that_it_is_emulated(self, page):
-        page.play(3)
-        with page.viewer() as viewer:
-            header, _ = frame(viewer)
-            assert header["kind"] == "hello" and (header["name"], header["source"]) == ("pretended", "emulated")
-            assert frame(viewer, "result")[0]["source"] == "emulated"
-
     def test_results_are_sampled_and_the_pattern_is_the_loops(self, page):
         with page.viewer() as viewer, page.playing():
             began_s = time.monotonic()
             seen = [frame(viewer, "result") for _ in range(15)]
             took_s = time.monotonic() - began_s
+            sockets = [one for one in gc.get_objects() if type(one) is socket.socket and one.fileno() >= 0]
+            ours = [one for one in sockets if one.getsockname()[1:] == (page.port,)]
+            # No frame waits for the one before it to be acknowledged.
+            assert len(ours) == 2 and all(one.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) for one in ours)
         scans = [header["scan"] for header, _ in seen]
         assert sum(len(header["trace"]) for header, _ in seen) == scans[-1] + 1
         assert scans == sorted(set(scans))
@@ -159,17 +124,10 @@ class TestFrames:
         for result in again:
             np.testing.assert_array_equal(shown[result.scan.number]["pattern"], result.pattern)
 
-    def test_a_frame_does_not_wait_for_the_one_before(self, page):
-        with page.viewer() as viewer:
-            frame(viewer, "state")
-            (connection,) = page.view._server._viewers
-            accepted = connection.transport.get_extra_info("socket")
-            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-
-    def test_state_comes_when_something_changes_and_every_second(self, page, monkeypatch):
+    def test_state_comes_with_every_change_and_every_second(self, page, monkeypatch):
         monkeypatch.setattr(server, "STATE_S", 0.05)
         with page.viewer() as first:
-            assert frame(first, "state")[0] | {"maps": []} == {
+            assert frame(first, "state")[0] == {
                 "kind": "state",
                 "recording": None,
                 "viewers": 1,
@@ -185,57 +143,55 @@ class TestFrames:
             page.play()
             wait_for(lambda: frame(first, "state")[0]["silent"].get("4", 0) >= 0.5)
 
-    def test_events_reach_all_and_also_who_comes_later(self, page):
-        with page.viewer() as first:
-            for sink in page.view.sinks:
-                sink.tell(Event(1, "lost", None, "gone"), {"outages": 1})
-            assert frame(first, "event")[0]["note"] == "gone"
-            with page.viewer() as second:
-                assert frame(second, "event")[0]["note"] == "gone"
+    def test_of_a_map_only_what_has_changed_is_sent(self, page):
+        mapped = Mapped(page, letter)
+        page.play()
+        whole = np.full((240, 240), np.nan, dtype=np.float32)
+        with page.viewer() as viewer:
+            for place, x_mm in enumerate((-12.0, -11.0, 0.0)):
+                mapped.touch(x_mm, 0.0)
+                header, maps = frame(viewer, "map")
+                (top, left), part = header["from"], maps["contact"]
+                whole[top : top + part.shape[0], left : left + part.shape[1]] = part
+                assert np.array_equal(whole, mapped.sink.whole.layers().contact, equal_nan=True)
+                assert part.size < 0.4 * 240**2 and header["pads"] == {"4": [x_mm, 0.0, 0.0]}
+                assert header["counts"]["fused"] == place
+            mapped.touch(0.0, 0.0, pattern=None, contact=False)  # the end of the press, at the same place
+            mapped.touch(0.0, 0.0, pattern=None, contact=False)
+            assert wait_for(lambda: frame(viewer, "map"))[0]["counts"]["fused"] == 3
+        x_mm, y_mm = pixels_mm(mapped.sink.whole.grid)
+        assert (whole[(letter(x_mm, y_mm) == 0) & (np.abs(y_mm) < 8) & (np.abs(x_mm + 12) < 3)] > 0.9).all()
 
-    def test_viewers_are_told_when_the_run_ends(self, tmp_path):
+    def test_viewers_are_told_when_the_run_ends(self, tmp_path, monkeypatch):
+        """Whoever else is there, and says nothing, holds up no end."""
+        monkeypatch.setattr(server, "OPEN_S", 600.0)
+        threads = threading.active_count()
         with ExitStack() as run:
             page = run.enter_context(live_page(tmp_path))
-            with page.viewer() as viewer:
-                frame(viewer)
+            with page.stranger(), page.stranger(HANDSHAKE), page.viewer() as viewer:
+                wait_for(lambda: frame(viewer, "state")[0]["viewers"] == 2)
                 run.close()
                 with pytest.raises(ConnectionClosed) as caught:
                     while True:
                         viewer.recv(TIMEOUT_S)
         assert caught.value.rcvd is not None
         assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1001, "the run has ended")
-        assert not any(thread.name == "live-view" for thread in threading.enumerate())
-
-    def test_who_reads_nothing_and_who_says_nothing_hold_up_no_end(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(server, "OPEN_S", 60.0)
-        with live_page(tmp_path) as page, page.stranger(), page.stranger(HANDSHAKE):
-            wait_for(lambda: viewers(page) == 1)
-            (watching,) = page.view._server._viewers
-            page.view._server._loop.call_soon_threadsafe(watching.transport.write, bytes(50_000_000))
-            closing = threading.Thread(target=page.view._server.close)
-            closing.start()
-            closing.join(20)  # it is over in one second, or in a minute at the earliest
-            assert not closing.is_alive()
+        assert threading.active_count() == threads
 
 
-class TestCommands:
-    def test_they_reach_the_loop(self, page):
-        with page.viewer() as viewer:
-            for command in ({"cmd": "zero", "sensor": "4"}, {"cmd": "reset"}):
-                viewer.send(json.dumps(command))
-            assert page.polled(2) == [Command("zero", "4"), Command("reset")]
-
-    def test_what_is_none_is_answered_to_who_asked_alone(self, page):
-        with page.viewer() as viewer, page.viewer() as other:
-            viewer.send('{"cmd": "jump"}')
-            answer = frame(viewer, "event")[0]
+class TestAsked:
+    def test_events_reach_all_and_a_refusal_who_asked_alone(self, page):
+        with page.viewer() as first, page.viewer() as other:
+            first.send('{"cmd": "jump"}')
+            answer = frame(first, "event")[0]
             assert answer["event"] == "refused" and "is not a command: expected" in answer["note"]
-            for sink in page.view.sinks:
-                sink.tell(Event(1, "lost", None, "gone"), {})
-            assert frame(other, "event")[0]["event"] == "lost"
+            tell(page, "lost", None, "gone")
+            assert frame(first, "event")[0]["note"] == frame(other, "event")[0]["note"] == "gone"
+            with page.viewer() as late:
+                assert frame(late, "event")[0]["note"] == "gone"
         assert page.asked.refused == 1
 
-    def test_one_that_is_too_long_ends_its_own_connection_alone(self, page):
+    def test_a_message_that_is_too_long_ends_its_own_connection_alone(self, page):
         with page.viewer() as viewer, page.viewer() as other:
             viewer.send("x" * 5000)
             with pytest.raises(ConnectionClosed) as caught:
@@ -250,36 +206,8 @@ class TestCommands:
             page = run.enter_context(live_page(tmp_path))
             with page.viewer() as viewer, page.viewer() as other:
                 for _ in range(500):
-                    viewer.send("{}")
+                    viewer.send(json.dumps({}))
                 page.play()
                 assert frame(other, "result")
                 run.close()
             assert page.asked.refused < 250  # what waits is not read to its end, either
-
-    def test_pause_is_the_viewers_own(self, page):
-        with page.viewer() as viewer, page.viewer() as other:
-            viewer.send('{"cmd": "pause", "on": true}')
-            viewer.send("is it so?")  # answered after it
-            frame(viewer, "event")
-            with page.playing():
-                frame(other, "result")
-                viewer.send("and now?")
-                while (header := frame(viewer)[0])["kind"] != "event":
-                    assert header["kind"] == "state"
-                viewer.send('{"cmd": "pause", "on": false}')
-                header = frame(viewer, "result")[0]
-            assert len(header["trace"]) > 1
-
-    def test_record_is_told_to_all_and_makes_a_recording(self, page, tmp_path):
-        with page.viewer() as viewer, page.viewer() as other:
-            viewer.send('{"cmd": "record", "on": true}')
-            wait_for(lambda: (page.asked.poll() == [] and page.wait()) or page.messages)
-            path = frame(other, "event")[0]["note"].removeprefix("recording into ")
-            wait_for(lambda: frame(other, "state")[0]["recording"] == path)
-            page.play(5)
-            viewer.send('{"cmd": "record", "on": false}')
-            wait_for(
-                lambda: (page.asked.poll(), page.wait()) and [e.text[:8] for e in page.messages][1:] == ["recorded"]
-            )
-            wait_for(lambda: frame(viewer, "state")[0]["recording"] is None)
-        assert [len(track.counts) for track in load_recording(path).tracks] == [5]

@@ -1,0 +1,325 @@
+"""The live page of results that no recording holds: forces, places, doubts and maps; and the page through a proxy."""
+
+import contextlib
+import re
+import socket
+import threading
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+from browser_samples import (
+    RGBA,
+    TOKEN,
+    browser,
+    colours_of,
+    live,
+    logged,
+    number,
+    open_page,
+    painted,
+    part,
+    playwright,
+    resize,
+    word,
+)
+from edge_samples import make_pad_contract
+from map_samples import letter
+from matplotlib.image import imread
+from view_samples import CONTRACT, Mapped, Press, live_page, tell, wait_for
+
+from edge.perception.event import Note
+from edge.perception.result import NextTap
+from edge.perception.wrench import Wrench
+
+__all__ = ["browser", "open_page"]
+
+# Whether anything is drawn over a pattern around a share of its width and height.
+DRAWN = """([x, y]) => {
+  const canvas = document.querySelector('[data-part="over"]');
+  const [left, top] = [Math.round(x * canvas.width) - 1, Math.round(y * canvas.height) - 1];
+  return canvas.getContext("2d").getImageData(left, top, 3, 3).data.some((one, at) => at % 4 === 3 && one > 0);
+}"""
+CENTRE, PITCH = 0.5, 2.35 / 18.8
+"""Middle of a pad and half a taxel's pitch, as shares of its width."""
+LIT = """() => {
+  const canvas = document.getElementById("map-over");
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  const lit = [];
+  for (let at = 0; at < canvas.width * canvas.height; at++)
+    if (data[4 * at] > 200 && data[4 * at + 3] > 200) lit.push(at);
+  return [canvas.width, canvas.height, ...lit];
+}"""
+
+
+def drawn(page, x, y):
+    return page.evaluate(DRAWN, [x, y])
+
+
+def picture_of(page):
+    return imread(BytesIO(part(page, "field").screenshot()))[..., :3]
+
+
+def red_share(page):
+    picture = picture_of(page)
+    return float(np.mean((picture[..., 0] > 0.55) & (picture[..., 0] > 2 * picture[..., 1])))
+
+
+def test_force_and_torque_are_told_and_drawn(open_page, tmp_path):
+    contract = make_pad_contract(interval_factor=1.6)
+    wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35))
+    made = replace(Press(contract=contract).next(), wrench=wrench)
+    with live_page(tmp_path, contract=contract) as shown, shown.playing(lambda: made):
+        page = open_page(shown.view.url)
+        live(page)
+        for name, text in {
+            "wrench_force": r"0\.30, 0\.00, 0\.40\sN",
+            "wrench_torque": r"\u22120\.9, 0\.9\sN\smm",
+            "wrench_twist": r"\u22121\.[23]\sN\smm",
+            "centre_of_pressure_mm": r"\u22122\.[34], \u22122\.[34]\smm",
+            "wrench_origin": "nominal",
+        }.items():
+            playwright.expect(number(page, name)).to_have_text(re.compile(f"^{text}$"))
+        centre = CENTRE - PITCH
+        assert drawn(page, centre + 0.1, centre), "the arrow of the shear, 0.24 of the width to the right"
+        assert not drawn(page, centre - 0.1, centre) and not drawn(page, centre + 0.3, centre)
+
+
+def test_the_pad_is_outlined_where_to_touch_next(open_page, tmp_path):
+    press = Press()
+    idle, contact = press.next(0), press.next(3000)
+    shows = [idle]
+    with live_page(tmp_path) as shown, shown.playing(lambda: shows[0]):
+        page = open_page(shown.view.url)
+        next_tap, state = playwright.expect(number(page, "next_tap")), playwright.expect(part(page, "word"))
+        for result, text in ((idle, "idle"), (contact, "contact")):
+            shows[0] = result
+            state.to_have_text(text)
+        assert number(page, "wrench_force").count() == 0
+        playwright.expect(part(page, "verdict")).to_have_text("not checked: the model has no checks")
+        playwright.expect(number(page, "trusted")).to_have_text(re.compile("not checked|\u2013"))
+        shows[0] = idle
+        state.to_have_text("idle")
+        next_tap.to_have_text("\u2013")
+        arrow, mirrored = ([CENTRE + side * PITCH / 2] * 2 for side in (1, -1))  # the arrow begins at the centre
+        assert not drawn(page, *arrow)
+        shows[0] = replace(idle, next_tap=NextTap(2.35, 2.35, 0.0))
+        next_tap.to_have_text("2.4\u202fmm right, 2.4\u202fmm down")
+        page.wait_for_function(DRAWN, arg=arrow)
+        edges = [[(0.6 + step / 40, PITCH), (PITCH, 0.6 + step / 40)] for step in range(4)]  # of dashes
+        for edge in zip(*edges, strict=True):
+            assert any(drawn(page, *place) for place in edge)
+        assert not drawn(page, *mirrored)
+        shows[0] = replace(idle, next_tap=NextTap(-2.35, -2.35, 0.0))
+        next_tap.to_contain_text("2.4\u202fmm left, 2.4\u202fmm up")
+        page.wait_for_function(DRAWN, arg=mirrored)
+        assert not drawn(page, *arrow)
+        shows[0] = contact
+        state.to_have_text("contact")
+        next_tap.to_have_text("\u2013")
+        assert not drawn(page, *mirrored)
+
+
+def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page, tmp_path):
+    contact = Press().next()
+    believed = replace(contact, trusted=True, mismatch=0.021, tap_mismatch=(0.0, 0.25))
+    unbelieved = replace(contact, trusted=False, mismatch=0.4, untrusted_reason="unfamiliar")
+    text = "baseline in doubt: most taxels are off it; free the pad and zero again"
+    doubt = {"state": "baseline_in_doubt", "contact": None, "trusted": False, "untrusted_reason": "baseline"}
+    in_doubt = replace(contact, notes=(Note("baseline_in_doubt", text),), area_mm2=None, **doubt)
+    shows = [believed]
+    contract = replace(CONTRACT, trust={"made": "of something"})
+    with live_page(tmp_path, contract=contract) as shown, shown.playing(lambda: shows[0]):
+        page = open_page(shown.view.url)
+        verdict, trusted = playwright.expect(part(page, "verdict")), playwright.expect(number(page, "trusted"))
+        live(page)
+        trusted.to_have_text("yes")
+        playwright.expect(number(page, "mismatch")).to_have_text("2.1\u202f%")
+        playwright.expect(number(page, "tap_mismatch")).to_have_text("0.00, 0.25")
+        playwright.expect(number(page, "reused_from")).to_have_text("new")
+        verdict.to_be_hidden()
+        assert red_share(page) < 0.01
+
+        shows[0] = unbelieved
+        word(page, "contact, not believed")
+        verdict.to_have_text(
+            "not to be believed: readings like no contact (a magnet or steel near? the id map? the axes?)"
+        )
+        playwright.expect(page.locator("#live")).to_have_text("sensor 4: contact, not believed")
+        trusted.to_have_text("no: unfamiliar")
+        for size in ((844, 390), (1280, 800)):
+            resize(page, *size)
+            verdict.to_be_in_viewport()
+            wait_for(lambda: red_share(page) > 0.25)
+        page.keyboard.press("Space")
+        word(page, "paused")
+        assert red_share(page) > 0.25, "it stays what it was while it is looked at"
+        page.keyboard.press("Space")
+
+        shows[0] = replace(contact, trusted=None)
+        verdict.to_have_text("too light to check whether the pattern is to be believed")
+        trusted.to_have_text("too light to check")
+        word(page, "contact")
+        assert red_share(page) < 0.01
+
+        shows[0] = in_doubt
+        word(page, "baseline in doubt")
+        playwright.expect(part(page, "stamp")).to_have_text(f"{text} (key z)")
+        playwright.expect(part(page, "stamp")).to_be_visible()
+        verdict.to_be_hidden()
+        trusted.to_have_text("no: baseline")
+        assert np.ptp(picture_of(page), axis=2).max() < 0.1, "a colour"
+
+        forgotten = "the tap before does not belong to this contact, and is forgotten"
+        tell(shown, "tap_dropped", "4", forgotten)
+        tell(shown, "suspected", "4", "")
+        logged(page, f"sensor 4: {forgotten}")
+        suspected = re.compile("several contacts in a row read like none")
+        playwright.expect(page.locator("#log .bad")).to_have_text(suspected)
+
+
+def shown_on(page):
+    return colours_of(page.locator("#map-contact").evaluate(RGBA))
+
+
+def outline(page):
+    """Return the least and the largest x and the least y of what is drawn above the bar of the scale, in [mm]."""
+    width, height, *lit = page.evaluate(LIT)
+    at = np.array(lit, dtype=int)
+    x_mm, y_mm = (at % width + 0.5) / width * 60 - 30, (at // width + 0.5) / height * 60 - 30
+    pad = y_mm < 23
+    return (x_mm[pad].min(), x_mm[pad].max(), y_mm[pad].min()) if pad.any() else (np.nan,) * 3
+
+
+def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page, tmp_path):
+    with live_page(tmp_path) as shown:
+        mapped = Mapped(shown, letter)
+        page = open_page(shown.view.url)
+        counts = playwright.expect(page.locator("#map-counts"))
+        playwright.expect(page.locator("#map")).to_be_hidden()
+        shown.play()
+        mapped.touch(-12.0, -8.0)
+        playwright.expect(page.locator("#map")).to_be_visible()
+        mapped.touch(-12.0, 8.0)
+        mapped.touch(2.0, 16.0)
+        mapped.touch(20.0, -20.0, 30.0, trusted=False)
+        counts.to_have_text("EMULATED: 3 patterns")
+        mapped.touch(0.0, 0.0, posed=False)
+        counts.to_have_text("EMULATED: 3 patterns, 1 not believed, 1 without a pose")
+        rgba, layers = shown_on(page), mapped.sink.whole.layers()
+        known = np.isfinite(layers.contact)
+        assert (rgba[..., 3] == 255).sum() == (known | (layers.doubted > 0)).sum()
+        assert (rgba[known & (layers.contact > 0.9)][:, 0] > 200).all(), "touched is the light end of the scale"
+        assert (rgba[known & (layers.contact < 0.1)][:, 0] < 80).all()
+        red = ~known & (layers.doubted > 0)
+        assert red.sum() > 1000 and (rgba[red][:, :3] == (200, 40, 30)).all()
+        mapped.touch(10.0, -5.0, 45.0)
+        reach = 9.4 * 2**0.5
+        around = pytest.approx((10 - reach, 10 + reach, -5 - reach), abs=0.5)
+        wait_for(lambda: outline(page) == around)
+
+        page.keyboard.press("Space")
+        playwright.expect(page.locator("#pause")).to_have_attribute("aria-pressed", "true")
+        before = shown_on(page)
+        for y_mm in (16.0, 0.0, -16.0):
+            mapped.touch(-20.0, y_mm)
+        for detail in ("first", "second"):  # what is sent with the first comes before the second
+            tell(shown, "tap_dropped", "4", detail)
+            logged(page, detail)
+        painted(page)
+        resize(page, 844, 800)
+        assert outline(page) == around, "a canvas of another size is painted, though paused"
+        assert np.array_equal(shown_on(page), before), "what is looked at stays"
+        page.keyboard.press("Space")
+        late = open_page(shown.view.url)
+        layers = mapped.sink.whole.layers()
+        for one in (page, late):
+            playwright.expect(one.locator("#map-counts")).to_contain_text("EMULATED: 6 patterns")
+            there = shown_on(one)[..., 3] == 255
+            assert np.array_equal(there, np.isfinite(layers.contact) | (layers.doubted > 0))
+
+
+def pump(source, sink):
+    with contextlib.suppress(OSError):
+        while data := source.recv(65536):
+            sink.sendall(data)
+    with contextlib.suppress(OSError):
+        sink.shutdown(socket.SHUT_WR)
+
+
+@contextlib.contextmanager
+def proxy(port, *, below="/edge/", host=None, sockets=True, status="404 Not Found"):
+    """Serve the page at `port` below a path, with another Host as nginx sends it; yield the address."""
+
+    def serve(client):
+        head = b""
+        while b"\r\n\r\n" not in head:
+            if not (data := client.recv(65536)):
+                return
+            head += data
+        method, path, rest = head.split(b" ", 2)
+        if not path.startswith(below.encode()) or (b"/ws" in path and sockets is None):
+            client.sendall(f"HTTP/1.1 {status}\r\nContent-Length: 0\r\nConnection: close\r\n\r\n".encode())
+            client.close()
+            return
+        if host is not None:
+            rest = re.sub(rb"\r\nHost: [^\r]*", b"\r\nHost: " + host.encode(), rest, flags=re.IGNORECASE)
+        if not sockets:
+            rest = re.sub(rb"\r\n(Upgrade|Connection): [^\r]*", b"", rest, flags=re.IGNORECASE)
+        upstream = socket.create_connection(("127.0.0.1", port))
+        upstream.sendall(b" ".join((method, path[len(below) - 1 :], rest)))
+        threading.Thread(target=pump, args=(upstream, client), daemon=True).start()
+        pump(client, upstream)
+
+    def accept():
+        with contextlib.suppress(OSError):
+            while True:
+                threading.Thread(target=serve, args=(listener.accept()[0],), daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=accept, daemon=True).start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}{below}"
+        listener.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize(
+    ("below", "host", "token"),
+    [
+        ("/edge/", None, None),
+        ("/", "127.0.0.1:{port}", None),
+        ("/a/b/", "localhost", None),
+        ("/edge/", "edge_up", TOKEN),
+    ],
+)
+def test_through_a_proxy_the_page_finds_its_socket(tmp_path, open_page, below, host, token):
+    with (
+        live_page(tmp_path, token=token) as view,
+        proxy(view.port, below=below, host=host and host.format(port=view.port)) as url,
+    ):
+        page = open_page(url + (f"?token={token}" if token else ""))
+        for _ in range(2):
+            playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
+            page.reload()
+
+
+@pytest.mark.parametrize(
+    ("settings", "token", "words"),
+    [
+        ({}, TOKEN, "the token is missing or wrong"),
+        ({"sockets": False}, None, "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
+        ({"sockets": None}, None, "answers 404 for /edge/ws, and not edge-sr"),
+        ({"sockets": None, "status": "502 Bad Gateway"}, None, "answers 502 for /edge/ws, and not edge-sr"),
+    ],
+)
+def test_a_page_that_a_proxy_cuts_off_shows_why(tmp_path, open_page, settings, token, words):
+    with live_page(tmp_path, token=token) as view, proxy(view.port, **settings) as url:
+        playwright.expect(open_page(url).locator("#trouble")).to_contain_text(words)
+
+
+def test_a_page_of_another_name_shows_that_it_needs_the_token(tmp_path, open_page):
+    """Chromium resolves every name that ends in .localhost to this machine, as a stranger's server may."""
+    with live_page(tmp_path) as view, proxy(view.port, host=f"127.0.0.1:{view.port}") as url:
+        trouble = open_page(url.replace("127.0.0.1", "robot.localhost")).locator("#trouble")
+        playwright.expect(trouble).to_contain_text("may not send requests to this server")
+        playwright.expect(trouble).to_contain_text("--view-token")
