@@ -178,7 +178,7 @@ def run(
     """Run `edge-sr doctor`; returns the exit code.
 
     Args:
-        options: of edge.doctor.options.doctor_parser.
+        options: of `edge-sr doctor`.
         out: for the findings.
         err: for requests to a person; no press is asked for where it is no terminal.
         clock_s: the clock of the scans, monotonic, in [s].
