@@ -61,7 +61,7 @@ class Visit:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with Progress("watching", length_s, SECONDS, stream=self._err, clock_s=self._clock_s) as bar:
+        with Progress("watching", length_s, SECONDS, stream=self._err) as bar:
 
             def show(scans: int, passed_s: float) -> None:
                 if passed_s > 0:
