@@ -33,12 +33,7 @@ _WIDEST: Final = 72
 
 
 class DemoMap(MapSink):
-    """Map of the slide alone, beside the truth.
-
-    Attributes:
-        begun: True once the slide has begun.
-        complete: True once it is over.
-    """
+    """Map of the slide alone, beside the truth: `begun` and `complete` are true once the slide has, or is."""
 
     def __init__(
         self, recording: Path, show: Callable[[MapState], object] | None, on_complete: Callable[["DemoMap"], object]
@@ -83,15 +78,10 @@ class DemoMap(MapSink):
 
 
 class Demo:
-    """Parts of the demo around one run.
+    """Parts of the demo around one run, which prints to `stream`, and shows its map on the live page, if there is one.
 
-    Args:
-        model: that is scored.
-        source: the demo's, open.
-        stream: of what is printed.
-        view: the live page, which shows the map; None without.
-        loops: the demo goes on after its end, so that each part is printed once it is complete.
-        maps: the demo makes a map; False where the user does.
+    Where it `loops`, it goes on after its end, and each part is printed once it is complete. It makes a map of its own
+    where `maps` is true, and the user does not.
     """
 
     def __init__(

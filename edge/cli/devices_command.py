@@ -16,11 +16,7 @@ SERVER_HINT = "The vendor's server, where one runs, is not searched for: --sourc
 
 
 def run(*, as_json: bool, stdout: TextIO) -> None:
-    """Print the devices, opening none; as JSON for programs.
-
-    Raises:
-        DeviceError: no device is of a kind that sensors are usually connected to; the others were printed.
-    """
+    """Print the devices, opening none, as JSON for programs; raises DeviceError if no adapter is among them."""
     found, notes = devices()
     if as_json:
         stdout.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")

@@ -25,11 +25,7 @@ UNEVEN: Final = 3.0
 
 
 def run(*, measure: bool, stdout: TextIO) -> None:
-    """Print the bundled models.
-
-    Raises:
-        ModelError: none is bundled, or one cannot be used.
-    """
+    """Print the bundled models; raises ModelError if there is none, or one cannot be used."""
     paths = bundled_models()
     if not paths:
         raise ModelError("no models are bundled with this installation")

@@ -53,11 +53,7 @@ def understood(command: str, arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
-    """Return the flags of the runtime, each by its own name; options without a flag keep their defaults.
-
-    Raises:
-        UsageError: thresholds or a time are out of range.
-    """
+    """Return the flags of the runtime, each by its own name; options without a flag keep their defaults."""
     given = vars(options)
     return RuntimeOptions(**{name: given[name] for name in asdict(DEFAULTS) if name in given})
 

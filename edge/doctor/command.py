@@ -144,13 +144,7 @@ def run(
     *,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> int:
-    """Run `edge-sr doctor`; returns the exit code.
-
-    Args:
-        options: of `edge-sr doctor`.
-        out: for the findings.
-        err: for requests to a person; no press is asked for where it is no terminal.
-        clock_s: the clock of the scans, monotonic, in [s].
+    """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
     Raises:
         BridgeError: of the source, or of the files; a link that was lost, and a sensor file that could not be written

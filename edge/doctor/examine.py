@@ -58,12 +58,9 @@ _PRESSED: Final = (
 
 @dataclass(frozen=True)
 class Examined:
-    """Findings, and baselines of the pads that may be zeroed, by sensor.
+    """Findings of link and sensors, and by sensor the baselines of the pads that may be zeroed.
 
-    Attributes:
-        findings: of link and sensors.
-        baselines: of the pads as they are.
-        loaded: sensors whose pads something presses, as an earlier baseline shows: theirs are not those of free pads.
+    The pads of `loaded` sensors are not free, as an earlier baseline shows.
     """
 
     findings: list[Finding]
@@ -123,11 +120,8 @@ def check_baseline(
 ) -> tuple[Baseline | None, Finding]:
     """Return the baseline of the last scans if the pad can be zeroed, and the finding on it.
 
-    Args:
-        scans: of one sensor.
-        living: (taxels,), taxels that are zeroed; there is a baseline only if all are living.
-        spoiled: name of another finding that explains a refusal.
-        unix_time_s: time of the last scan, in [s] since 1970.
+    There is one only if all taxels are `living`; `spoiled` names another finding that explains a refusal. The last scan
+    was at `unix_time_s`, in [s] since 1970.
     """
     needed = zeroing.FEWEST_SCANS
     norm = f"{needed} scans that span at most {' / '.join(f'{limit:.0f}' for limit in zeroing.SPREAD_LIMIT_COUNTS)}"
@@ -158,10 +152,8 @@ def check_load(
 ) -> Finding:
     """Check whether something lies on the pad; only an earlier baseline of the free pad can show it.
 
-    Args:
-        rest_counts: (3, taxels) now; NaN where silent.
-        reference: the earlier baseline.
-        mounting: gives the direction of z, which separates a load now from one then; None where it is as wired.
+    The rest now is (3, taxels), NaN where silent. The mounting gives the direction of z, which tells a load now from
+    one then; without one it is as wired.
     """
     norm = f"z within {LOAD_LIMIT_COUNTS:.0f} counts of the baseline before"
     if reference is None:

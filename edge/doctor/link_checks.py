@@ -137,13 +137,7 @@ def check_baud(
 ) -> Finding | None:
     """Check that the serial line carries what the sensors send; None where there is no serial line.
 
-    Args:
-        facts: of the line.
-        counters: of the link.
-        duration_s: for which it was watched, in [s].
-        sensors: number of those on the bus.
-        rate_hz: of each, where a user expects one, in [Hz].
-        taxel_count: of each sensor.
+    It was watched for `duration_s`, with so many sensors on the bus, of which a user expects `rate_hz` each, or None.
     """
     frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
     if facts.baud is None or not frames or not sensors or duration_s <= 0:

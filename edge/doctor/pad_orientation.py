@@ -32,11 +32,10 @@ _OFF_THE_MIDDLE: Final = 0.4
 
 @dataclass(frozen=True)
 class Press:
-    """Result of the press on one corner.
+    """Press on one corner.
 
     Attributes:
-        place: of the corner that was asked for, one of the geometry's corners.
-        taxel: the corner of the taxels that answered, one of the same.
+        place: that was asked for, and the taxel that answered: each one of the geometry's corners.
         z_counts: summed z.
         push_counts: change of the summed x and y when pushed to the middle; None where no push was felt.
     """
@@ -149,11 +148,7 @@ def judge_press(
 ) -> tuple[list[Finding], Mounting | None]:
     """Return the findings, and the mounting that they give; None while order or axes are not clear.
 
-    Args:
-        answer: of the guided press.
-        kept: the results go into a sensor file, so that nothing is left to be done.
-        weighed: a weight was asked for.
-        geometry: of the sensor.
+    Where the results are `kept`, in a sensor file, nothing is left to be done; a weight was asked for if `weighed`.
     """
     presses = answer.presses
     verdict, remedy = "wrong", "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"

@@ -39,18 +39,15 @@ class Watch:
         stop: threading.Event,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepare to watch the source that `texts` names, one at most.
+        """Prepare to watch the source that `texts` names, one at most, which raises what source_setup.links_to raises.
 
         Args:
-            texts: as in edge.pipeline.source_setup.links_to, which raises what it raises.
+            texts: the source.
             known: facts on the sensors.
             references: earlier baselines of the free pads, by sensor.
             rate_hz: expected of each sensor, in [Hz].
             stop: ends the watch when it is set.
             clock_s: the clock of the scans, monotonic, in [s].
-
-        Raises:
-            UsageError: several sources, or a rate or references that are not valid.
         """
         if len(texts) > 1:
             raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")

@@ -18,11 +18,7 @@ _AS_WIRED = frozenset({"mounting"})
 def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
-    Args:
-        path: of the file.
-        known: sensor file that the doctor started with.
-        presses: presses will be asked for.
-        weighs: a weight will be asked for.
+    The doctor started with what is `known`, and will ask for `presses`, and for a weight where it `weighs`.
 
     Raises:
         SensorFileError: the file cannot be written, or holds values that this visit cannot measure.

@@ -61,7 +61,7 @@ class MapSink(Sink):
             npz: file of the layers, written on `close`, and at a reset; later maps have a number in their names.
             png: picture, written likewise.
             show: called with the map's state a few times a second; it must not wait.
-            origin: see above.
+            origin: as above.
             clock_ns: monotonic, in [ns].
 
         Raises:

@@ -67,10 +67,7 @@ class Access:
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
         """Return the refusal of a request; None if it is granted.
 
-        Args:
-            path: with its query.
-            hosts: values of its Host header.
-            origins: values of its Origin header; only browsers send it.
+        The path has its query; `hosts` and `origins` are the values of these headers, the latter of browsers alone.
         """
         called = ", ".join(hosts) or "nothing"
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
@@ -99,10 +96,7 @@ class Access:
     def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:
         """Return the addresses of the page, the most useful first.
 
-        Args:
-            port: of the server.
-            addresses: of this machine, where the server listens at all of them. Its name is the last: other machines
-                may not know it.
+        Where the server listens at all `addresses` of this machine, its name is the last: others may not know it.
         """
         hosts = [*addresses, self.name] if is_everything(self.host) else [self.host]
         query = "" if self.token is None else f"?token={self.token}"

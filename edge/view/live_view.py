@@ -37,11 +37,11 @@ class LiveView:
     def __init__(
         self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract, commands: Commands
     ) -> None:
-        """Take the port.
+        """Take the port, 0 for any free one.
 
         Args:
             host: name or address to listen at.
-            port: 0 for any free one.
+            port: to listen at.
             token: that requests must carry; None makes one where other machines can reach `host`.
             record_dir: folder in which recordings are made.
             contract: of the run's model.
