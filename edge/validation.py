@@ -1,4 +1,4 @@
-"""Checks of the arguments that a caller of the library passes; each refuses in one line."""
+"""Checks of the arguments that a caller of the library passes; each raises a UsageError of one line."""
 
 from collections.abc import Mapping
 from numbers import Integral, Real
@@ -23,32 +23,20 @@ def as_float(value: Any) -> float | None:
 
 
 def check_positive(name: str, number: Any, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> None:
-    """Check that the value called `name` is a positive number in a range.
-
-    Raises:
-        UsageError: it is not.
-    """
+    """Check that the value called `name` is a positive number in a range."""
     value = as_float(number)
     if value is None or not low <= value <= high:
         raise UsageError(f"{name} is {number!r}, expected a positive number, {low:g} to {high:g}")
 
 
 def check_whole(name: str, number: Any, least: int) -> None:
-    """Check that the value called `name` is a whole number from `least`, and one that fits into an int32.
-
-    Raises:
-        UsageError: it is not.
-    """
+    """Check that the value called `name` is a whole number from `least`, and one that fits into an int32."""
     if not isinstance(number, Integral) or not least <= int(number) < 2**31:
         raise UsageError(f"{name} is {number!r}, expected a whole number from {least}")
 
 
 def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
-    """Check that baselines are given by sensor name and are of one grid.
-
-    Raises:
-        UsageError: they are not baselines, or of another grid.
-    """
+    """Check that baselines are given by sensor name and are of one grid."""
     if not isinstance(baselines, Mapping):
         raise UsageError(
             f"baselines are a {type(baselines).__name__}, expected their file, or each by its sensor's name"
@@ -62,11 +50,7 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
 
 
 def check_pads(pads: Any, geometry: SensorGeometry) -> None:
-    """Check that pads are one for all sensors, one by each sensor name, or None, with gains of one grid.
-
-    Raises:
-        UsageError: they are none of these.
-    """
+    """Check that pads are one for all sensors, one by each sensor name, or None, with gains of one grid."""
     if isinstance(pads, Mapping):
         for name, pad in pads.items():
             if not isinstance(pad, Pad):
@@ -87,11 +71,7 @@ def _check_gains(name: str, pad: Pad, geometry: SensorGeometry) -> None:
 
 
 def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry) -> None:
-    """Check that mountings, by sensor name, are of one grid.
-
-    Raises:
-        UsageError: a mounting has another number of taxels.
-    """
+    """Check that mountings, by sensor name, are of one grid."""
     for name, mounting in mountings.items():
         if mounting.taxel_count != geometry.taxel_count:
             got = f"mounting of sensor {name} is of {mounting.taxel_count} taxels"
@@ -99,11 +79,7 @@ def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry)
 
 
 def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
-    """Refuse counts per newton, of all sensors or by name, that no pad has.
-
-    Raises:
-        UsageError: they are out of range.
-    """
+    """Check that counts per newton, of all sensors or by name, are such as a pad may have."""
     if isinstance(counts, Mapping):
         for name, one in counts.items():
             check_positive(f"counts_per_newton of sensor {name}", one, *PAD_RANGES["counts_per_newton"])

@@ -10,30 +10,10 @@ from argparse_manpage.manpage import Manpage
 
 from edge import __version__
 from edge.bench.options import bench_parser
-from edge.cli.run_options import (
-    baseline_parser,
-    demo_parser,
-    devices_parser,
-    map_parser,
-    models_parser,
-    record_parser,
-    replay_parser,
-    run_parser,
-)
-from edge.doctor.options import doctor_parser
+from edge.cli.run_options import parser
 from edge.inference.bundled import bundled_models
 
-PARSERS: Final = {
-    "demo": demo_parser,
-    "record": record_parser,
-    "replay": replay_parser,
-    "map": map_parser,
-    "models": models_parser,
-    "baseline": baseline_parser,
-    "bench": bench_parser,
-    "devices": devices_parser,
-    "doctor": doctor_parser,
-}
+COMMANDS: Final = ("demo", "record", "replay", "map", "models", "baseline", "bench", "devices", "doctor")
 SHELLS: Final = {
     "bash": "bash-completion/completions/edge-sr",
     "zsh": "zsh/site-functions/_edge-sr",
@@ -68,10 +48,10 @@ def write_terminal_files(folder: Path) -> dict[Path, str]:
 
 def command_tree() -> argparse.ArgumentParser:
     """Return one parser with the commands as subparsers: the form that both generators read."""
-    tree = run_parser()
+    tree = parser()
     commands: Any = tree.add_subparsers(title="commands", metavar="COMMAND")
-    for name, make in PARSERS.items():
-        one = make()
+    for name in COMMANDS:
+        one = bench_parser() if name == "bench" else parser(name)
         commands.add_parser(
             name,
             parents=[one],
@@ -82,8 +62,8 @@ def command_tree() -> argparse.ArgumentParser:
             description=one.description,
             epilog=one.epilog,
         )
-    for parser in (tree, *commands.choices.values()):
-        for action in parser._actions:
+    for command in (tree, *commands.choices.values()):
+        for action in command._actions:
             _complete(action)
     return tree
 

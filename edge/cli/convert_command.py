@@ -15,7 +15,7 @@ from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_columns import PoseColumns, PoseRows
+from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -23,14 +23,8 @@ from firmware_bridge.scans.scan import Scan
 _ENDINGS: Final = (".mcap", ".npz", ".csv")
 _WITHOUT: Final = {
     (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
-    (
-        ".mcap",
-        ".csv",
-    ): "all but counts, times and poses: patterns, events, baselines and the mounting",
-    (
-        ".npz",
-        ".mcap",
-    ): "what was computed, patterns too (edge-sr replay computes it), the device's times, later baselines",
+    (".mcap", ".csv"): "all but counts, times and poses: patterns, events, baselines and the mounting",
+    (".npz", ".mcap"): "what was computed (edge-sr replay computes it), the device's times, later baselines",
     (".npz", ".csv"): "all but counts, times and poses: patterns, baselines and the mounting",
     (".csv", ".mcap"): "the time of day, which the file does not state",
     (".csv", ".npz"): "the vendor's newtons",
@@ -43,8 +37,7 @@ def convert(options: argparse.Namespace) -> None:
 
     Raises:
         UsageError: the new name ends in none, or the format is that of the recording; a rate for one with times.
-        RecordingError: the recording cannot be used.
-        SourceError: a CSV of unknown rate.
+        BridgeError: the recording cannot be used.
         SinkError: the new file exists, or cannot be written; then nothing is left of it.
     """
     source, target = Path(options.recording), Path(options.new)
@@ -76,13 +69,9 @@ def convert(options: argparse.Namespace) -> None:
 def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
     """Write one file, read it back before it gets its name, and report it."""
     made: list[Recording] = []
+    write = partial(_WRITERS[path.suffix.lower()], replay, sensor=sensor)
     try:
-        write_in_place(
-            path,
-            partial(_WRITERS[path.suffix.lower()], replay, sensor=sensor),
-            lambda draft: made.append(load_recording(draft)),
-            keep_before=False,
-        )
+        write_in_place(path, write, lambda draft: made.append(load_recording(draft)), keep_before=False)
     except SinkError:
         raise
     except OSError as error:
@@ -132,21 +121,17 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     poses = recording.poses
     if recording.path.suffix.lower() == ".csv":
         read = list(_scans(replay))
-        rows = (_row(scan, origin) for scan, _ in read)
-        poses = _columns([pose for _, some in read for pose in some])
+        facts = {"source": origin, "origin": origin}
+        rows = (
+            {"time_ns": scan.time_ns, "sensor": scan.sensor, "scan": scan.number, "counts": scan.counts} | facts
+            for scan, _ in read
+        )
+        stated = PoseRows()
+        for _, some in read:
+            for pose in some:
+                stated.add(pose)
+        poses = stated.columns()
     write_npz(path, rows, recording.mountings, poses)
-
-
-def _row(scan: Scan, origin: str) -> dict[str, Any]:
-    counts = {"counts": scan.counts, "source": origin, "origin": origin}
-    return {"time_ns": scan.time_ns, "sensor": scan.sensor, "scan": scan.number} | counts
-
-
-def _columns(poses: list[TimedPose]) -> PoseColumns | None:
-    rows = PoseRows()
-    for pose in poses:
-        rows.add(pose)
-    return rows.columns()
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
@@ -177,10 +162,8 @@ def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     recording = replay.recordings[0]
     track = next(track for track in recording.tracks if sensor in (None, track.sensor))
     mounting = recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
-    first_ns = replay.first_ns
-    poses = (
-        [] if recording.poses is None else [recording.poses.at(row, -first_ns) for row in range(len(recording.poses))]
-    )
+    columns = recording.poses
+    poses = [] if columns is None else [columns.at(row, -replay.first_ns) for row in range(len(columns))]
     own = [pose for pose in poses if pose.sensor == track.sensor] or [pose for pose in poses if pose.sensor is None]
     write_csv(path, track, replay.times_ns(track.sensor), mounting, own, emulated=recording.origin == "emulated")
 

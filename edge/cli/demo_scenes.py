@@ -17,12 +17,7 @@ class DemoRobot(Sink):
     """Sink that passes on the proposal after each tap of the demo's figure, or that there is none."""
 
     def __init__(self, recording: Path, touch: Callable[[PadPose | None], object]) -> None:
-        """Load the taps.
-
-        Args:
-            recording: .npz with `counts`, `tap` and `option_counts` as in `DemoScore`.
-            touch: called with the pose of each proposal; None where nothing is proposed.
-        """
+        """Load the taps; `touch` is called with the pose of each proposal, None where nothing is proposed."""
         with np.load(recording, allow_pickle=False) as data:
             options = data["option_counts"]
             taps = np.concatenate([data["counts"][data["tap"] >= 0], options.reshape(-1, *options.shape[2:])])
@@ -52,26 +47,17 @@ _BEGINS: Final = {
 
 
 def scene_of(recording: Path) -> dict[bytes, int]:
-    """Return the scene of each scan of a recording, by its counts."""
+    """Return the scene of each scan of a recording, by its counts; -1 outside of scenes."""
     with np.load(recording, allow_pickle=False) as data:
         pairs = zip(data["counts"], data["scene"].tolist(), strict=True)
         return {counts.astype(np.int32).tobytes(): scene for counts, scene in pairs}
 
 
 class DemoScenes(Sink):
-    """Sink that announces each scene of the demo, and its outcome, as events of kind "note".
-
-    A result is matched to its scene by its raw counts, as in `DemoScore`.
-    """
+    """Sink that announces each scene of the demo, and its outcome unless it is cut off, as events of kind "note"."""
 
     def __init__(self, recording: Path, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
-        """Load the scenes.
-
-        Args:
-            recording: .npz that has, in addition to `counts` (n, 3, rows, cols), `scene` (n,): -1 outside of scenes.
-            tell: called with each event.
-            reset: called where the robot goes on to another object, whose taps do not belong to those before.
-        """
+        """Load the scenes; `reset` is called where the robot goes on to another object."""
         self._scenes = scene_of(recording)
         self._tell = tell
         self._reset = reset

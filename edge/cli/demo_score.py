@@ -4,13 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db, rmse_percent
-from edge.inference.contract import Contract
+from edge.inference.model_interface import Model
 from edge.inference.pose_input import scheduled_rows
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
@@ -25,7 +24,7 @@ class TapScore:
     Attributes:
         tap: number of the tap, from 0.
         pose: x and y in [mm] and turn in [deg] of the pad, as the robot stated them.
-        result: result at the peak frame.
+        result: at the peak frame.
         truth: (H, W) in the model's output unit.
         psnr_db: in [dB].
         rmse_percent: in [% of full scale].
@@ -41,23 +40,8 @@ class TapScore:
     alone_percent: float
 
 
-class Scored(Protocol):
-    """Model as the score needs it."""
-
-    contract: Contract
-
-    def run(
-        self,
-        window: NDArray[np.float32],
-        pad: NDArray[np.float32] | None = None,
-        poses: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Infer the pattern of one window."""
-        ...
-
-
 class DemoScore(Sink):
-    """Sink that keeps of each tap the result with the largest force.
+    """Sink that keeps of each tap the result with the largest force, until the last tap is over.
 
     A result is matched to its truth by its raw counts, not by its number: a lost scan shifts nothing.
 
@@ -68,36 +52,28 @@ class DemoScore(Sink):
     """
 
     def __init__(
-        self, recording: Path, model: Scored, on_complete: Callable[["DemoScore"], object] = lambda score: None
+        self, recording: Path, model: Model, on_complete: Callable[["DemoScore"], object] = lambda score: None
     ) -> None:
-        """Load the truth.
+        """Load the truth, as train/demo.py records it; `on_complete` is called once, when the last tap is over.
 
-        Args:
-            recording: .npz that has, in addition to `counts` (n, 3, rows, cols): `tap` (n,), -1 without contact;
-                `scene` (n,), -1 outside of scenes; `indentation_mm` (n,); `unit_patterns` (taps, H, W), the truth per
-                indentation; `tap_pose` (taps, 5); `surface`; and of the taps that may be played in place of those after
-                the first `option_counts` (o, f, 3, rows, cols), `option_indentation_mm` (o, f), `option_unit_patterns`
-                and `option_pose`.
-            model: that is scored.
-            on_complete: called with this, once, when the last tap is over; later results are not scored.
+        The recording's taps are numbered; after them come those that may be played in place of all but the first.
         """
-        self._model = model
+        self._model, self._on_complete = model, on_complete
         with np.load(recording, allow_pickle=False) as data:
             self.surface = str(data["surface"])
             self.taps = len(data["tap_pose"])
-            self._poses = np.concatenate([data["tap_pose"], data["option_pose"]])[:, :3].tolist()
-            self._unit_patterns = np.concatenate([data["unit_patterns"], data["option_unit_patterns"]]).astype(
-                np.float32
-            )
+            poses = np.concatenate([data["tap_pose"], data["option_pose"]])[:, :3].tolist()
+            self._poses = [(x_mm, y_mm, turn_deg) for x_mm, y_mm, turn_deg in poses]
+            patterns = [data["unit_patterns"], data["option_unit_patterns"]]
+            self._unit_patterns = np.concatenate(patterns).astype(np.float32)
             shown = zip(data["tap"].tolist(), data["indentation_mm"].tolist(), data["counts"], strict=True)
-            self._frames = {_key(counts): _Frame(tap, mm) for tap, mm, counts in shown if tap >= 0}
+            self._frames = {_key(counts): (tap, mm) for tap, mm, counts in shown if tap >= 0}
             options = zip(data["option_counts"], data["option_indentation_mm"].tolist(), strict=True)
             for place, (counts, depths_mm) in enumerate(options, self.taps):
-                self._frames |= {_key(one): _Frame(place, mm) for one, mm in zip(counts, depths_mm, strict=True)}
+                self._frames |= {_key(one): (place, mm) for one, mm in zip(counts, depths_mm, strict=True)}
             self._scenes = {_key(counts) for counts in data["counts"][data["scene"] >= 0]}
-        self._peaks: list[_Peak] = []
+        self._peaks: list[tuple[Result, int, float]] = []  # with number of the tap's place, and indentation in [mm]
         self._between = True
-        self._on_complete = on_complete
         self.complete = False
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -110,37 +86,31 @@ class DemoScore(Sink):
             self.complete = True
             self._on_complete(self)
             return
-        frame = self._frames.get(key)
-        if frame is None or result.pattern is None or result.force_counts is None:
+        if key not in self._frames or result.pattern is None or result.force_counts is None:
             return
-        peak = _Peak(result, result.pattern, result.force_counts, frame)
-        if self._between or frame.place != self._peaks[-1].frame.place:
-            self._peaks.append(peak)
+        place, indentation_mm = self._frames[key]
+        if self._between or place != self._peaks[-1][1]:
+            self._peaks.append((result, place, indentation_mm))
             self._between = False
-        elif peak.force_counts > self._peaks[-1].force_counts:
-            self._peaks[-1] = peak
+        elif result.force_counts > (self._peaks[-1][0].force_counts or 0):
+            self._peaks[-1] = result, place, indentation_mm
 
     def close(self) -> None:
         """Do nothing, since there is nothing to finish."""
 
     def scores(self) -> list[TapScore]:
         """Return the scores of the taps that got a pattern."""
-        return [self._score(tap, peak) for tap, peak in enumerate(self._peaks)]
+        return [self._score(tap, *peak) for tap, peak in enumerate(self._peaks)]
 
-    def _score(self, tap: int, peak: "_Peak") -> TapScore:
-        truth = self._unit_patterns[peak.frame.place] * peak.frame.indentation_mm
+    def _score(self, tap: int, result: Result, place: int, indentation_mm: float) -> TapScore:
+        truth = self._unit_patterns[place] * indentation_mm
+        if result.pattern is None:
+            raise ValueError("peak has no pattern, expected one kept by write")
         full_scale = self._model.contract.output_full_scale
-        x_mm, y_mm, turn_deg = self._poses[peak.frame.place]
-        alone = peak.pattern if peak.result.taps_used < 2 else self._alone(peak.result)
-        return TapScore(
-            tap=tap,
-            pose=(x_mm, y_mm, turn_deg),
-            result=peak.result,
-            truth=truth,
-            psnr_db=float(psnr_db(peak.pattern, truth, full_scale)),
-            rmse_percent=float(rmse_percent(peak.pattern, truth, full_scale)),
-            alone_percent=float(rmse_percent(alone, truth, full_scale)),
-        )
+        alone = result.pattern if result.taps_used < 2 else self._alone(result)
+        error_db = float(psnr_db(result.pattern, truth, full_scale))
+        errors = (float(rmse_percent(one, truth, full_scale)) for one in (result.pattern, alone))
+        return TapScore(tap, self._poses[place], result, truth, error_db, *errors)
 
     def _alone(self, result: Result) -> NDArray[np.float32]:
         """Return the pattern of a result's newest tap alone."""
@@ -153,20 +123,6 @@ class DemoScore(Sink):
         padded = np.zeros((contract.taps, *window.shape[1:]), dtype=np.float32)
         padded[0] = window[0]
         return self._model.run(padded)
-
-
-class _Frame(NamedTuple):
-    """Frame of a tap: number of its place, and indentation in [mm]."""
-
-    place: int
-    indentation_mm: float
-
-
-class _Peak(NamedTuple):
-    result: Result
-    pattern: NDArray[np.float32]
-    force_counts: float
-    frame: _Frame
 
 
 def _key(counts: NDArray[np.integer]) -> bytes:

@@ -15,19 +15,8 @@ NOTHING = (
 SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 
-def run(*, as_json: bool, stdout: TextIO) -> int:
-    """Print the devices, opening none.
-
-    Args:
-        as_json: True prints an object, for programs.
-        stdout: output stream.
-
-    Returns:
-        The exit code, 0.
-
-    Raises:
-        DeviceError: no device is of a kind that sensors are usually connected to; the others were printed.
-    """
+def run(*, as_json: bool, stdout: TextIO) -> None:
+    """Print the devices, opening none, as JSON for programs; raises DeviceError if no adapter is among them."""
     found, notes = devices()
     if as_json:
         stdout.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
@@ -35,17 +24,10 @@ def run(*, as_json: bool, stdout: TextIO) -> int:
         stdout.write("".join(f"{line}\n" for line in page(found, notes, columns())))
     if not any(one.adapter for one in found):
         raise DeviceError(NOTHING)
-    return 0
 
 
 def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
-    """Return lines for a reader, adapters first, then what could not be examined.
-
-    Args:
-        found: the devices.
-        notes: what could not be examined, and why.
-        width: of a line, in columns; only wider words, and text to be typed, exceed it.
-    """
+    """Return lines for a reader, adapters first; only text to be typed and longer words are wider than `width`."""
     lines: list[str] = []
     for one in sorted(found, key=lambda one: not one.adapter):
         serial = f"serial {one.serial_number}" if one.serial_number else None

@@ -8,7 +8,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from edge.api import (
@@ -26,18 +26,7 @@ from edge.api import (
     save_baselines,
     unfinished_load,
 )
-from edge.cli.run_options import (
-    baseline_parser,
-    convert_parser,
-    demo_parser,
-    devices_parser,
-    map_parser,
-    models_parser,
-    record_parser,
-    replay_parser,
-    run_parser,
-    understood,
-)
+from edge.cli.run_options import parser, understood
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 from firmware_bridge.in_place import BACKUP_SUFFIX
@@ -66,7 +55,7 @@ def _main(arguments: Sequence[str]) -> int:
     open_closed_streams()
     try:
         with guarded_streams():
-            return _run(arguments) if command is None else command(arguments[1:])
+            return (_run(arguments) if command is None else command(arguments[1:])) or 0
         return 0
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -87,19 +76,10 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
         return EXIT_DEVICE
     if isinstance(error, ModelError):
         return EXIT_MODEL
-    if isinstance(error, SinkError):
-        return EXIT_SINK
-    return EXIT_USAGE
+    return EXIT_SINK if isinstance(error, SinkError) else EXIT_USAGE
 
 
-def _demo(arguments: Sequence[str]) -> int:
-    options = understood(demo_parser(), arguments)
-    options.source = ["demo"]
-    _follow(options)
-    return 0
-
-
-def _run(arguments: Sequence[str]) -> int:
+def _run(arguments: Sequence[str]) -> None:
     if arguments and not arguments[0].startswith("-"):
         from difflib import get_close_matches
 
@@ -108,17 +88,7 @@ def _run(arguments: Sequence[str]) -> int:
             f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"
         )
         raise UsageError(f"no command {arguments[0]!r}: {meant}")
-    _follow(understood(run_parser(), arguments))
-    return 0
-
-
-def _map(arguments: Sequence[str]) -> int:
-    options = understood(map_parser(), arguments)
-    from edge.cli.new_map import new_map
-
-    with new_map(options) as mapping:
-        _follow(options, mapping=mapping)
-    return 0
+    _follow(understood("", arguments))
 
 
 def _follow(
@@ -132,17 +102,30 @@ def _follow(
     run(options, source, statistics, mapping)
 
 
-def _record(arguments: Sequence[str]) -> int:
-    options = understood(record_parser(), arguments)
-    from edge.cli.new_recording import new_recording
+def _demo(arguments: Sequence[str]) -> None:
+    options = understood("demo", arguments)
+    options.source = ["demo"]
+    _follow(options)
+
+
+def _map(arguments: Sequence[str]) -> None:
+    options = understood("map", arguments)
+    from edge.cli.run_files import new_map
+
+    with new_map(options) as mapping:
+        _follow(options, mapping=mapping)
+
+
+def _record(arguments: Sequence[str]) -> None:
+    options = understood("record", arguments)
+    from edge.cli.run_files import new_recording
 
     with new_recording(options) as statistics:
         _follow(options, statistics)
-    return 0
 
 
-def _replay(arguments: Sequence[str]) -> int:
-    options = understood(replay_parser(), arguments)
+def _replay(arguments: Sequence[str]) -> None:
+    options = understood("replay", arguments)
     from edge.cli.run_command import run
     from edge.pipeline.replay_setup import Player, open_recording
 
@@ -158,28 +141,11 @@ def _replay(arguments: Sequence[str]) -> int:
         bar=not paced and "status" not in options.sink,
         player=player,
     )
-
     run(options, source, player=player)
-    return 0
 
 
-def _convert(arguments: Sequence[str]) -> int:
-    options = convert_parser().parse_args(arguments)
-    from edge.cli.convert_command import convert
-
-    convert(options)
-    return 0
-
-
-def _models(arguments: Sequence[str]) -> int:
-    options = models_parser().parse_args(arguments)
-    from edge.cli.models_command import run
-
-    return run(measure=options.measure, stdout=sys.stdout)
-
-
-def _baseline(arguments: Sequence[str]) -> int:
-    options = baseline_parser().parse_args(arguments)
+def _baseline(arguments: Sequence[str]) -> None:
+    options = parser("baseline").parse_args(arguments)
     from edge.api import take_baselines
     from edge.terminal.stop_signals import stop_on_signals
 
@@ -201,7 +167,6 @@ def _baseline(arguments: Sequence[str]) -> int:
         print(f"sensor {name}: baseline {baseline.id} of {baseline.scans} scans{emulated} -> {options.out}")
     if replaced:
         print(f"the former file is now {options.out}{BACKUP_SUFFIX}")
-    return 0
 
 
 def _bench(arguments: Sequence[str]) -> int:
@@ -220,23 +185,35 @@ def _bench(arguments: Sequence[str]) -> int:
     return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
-def _devices(arguments: Sequence[str]) -> int:
-    options = devices_parser().parse_args(arguments)
+def _convert(arguments: Sequence[str]) -> None:
+    options = parser("convert").parse_args(arguments)
+    from edge.cli.convert_command import convert
+
+    convert(options)
+
+
+def _models(arguments: Sequence[str]) -> None:
+    options = parser("models").parse_args(arguments)
+    from edge.cli.models_command import run
+
+    run(measure=options.measure, stdout=sys.stdout)
+
+
+def _devices(arguments: Sequence[str]) -> None:
+    options = parser("devices").parse_args(arguments)
     from edge.cli.devices_command import run
 
-    return run(as_json=options.json, stdout=sys.stdout)
+    run(as_json=options.json, stdout=sys.stdout)
 
 
 def _doctor(arguments: Sequence[str]) -> int:
-    from edge.doctor.options import doctor_parser
-
-    options = doctor_parser().parse_args(arguments)
+    options = parser("doctor").parse_args(arguments)
     from edge.doctor.command import run
 
     return run(options, sys.stdout, sys.stderr)
 
 
-COMMANDS: Final = {
+COMMANDS: Final[dict[str, Callable[[Sequence[str]], int | None]]] = {
     "demo": _demo,
     "record": _record,
     "replay": _replay,

@@ -24,12 +24,8 @@ UNEVEN: Final = 3.0
 """Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine."""
 
 
-def run(*, measure: bool, stdout: TextIO) -> int:
-    """Print the bundled models, and return the exit code.
-
-    Raises:
-        ModelError: none is bundled, or one cannot be used.
-    """
+def run(*, measure: bool, stdout: TextIO) -> None:
+    """Print the bundled models; raises ModelError if there is none, or one cannot be used."""
     paths = bundled_models()
     if not paths:
         raise ModelError("no models are bundled with this installation")
@@ -48,7 +44,6 @@ def run(*, measure: bool, stdout: TextIO) -> int:
         stdout.write(f"{cells}{contract.arithmetic:10s} {times} {figures or 'not known'}\n")
     if measure:
         stdout.writelines(_notes(paths, took_us))
-    return 0
 
 
 def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:

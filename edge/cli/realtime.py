@@ -1,9 +1,6 @@
 """Real-time scheduling of `--realtime`: each part requested on its own, with one line for each that is refused.
 
-SCHED_FIFO lets the loop, and the thread that reads for it, run before every ordinary process. The pin keeps their
-caches warm, on the last of the processors they may use, since interrupts and most other work run on the first. Locked
-memory cannot be paged out. The kernel still takes 5 % of each second from threads that never rest
-(/proc/sys/kernel/sched_rt_runtime_us); these rest between scans.
+The pin is to the last of the processors that may be used, since interrupts and most other work run on the first.
 """
 
 import ctypes
@@ -27,12 +24,11 @@ _MEMORY_REMEDY: Final = "'ulimit -l unlimited', a line '@GROUP - memlock unlimit
 
 @contextmanager
 def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> Iterator[None]:
-    """Run in real time as far as is permitted, and as before afterwards.
+    """Run this thread, and those that it waits for, in real time as far as is permitted, and as before afterwards.
 
     Args:
         tell: called with one line for each part that is refused; the run continues without it.
-        thread_ids: system's numbers of the threads that the caller's waits for, which get the same priority. Other
-            threads started before stay as they are; one begun meanwhile is ordinary, but on the caller's processor.
+        thread_ids: system's numbers of the other threads. A thread begun meanwhile is ordinary, on this processor.
     """
     if sys.platform != "linux":
         tell(f"--realtime: not on {sys.platform}, only on Linux; going on without")

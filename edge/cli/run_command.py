@@ -62,15 +62,11 @@ def run(
     """Run `edge-sr` without a command, or a command that runs the same way.
 
     Args:
-        options: of edge.cli.run_options.run_parser.
+        options: of edge.cli.run_options.
         source: not open yet.
         statistics: filled on the way, so that they are available however the run ends.
         mapping: takes the results into a map, which the live page shows; closed here.
         player: of the recording that is the source, for the page.
-
-    Raises:
-        EdgeError: an option, a model or a sink cannot be used.
-        BridgeError: the source cannot be used.
     """
     stdout_taken = "jsonl:-" in options.sink
     share_one_heap()
@@ -100,14 +96,8 @@ def run(
             hint = partial(_silence_hint, options.source, source)
             unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
             messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
-            opener = partial(
-                open_sink,
-                contract=model.contract,
-                source=source,
-                stop=stop,
-                commands=commands,
-                fields=options.fields,
-            )
+            facts = {"contract": model.contract, "source": source, "fields": options.fields}
+            opener = partial(open_sink, **facts, stop=stop, commands=commands)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say, player)
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
@@ -121,15 +111,10 @@ def run(
             if loops:
                 rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
                 asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
-            if played is not None:  # the demo shows the run time of every scan
+            if demo:  # it shows the run time of every scan
                 asked = replace(asked, every_scan=True)
-            runtime = open_runtime(
-                model,
-                source,
-                baselines=baselines,
-                counts_per_newton=options.counts_per_newton,
-                **asdict(asked),
-            )
+            per_newton = options.counts_per_newton
+            runtime = open_runtime(model, source, baselines=baselines, counts_per_newton=per_newton, **asdict(asked))
             give_back()
             sinks: list[Sink] = []
             if played is not None:
@@ -142,11 +127,11 @@ def run(
                 _tell("keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact")
             for text in wanted:
                 sink = opener(text)
-                if text != "status":
+                if text == "status":
+                    closing.callback(sink.close)
+                    sinks.append(sink)
+                else:
                     fan.add(sink)
-                    continue
-                closing.callback(sink.close)
-                sinks.append(sink)
             if set(options.sink) - {"status"}:
                 sinks.append(fan)
             if mapping is not None:
@@ -163,15 +148,7 @@ def run(
                 from edge.cli.realtime import realtime
 
                 closing.enter_context(realtime(_tell, source.thread_ids))
-            pump(
-                source,
-                runtime,
-                sinks,
-                statistics,
-                stop=stop,
-                duration_s=options.duration_s,
-                commands=commands,
-            )
+            pump(source, runtime, sinks, statistics, stop=stop, duration_s=options.duration_s, commands=commands)
         # A run that its user ends before the first scan was due is no fault of the sensor.
         if not statistics.scans and (statistics.events or not stop.is_set()):
             raise DeviceError(f"no scan came from {source.name}: {hint()}")

@@ -1,13 +1,17 @@
-"""Texts of the help of `edge-sr` and its small commands, in the form that edge.terminal.argument_types lays out."""
+"""Texts of the help of `edge-sr` and its commands, in the form that edge.terminal.argument_types lays out."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
-RUN_ABOUT: Final = (
-    "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
-    "pattern: a fine map of how deep an object presses into the pad, in mm."
-)
 
-RUN_COMMANDS: Final = """\
+class Help(NamedTuple):
+    """Help of a command: what follows its name, what it does, and what stands below its options."""
+
+    usage: str
+    about: str
+    more: str
+
+
+_RUN: Final = """\
 commands (each has its own --help):
 demo\tan emulated sensor; no hardware needed
 devices\tlist what is plugged in, and what to type to read it
@@ -19,10 +23,7 @@ map\tfuse the patterns into a map of an object larger than the pad
 baseline\tmeasure the free pad once, and store it
 models\tlist the bundled models
 bench\tmeasure error and run time on this machine
-"""
 
-RUN_HELP: Final = f"""\
-{RUN_COMMANDS}
 sources, SRC (found by itself if one adapter is plugged in):
 slcan:/dev/ttyUSB0[@BAUD]\tserial CAN adapter, such as VScom or CANable
 slcan:serial=D30BL366[@BAUD]\tthe same, by its serial number
@@ -46,9 +47,9 @@ r\tforget earlier taps, as for a new object
 z\tzero again: the pad must be free; Z even in contact
 
 lines on stdin, where it is no terminal:
-{{"cmd": "reset"}}\tlike key r
-{{"cmd": "zero"}}\tlike key z; "sensor": "4" for one sensor, "force": true even in contact
-{{"cmd": "pose", "x_mm": 1, "y_mm": 0}}\twhere the pad is
+{"cmd": "reset"}\tlike key r
+{"cmd": "zero"}\tlike key z; "sensor": "4" for one sensor, "force": true even in contact
+{"cmd": "pose", "x_mm": 1, "y_mm": 0}\twhere the pad is
 
 The signal SIGUSR1 is like key z.
 
@@ -61,18 +62,7 @@ examples:
 Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
 """
 
-DEMO_ABOUT: Final = (
-    "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
-    "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C."
-)
-
-DEMO_HELP: Final = """\
-examples:
-  edge-sr demo
-  edge-sr demo --view
-"""
-
-BASELINE_HELP: Final = """\
+_BASELINE: Final = """\
 Keep the pad still, with nothing touching it.
 
 examples:
@@ -85,7 +75,7 @@ Of a recording it takes the scans during which the pad is still and pressed leas
           --skip 190 --scans 60
 """
 
-RECORD_HELP: Final = """\
+_RECORD: Final = """\
 examples:
   edge-sr record press.mcap
   edge-sr replay press.mcap --view
@@ -93,7 +83,7 @@ examples:
 All other options are those of edge-sr: its --help lists sources, outputs and keys.
 """
 
-REPLAY_HELP: Final = """\
+_REPLAY: Final = """\
 Computes a result for every scan, as fast as possible, with the times of the recording. It begins \
 with the baseline (the readings of the free pad) that was in use at the first scan. If there is none, and the \
 recording does not begin free and still, those scans are the baseline during which the pad is still and pressed least.
@@ -109,7 +99,7 @@ examples:
           --sink mcap:again.mcap
 """
 
-CONVERT_HELP: Final = """\
+_CONVERT: Final = """\
 Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
 several a file each). What the new file cannot hold is printed. Nothing is computed, and no file is replaced.
 
@@ -119,7 +109,7 @@ examples:
   edge-sr convert old.npz old.mcap
 """
 
-MAP_HELP: Final = """\
+_MAP: Final = """\
 Needs poses of the pad (where it is, and how it is turned) in the object's plane: lines on stdin, or those of a \
 recording. x points right and y down, as in a pattern.
 
@@ -133,3 +123,56 @@ A line of poses:
 
 All other options are those of edge-sr: its --help lists sources, outputs and keys.
 """
+
+_DOCTOR: Final = """\
+Keep the pad still, with nothing touching it, until you are asked to press its corners. Hold it in the \
+orientation in which patterns are to be drawn: it defines top and left.
+
+examples:
+  edge-sr doctor
+  edge-sr doctor --out sensor.toml
+  edge-sr doctor --weight-g 200 \\
+          --out sensor.toml
+  edge-sr --sensor sensor.toml
+
+Enter skips a request. Ctrl-C ends the doctor: what is measured until then is printed, and written with --out once the \
+free pad is measured.
+
+Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong usage, 3 sensor, 130 Ctrl-C.
+"""
+
+HELP: Final = {
+    "": Help(
+        "[options]\n       edge-sr COMMAND [options]",
+        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
+        "pattern: a fine map of how deep an object presses into the pad, in mm.",
+        _RUN,
+    ),
+    "demo": Help(
+        "[options]",
+        "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
+        "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
+        "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
+    ),
+    "record": Help("FILE [options]", "Runs like edge-sr, and records scans, patterns and events.", _RECORD),
+    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", _REPLAY),
+    "convert": Help("FILE NEW", "Writes a recording in another format: that of the ending of the new name.", _CONVERT),
+    "map": Help("[options]", "Runs like edge-sr, and fuses the patterns into a map of the object.", _MAP),
+    "models": Help("[--measure]", "Lists the bundled models, with their error.", ""),
+    "baseline": Help(
+        "--out FILE",
+        "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
+        _BASELINE,
+    ),
+    "devices": Help(
+        "[--json]",
+        "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
+        "its use.",
+        "Exit code: 3 if there is no adapter.",
+    ),
+    "doctor": Help(
+        "[options]",
+        "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
+        _DOCTOR,
+    ),
+}

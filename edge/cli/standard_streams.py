@@ -33,10 +33,8 @@ def open_closed_streams() -> None:
 def guarded_streams() -> Iterator[None]:
     """Replace stdout by one whose faults are those of a sink, and stderr by one without, in a with statement.
 
-    Text that nobody can read ends no run. A reader of stdout that has had enough ends the block, without a message.
-
-    Raises:
-        SinkError: stdout cannot be written.
+    Text that nobody can read ends no run. A reader of stdout that has had enough ends the block, without a message; a
+    stdout that cannot be written raises SinkError.
     """
     streams = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = cast("TextIO", _Checked(sys.stdout)), cast("TextIO", _Optional(sys.stderr))

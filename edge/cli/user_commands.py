@@ -1,6 +1,5 @@
 """Commands of a run from its user: lines on stdin, keys of a terminal, and SIGUSR1."""
 
-import contextlib
 import os
 import select
 import signal
@@ -23,14 +22,8 @@ class Keys:
     """Producer of commands from keys of a terminal; it never waits, and ignores other keys than KEYS."""
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
-        """Start with the terminal as it is.
-
-        Args:
-            commands: queue that the keys' commands are put into.
-            descriptor: of a terminal.
-        """
-        self._commands = commands
-        self._descriptor = descriptor
+        """Start with the terminal of this descriptor as it is."""
+        self._commands, self._descriptor = commands, descriptor
         self._before: list[Any] | None = None
         self._gone = False
 
@@ -140,7 +133,7 @@ def _given_back_on_signals(keys: Keys) -> Iterator[None]:
                 signal.signal(number, before[number])
 
 
-@contextlib.contextmanager
+@contextmanager
 def user_commands() -> Iterator[Commands]:
     """Yield the queue of commands from lines on stdin, or from keys if it is a terminal, and from SIGUSR1."""
     commands = Commands()

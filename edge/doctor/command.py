@@ -12,7 +12,7 @@ from typing import Final, TextIO
 from edge.doctor.examine import Examined, examine
 from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.pad_orientation import judge_press
-from edge.doctor.press_guide import FeltLine, Guide, GuidedPress, enter_pressed
+from edge.doctor.press_guide import FeltLine, GuidedPress, enter_pressed
 from edge.doctor.watch import Watch
 from edge.doctor.write_sensor_file import check_writable, keep
 from edge.errors import UsageError
@@ -21,19 +21,22 @@ from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, wrapped
-from firmware_bridge.errors import LinkLostError, SensorFileError
+from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
 
+EXIT_WRONG: Final = 1
+EXIT_STOPPED: Final = 130
+
 
 class Visit:
-    """Visit to the sensors of one link.
+    """Visit to the sensors of one link: what is asked of a person, and what that gives.
 
     Attributes:
+        mountings: corrections of the mountings, by sensor.
         newtons: counts per newton of the sensors that were weighed.
         watched: True when the free pads were watched for the whole time.
         unfinished: True when a measurement was asked of a person, and not made.
@@ -47,33 +50,18 @@ class Visit:
         stop: threading.Event,
         clock_s: Callable[[], float],
     ) -> None:
-        """Prepare the visit.
-
-        Args:
-            options: of `edge-sr doctor`.
-            watch: not begun yet.
-            err: for requests to a person.
-            stop: ends the visit when it is set.
-            clock_s: the clock of the scans, monotonic, in [s].
-        """
+        """Prepare the visit of a watch that has not begun; requests to a person go to `err`."""
+        self.mountings: dict[str, Mounting] = {}
         self.newtons: dict[str, float] = {}
         self.watched = self.unfinished = False
-        self._options = options
-        self._err = err
-        self._stop = stop
-        self._clock_s = clock_s
-        self._watch = watch
-        self._link = watch.link
+        self._options, self._err, self._stop, self._clock_s = options, err, stop, clock_s
+        self._watch, self._link = watch, watch.link
 
     def watch(self) -> None:
-        """Watch the link while the pads are free.
-
-        Raises:
-            LinkLostError: the link is gone.
-        """
+        """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with Progress("watching", length_s, SECONDS, stream=self._err, clock_s=self._clock_s) as bar:
+        with Progress("watching", length_s, SECONDS, stream=self._err) as bar:
 
             def show(scans: int, passed_s: float) -> None:
                 if passed_s > 0:
@@ -83,44 +71,31 @@ class Visit:
             self._watch.run(length_s, show)
         self.watched = not self._stop.is_set()
 
-    def press(self, examined: Examined) -> dict[str, Mounting]:
-        """Ask for presses on every pad that may be zeroed; returns the corrections of their mountings.
-
-        Raises:
-            LinkLostError: the link is gone.
-        """
-        found: dict[str, Mounting] = {}
-        names = sorted(self._watch.scans)
+    def press(self, examined: Examined) -> None:
+        """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
         why = self._why_no_press()
-        for name in names:
+        for name in sorted(self._watch.scans):
             if why is None and name in examined.baselines:
-                mounting = self._press_one(name, examined, len(names) > 1)
-                if mounting is not None:
-                    found[name] = mounting
-            elif why is not None or name not in examined.baselines:
+                self._press_one(name, examined)
+            else:
                 reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
-        return found
 
-    def _press_one(self, name: str, examined: Examined, several: bool) -> Mounting | None:
-        geometry = self._watch.known.geometry
-        guide = GuidedPress(self._options.weight_g, geometry)
-        whose = f"Sensor {name}: " if several else ""
+    def _press_one(self, name: str, examined: Examined) -> None:
+        geometry, weight_g = self._watch.known.geometry, self._options.weight_g
+        guide = GuidedPress(weight_g, geometry)
+        whose = f"Sensor {name}: " if len(self._watch.scans) > 1 else ""
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
-        weighed = self._options.weight_g is not None
-        findings, found = judge_press(guide.answer, self._options.out is not None, weighed, geometry)
-        self._add(findings, name, examined)
-        if guide.answer.counts_per_newton is not None:
-            self.newtons[name] = guide.answer.counts_per_newton
-        return found
-
-    def _add(self, findings: list[Finding], name: str, examined: Examined) -> None:
-        """Add findings of what was asked of a person."""
+        findings, found = judge_press(guide.answer, self._options.out is not None, weight_g is not None, geometry)
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
+        if guide.answer.counts_per_newton is not None:
+            self.newtons[name] = guide.answer.counts_per_newton
+        if found is not None:
+            self.mountings[name] = found
 
-    def _lead(self, guide: Guide, name: str, examined: Examined, whose: str) -> None:
+    def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
         baseline, mounting = examined.baselines[name], self._watch.known.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
@@ -141,11 +116,9 @@ class Visit:
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
             for scan in self._link.read(POLL_S):
-                if scan.sensor != name:
-                    continue
-                received_s = self._clock_s()
-                zeroed = deformation(scan.counts, baseline, mounting)
-                ask(guide.push(zeroed, scan.time_ns / NS_PER_S))
+                if scan.sensor == name:
+                    received_s = self._clock_s()
+                    ask(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
             if enter_pressed():
                 ask(guide.skip())
             line.show(guide)
@@ -164,10 +137,6 @@ class Visit:
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
-EXIT_WRONG: Final = 1
-EXIT_STOPPED: Final = 130
-
-
 def run(
     options: argparse.Namespace,
     out: TextIO,
@@ -175,21 +144,12 @@ def run(
     *,
     clock_s: Callable[[], float] = time.monotonic,
 ) -> int:
-    """Run `edge-sr doctor`; returns the exit code.
-
-    Args:
-        options: of edge.doctor.options.doctor_parser.
-        out: for the findings.
-        err: for requests to a person; no press is asked for where it is no terminal.
-        clock_s: the clock of the scans, monotonic, in [s].
+    """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
     Raises:
-        LinkLostError: raised after the findings until then were printed.
-        BridgeError: of the source.
-        RecordingError: the baseline file cannot be used, or is of another order.
+        BridgeError: of the source, or of the files; a link that was lost, and a sensor file that could not be written
+            in the end, are raised after the findings were printed.
         UsageError: several sources; or the sensor file is for another id map than the chosen one.
-        SensorFileError: the sensor file cannot be used, or cannot be written; a failure at the end is raised after the
-            findings were printed.
     """
     if options.forget_gains is not None:
         if options.sensor is None:
@@ -199,57 +159,44 @@ def run(
         return 0
     known = settled(options.sensor, options.id_map)
     if options.out is not None:
-        check_writable(
-            options.out,
-            known,
-            presses=not options.no_press,
-            weighs=options.weight_g is not None,
-        )
+        check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
     before = references(options.baseline, known)
     with stop_on_signals() as stop:
         watch = Watch(options.source, known, references=before, rate_hz=options.rate_hz, stop=stop, clock_s=clock_s)
         visit = Visit(options, watch, err, stop, clock_s)
         start_s = clock_s()
-        lost = None
+        failed: BridgeError | None = None
         with watch.link:
             refuse_emulated(known, watch.link.kind, options.force)
             try:
                 visit.watch()
             except LinkLostError as error:
-                lost = error
+                failed = error
             watched = watch.watched()
             examined = examine(watched, math.nan if watch.link.kind == "replay" else time.time())
-            mountings: dict[str, Mounting] = {}
-            if lost is None and not stop.is_set():
+            if failed is None and not stop.is_set():
                 try:
-                    mountings = visit.press(examined)
+                    visit.press(examined)
                 except LinkLostError as error:
-                    lost = error
-        if lost is not None:
-            examined.findings.append(Finding("link", "wrong", f"lost: {lost}", "", "check plug and cable"))
-        kept = unwritten = None
-        replaced = options.out is not None and options.out.exists()
-        if options.out is not None and lost is None and visit.watched:
+                    failed = error
+        if failed is not None:
+            examined.findings.append(Finding("link", "wrong", f"lost: {failed}", "", "check plug and cable"))
+        kept, replaced = False, options.out is not None and options.out.exists()
+        if options.out is not None and failed is None and visit.watched:
+            free = {name: one for name, one in examined.baselines.items() if name not in examined.loaded}
+            emulated = "emulated" in (watch.link.kind, watch.link.origin)
+            found = free, visit.mountings, visit.newtons
             try:
-                kept = keep(
-                    options.out,
-                    watch.known,
-                    watched.facts.port,
-                    {name: one for name, one in examined.baselines.items() if name not in examined.loaded},
-                    mountings,
-                    visit.newtons,
-                    emulated="emulated" in (watch.link.kind, watch.link.origin),
-                )
+                keep(options.out, watch.known, watched.facts.port, *found, emulated=emulated)
+                kept = True
             except SensorFileError as error:
-                unwritten = error
+                failed = error
         stopped_s = clock_s() - start_s if stop.is_set() else None
-        _tell(options, watch, stopped_s, examined.findings, kept, out, replaced=replaced)
-        if lost is not None:
-            raise lost
-        if unwritten is not None:
-            raise unwritten
+        _tell(options, watch, stopped_s, examined.findings, out, kept=kept, replaced=replaced)
+        if failed is not None:
+            raise failed
         if stop.is_set():
-            if options.out is not None and kept is None:
+            if options.out is not None and not kept:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return EXIT_STOPPED
     return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
@@ -260,9 +207,9 @@ def _tell(
     watch: Watch,
     stopped_s: float | None,
     findings: list[Finding],
-    kept: SensorFile | None,
     out: TextIO,
     *,
+    kept: bool,
     replaced: bool,
 ) -> None:
     link = watch.link
@@ -275,14 +222,13 @@ def _tell(
             "stopped": stopped_s is not None,
             "verdict": worst(findings),
             "findings": [finding.document() for finding in findings],
-            "sensor_file": None if kept is None else str(options.out),
+            "sensor_file": str(options.out) if kept else None,
         }
         print(json.dumps(document, indent=1), file=out)
         return
     emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
-    print(f"{link.name}{emulated}", file=out)
-    print(page(findings, columns()), file=out)
-    if kept is not None:
+    print(f"{link.name}{emulated}", page(findings, columns()), sep="\n", file=out)
+    if kept:
         print(f"kept in {options.out}", file=out)
         if replaced:
             print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)

@@ -38,6 +38,16 @@ class Finding:
         return {name: getattr(self, name) for name in ("sensor", "name", "verdict", "measured", "norm", "remedy")}
 
 
+def judged(name: str, verdict: Verdict, measured: str, norm: str, remedy: str) -> Finding:
+    """Return a finding, which has a remedy unless all is well."""
+    return Finding(name, verdict, measured, norm, "" if verdict == "ok" else remedy)
+
+
+def graded(value: float, look: float, wrong: float) -> Verdict:
+    """Return the verdict on a value of which less is better, by the largest values that are "ok" and "look"."""
+    return "ok" if value <= look else "look" if value <= wrong else "wrong"
+
+
 def worst(findings: Iterable[Finding]) -> Verdict:
     """Return the gravest verdict; "not known" counts as ok."""
     verdicts = {finding.verdict for finding in findings}

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from edge.doctor.findings import Finding, Verdict
+from edge.doctor.findings import Finding, graded, judged
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
@@ -21,12 +21,9 @@ _SHOWN = 8
 
 
 def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
-    """Return whether the chosen id map fits the sensors on the bus; None where no CAN ids are seen at all.
+    """Check that the chosen id map fits the CAN ids that came; None where none are seen at all.
 
-    Args:
-        ids: the CAN ids that came.
-        model: the id map that the user chose.
-        half_silent: half of the taxels or more of some sensor are silent.
+    `half_silent` is true where half of the taxels or more of some sensor are silent.
     """
     if not ids:
         return None
@@ -50,10 +47,8 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
     known = [can_id for can_id in ids if can_id in model.taxels]
     shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:_SHOWN]) + ", ..." * (len(ids) > _SHOWN)
     measured = f"{len(ids)} ids received, {len(known)} of them {model.name}'s: {shown}"
-    if half_silent or not known:
-        remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
-        return Finding("id map", "wrong", measured, norm, remedy)
-    return Finding("id map", "ok", measured, norm)
+    remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
+    return judged("id map", "wrong" if half_silent or not known else "ok", measured, norm, remedy)
 
 
 def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
@@ -124,9 +119,8 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
             "xela_server and every other program that holds it, pull its plug and put it in again"
         )
         return Finding("link", "wrong", measured + (refused or ", answers only"), "", remedy if refusals else off)
-    share = bad / (bad + frames)
     measured += f", {bad} bad lines{refused}"
-    verdict: Verdict = "ok" if bad <= 1 or share <= _BAD_LIMITS[0] else "look" if share <= _BAD_LIMITS[1] else "wrong"
+    verdict = "ok" if bad <= 1 else graded(bad / (bad + frames), *_BAD_LIMITS)
     if verdict != "ok":
         remedy = "bytes are lost or garbled: a poor cable or hub, another line speed, or no RTS/CTS at the adapter"
         return Finding("link", verdict, measured, f"under {100 * _BAD_LIMITS[0]:.2f} % bad lines", remedy)
@@ -143,13 +137,7 @@ def check_baud(
 ) -> Finding | None:
     """Check that the serial line carries what the sensors send; None where there is no serial line.
 
-    Args:
-        facts: of the line.
-        counters: of the link.
-        duration_s: for which it was watched, in [s].
-        sensors: on the bus.
-        rate_hz: of each, where a user expects one, in [Hz].
-        taxel_count: of each.
+    It was watched for `duration_s`, with so many sensors on the bus, of which a user expects `rate_hz` each, or None.
     """
     frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
     if facts.baud is None or not frames or not sensors or duration_s <= 0:
@@ -165,9 +153,8 @@ def check_baud(
         return Finding("baud rate", "ok", f"{measured}: this adapter goes by USB and ignores it", norm)
     if used > FULL_SHARE:
         return Finding("baud rate", "wrong", measured, norm, remedy)
-    if carries_hz < (USUAL_RATE_HZ if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or ""):
-        return Finding("baud rate", "look", measured, norm, remedy)
-    return Finding("baud rate", "ok", measured, norm)
+    slow = carries_hz < (USUAL_RATE_HZ if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or "")
+    return judged("baud rate", "look" if slow else "ok", measured, norm, remedy)
 
 
 def capacity_hz(baud: int, line_bytes: int, sensors: int = 1, taxel_count: int = USPA44.taxel_count) -> float:
@@ -176,12 +163,9 @@ def capacity_hz(baud: int, line_bytes: int, sensors: int = 1, taxel_count: int =
 
 
 def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Finding:
-    """Check that bytes are passed on as they come.
+    """Check that bytes are passed on as they come: a quarter of the scans are `held_back_ms` late or more.
 
-    Args:
-        facts: of the line.
-        held_back_ms: delay of a quarter of the scans or more, in [ms].
-        line_full: the serial line carries no more, so that everything is late.
+    Where the serial line carries no more, `line_full`, everything is late.
     """
     timer = "" if facts.latency_ms is None else f"timer at {facts.latency_ms} ms, "
     measured = f"{timer}a quarter of the scans {held_back_ms:.1f} ms late or more"
@@ -193,11 +177,10 @@ def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Fin
         return Finding("latency timer", "wrong", measured, norm, remedy)
     if line_full:
         return Finding("latency timer", "not known", measured, norm, "the line is full: see baud rate")
-    if held_back_ms > HELD_BACK_LIMIT_MS:
-        busy = "this machine is too busy to read in time: end what else runs, or use --realtime"
-        remedy = f"the adapter holds bytes back: of an FTDI chip, echo 1 | sudo tee {shown}; or {busy}"
-        return Finding("latency timer", "wrong", measured, norm, remedy if facts.latency_ms is None else busy)
-    return Finding("latency timer", "ok", measured, norm)
+    remedy = "this machine is too busy to read in time: end what else runs, or use --realtime"
+    if facts.latency_ms is None:
+        remedy = f"the adapter holds bytes back: of an FTDI chip, echo 1 | sudo tee {shown}; or {remedy}"
+    return judged("latency timer", "wrong" if held_back_ms > HELD_BACK_LIMIT_MS else "ok", measured, norm, remedy)
 
 
 def _trouble(counters: Mapping[str, int]) -> Finding | None:
@@ -221,13 +204,7 @@ _LOSS_REMEDY: Final = (
 
 
 def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Finding:
-    """Check the scans and the new readings a second.
-
-    Args:
-        samples: of the sensor.
-        wanted_hz: the rate that a user expects, in [Hz].
-        line_full: the serial line carries no more, so that the sensor's own rate cannot be seen.
-    """
+    """Check the scans and the new readings a second, in [Hz]; on a full line the sensor's own rate cannot be seen."""
     rate_hz = 1 / samples.period_s()
     new_hz = samples.renewed[:, samples.living & ~samples.stuck()].mean(axis=0) * rate_hz
     taxels = f", taxels renewed {new_hz.min():.1f} to {new_hz.max():.1f} Hz" if new_hz.size else ""
@@ -236,14 +213,10 @@ def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Fi
     norm = f"{low:.0f} to {high:.0f} Hz"
     if line_full:
         return Finding("rate", "not known", measured, norm, "the line is full: see baud rate")
-    if low <= rate_hz <= high:
-        return Finding("rate", "ok", measured, norm)
-    remedy = (
-        "set the sensor's rate in its controller, or state the expected one with --rate-hz"
-        if rate_hz < low
-        else "harmless, if the processor keeps up: state the expected rate with --rate-hz"
-    )
-    return Finding("rate", "look", measured, norm, remedy)
+    remedy = "harmless, if the processor keeps up: state the expected rate with --rate-hz"
+    if rate_hz < low:
+        remedy = "set the sensor's rate in its controller, or state the expected one with --rate-hz"
+    return judged("rate", "ok" if low <= rate_hz <= high else "look", measured, norm, remedy)
 
 
 def check_torn(samples: Samples) -> Finding:
@@ -251,7 +224,7 @@ def check_torn(samples: Samples) -> Finding:
     torn, old = float(samples.torn().mean()), float(samples.half_old().mean())
     measured = f"{100 * torn:.2f} % lack a taxel, {100 * old:.2f} % hold old readings"
     norm = f"under {100 * _LOSS_LIMITS[0]:.1f} % and {100 * _OLD_LIMITS[0]:.0f} %"
-    verdict = _graded(torn, _LOSS_LIMITS)
+    verdict = graded(torn, *_LOSS_LIMITS)
     if verdict != "ok":
         missing = np.where(samples.living, (~samples.fresh).mean(axis=0), 0)
         most = int(missing.argmax())
@@ -259,33 +232,16 @@ def check_torn(samples: Samples) -> Finding:
         remedy = f"taxel {most} comes and goes: its connection may be broken" if only else _LOSS_REMEDY
         return Finding("torn scans", verdict, measured, norm, remedy)
     remedy = "the sender of these scans repeats itself: lower its rate to that of the sensor"
-    verdict = _graded(old, _OLD_LIMITS)
-    return Finding("torn scans", verdict, measured, norm, "" if verdict == "ok" else remedy)
+    return judged("torn scans", graded(old, *_OLD_LIMITS), measured, norm, remedy)
 
 
 def check_lost(samples: Samples, silent_s: float) -> Finding:
-    """Check the share of scans that never came, by the gaps they left.
-
-    Args:
-        samples: of the sensor.
-        silent_s: time without a scan at the end, in [s].
-    """
+    """Check the share of scans that never came, by the gaps they left; none came for `silent_s` at the end."""
     if silent_s > LATEST_SCAN_S:
         remedy = "the sensor fell silent: check its power and its plug"
         return Finding("lost scans", "wrong", f"all of the last {silent_s:.0f} s", "", remedy)
     lost = samples.lost()
-    share = lost / (lost + samples.scans)
     gap_ms = 1000 * float(np.diff(samples.time_s).max())
     measured = f"{lost} of {lost + samples.scans}, longest gap {gap_ms:.0f} ms"
-    verdict = _graded(share, _LOSS_LIMITS)
-    return Finding(
-        "lost scans",
-        verdict,
-        measured,
-        f"under {100 * _LOSS_LIMITS[0]:.1f} %",
-        "" if verdict == "ok" else _LOSS_REMEDY,
-    )
-
-
-def _graded(value: float, limits: tuple[float, float]) -> Verdict:
-    return "ok" if value <= limits[0] else "look" if value <= limits[1] else "wrong"
+    norm = f"under {100 * _LOSS_LIMITS[0]:.1f} %"
+    return judged("lost scans", graded(lost / (lost + samples.scans), *_LOSS_LIMITS), measured, norm, _LOSS_REMEDY)

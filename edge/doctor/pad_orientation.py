@@ -5,14 +5,14 @@ the middle of the pad, its surface moves along both axes, and each corner has an
 readings fits only one axis and one direction, and any three corners settle which.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.findings import Finding, Verdict
+from edge.doctor.findings import Finding, judged
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 
@@ -32,11 +32,10 @@ _OFF_THE_MIDDLE: Final = 0.4
 
 @dataclass(frozen=True)
 class Press:
-    """Result of the press on one corner.
+    """Press on one corner.
 
     Attributes:
-        place: of the corner that was asked for, one of the geometry's corners.
-        taxel: the corner of the taxels that answered, one of the same.
+        place: that was asked for, and the taxel that answered: each one of the geometry's corners.
         z_counts: summed z.
         push_counts: change of the summed x and y when pushed to the middle; None where no push was felt.
     """
@@ -129,15 +128,12 @@ def z_sign(presses: Sequence[Press]) -> int | None:
     return signs.pop() if len(signs) == 1 else None
 
 
-def why_no_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str:
-    """Return the reason why no orientation fits these presses."""
-    answered: Mapping[int, list[int]] = {
-        taxel: [press.place for press in presses if press.taxel == taxel] for taxel in geometry.corners
-    }
-    twice = [places for places in answered.values() if len(places) > 1]
-    if twice:
-        names = " and ".join(CORNERS[geometry.corners.index(place)] for place in twice[0])
-        return f"{names} answered at the same corner"
+def _why_no_order(presses: Sequence[Press], geometry: SensorGeometry) -> str:
+    for taxel in geometry.corners:
+        places = [press.place for press in presses if press.taxel == taxel]
+        if len(places) > 1:
+            names = " and ".join(CORNERS[geometry.corners.index(place)] for place in places)
+            return f"{names} answered at the same corner"
     return "opposite corners do not answer at opposite corners"
 
 
@@ -152,13 +148,12 @@ def judge_press(
 ) -> tuple[list[Finding], Mounting | None]:
     """Return the findings, and the mounting that they give; None while order or axes are not clear.
 
-    Args:
-        answer: of the guided press.
-        kept: the results go into a sensor file, so that nothing is left to be done.
-        weighed: a weight was asked for.
-        geometry: of the sensor.
+    Where the results are `kept`, in a sensor file, nothing is left to be done; a weight was asked for if `weighed`.
     """
     presses = answer.presses
+    verdict, remedy = "wrong", "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
+    if kept:
+        verdict, remedy = "look", "the sensor file states this: run edge-sr with it"
     findings: list[Finding] = []
     mounting = None
     if len(presses) < FEWEST_CORNERS:
@@ -166,37 +161,26 @@ def judge_press(
         findings = [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")]
     else:
         turn = find_order(presses, geometry)
+        norm = "each corner answers where it is pressed"
+        if turn is None:
+            other = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
+            findings.append(Finding("taxel order", "wrong", _why_no_order(presses, geometry), norm, other))
+        else:
+            findings.append(judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy))
         axes, z = find_axes(presses, geometry), z_sign(presses)
-        findings.append(_order_finding(turn, "" if turn else why_no_order(presses, geometry), kept))
         if axes is None or z is None:
             findings.append(_unclear_axes(sum(press.push_counts is not None for press in presses), z))
         else:
-            count = geometry.taxel_count
-            found = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=count)
-            findings.append(_axes_finding(found, kept))
+            found = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=geometry.taxel_count)
+            ways = [way for way, sign in zip("xyz", found.signs, strict=True) if sign < 0]
+            parts = ["x and y swapped"] * found.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
+            measured = " and ".join(parts) or "x right, y down, z up when pressed"
+            findings.append(judged("axis signs", verdict if parts else "ok", measured, _NORM, remedy))
             if turn is not None:
                 mounting = replace(found, order=orders(geometry)[turn])
     if weighed:
         findings.append(_force_finding(answer.counts_per_newton, kept))
     return findings, mounting
-
-
-def _order_finding(turn: str | None, why: str, kept: bool) -> Finding:
-    norm = "each corner answers where it is pressed"
-    if turn is None:
-        remedy = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
-        return Finding("taxel order", "wrong", why, norm, remedy)
-    if turn == AS_MAPPED:
-        return Finding("taxel order", "ok", turn, norm)
-    return Finding("taxel order", _settled(kept), turn, norm, _use(kept))
-
-
-def _axes_finding(found: Mounting, kept: bool) -> Finding:
-    if not found.turns_axes:
-        return Finding("axis signs", "ok", "x right, y down, z up when pressed", _NORM)
-    ways = [way for way, sign in zip(("x", "y", "z"), found.signs, strict=True) if sign < 0]
-    parts = ["x and y swapped"] * found.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
-    return Finding("axis signs", _settled(kept), " and ".join(parts), _NORM, _use(kept))
 
 
 def _unclear_axes(pushes: int, z: int | None) -> Finding:
@@ -219,18 +203,5 @@ def _force_finding(counts_per_newton: float | None, kept: bool) -> Finding:
     if not low <= counts_per_newton <= high:
         remedy = "is the weight as heavy as --weight-g states, and does it lie on the pad alone?"
         return Finding("force", "look", measured, norm, remedy)
-    return Finding(
-        "force", "ok", measured, norm, "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
-    )
-
-
-def _settled(kept: bool) -> Verdict:
-    return "look" if kept else "wrong"
-
-
-def _use(kept: bool) -> str:
-    return (
-        "the sensor file states this: run edge-sr with it"
-        if kept
-        else "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
-    )
+    use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
+    return Finding("force", "ok", measured, norm, use)

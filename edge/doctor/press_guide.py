@@ -7,8 +7,7 @@ import os
 import select
 import sys
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Final, NamedTuple, TextIO, TypeVar
 
 import numpy as np
@@ -50,7 +49,7 @@ class Reading(NamedTuple):
         return self.zeroed[:2].sum(axis=(1, 2))
 
 
-class SkippedError(Exception):
+class _SkippedError(Exception):
     """Raised in a dialogue where the person skips the request."""
 
 
@@ -58,25 +57,22 @@ T = TypeVar("T")
 Dialogue = Generator[str | None, Reading, T]
 
 
-class Guide(ABC):
-    """Dialogue with a person who presses a pad.
+class GuidedPress:
+    """Dialogue that asks a person for four presses on corners, one after the other, then for a weight.
 
     Attributes:
+        first: the first request.
         done: True when there are no more requests.
-        enough_counts: load at which a press is measured.
+        answer: results so far; complete when `done`.
     """
 
-    enough_counts: float
-
-    def __init__(self, geometry: SensorGeometry) -> None:
+    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
+        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
         self.done = False
+        self.answer = Answer()
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all()
+        self._dialogue = self._all(geometry.corners, weight_g)
         self.first: Final = next(self._dialogue) or ""
-
-    @abstractmethod
-    def _all(self) -> Dialogue[None]:
-        """Return the whole dialogue."""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
         """Take one more reading; returns the next request, or None.
@@ -90,66 +86,49 @@ class Guide(ABC):
 
     def skip(self) -> str | None:
         """Leave the open request out; returns the next one, or None."""
-        return self._go_on(lambda: self._dialogue.throw(SkippedError()))
+        return self._go_on(lambda: self._dialogue.throw(_SkippedError()))
 
     @property
-    def felt_counts(self) -> float:
-        """Load on the pad by the last reading."""
-        return float(np.abs(self._held[2]).sum())
+    def felt(self) -> float:
+        """Load on the pad by the last reading, of that at which a press is measured."""
+        return float(np.abs(self._held[2]).sum()) / ON_COUNTS
 
     def _go_on(self, step: Callable[[], str | None]) -> str | None:
         if self.done:
             return None
         try:
             return step()
-        except (StopIteration, SkippedError):  # a dialogue without another way ends where it is skipped
+        except (StopIteration, _SkippedError):  # a dialogue without another way ends where it is skipped
             self.done = True
             return None
 
-
-class GuidedPress(Guide):
-    """Dialogue that asks for four corners, one after the other, then for a weight.
-
-    Attributes:
-        answer: results so far; complete when `done`.
-    """
-
-    enough_counts = ON_COUNTS
-
-    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
-        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
-        self._corners = geometry.corners
-        self._weight_g = weight_g
-        self.answer = Answer()
-        super().__init__(geometry)
-
-    def _all(self) -> Dialogue[None]:
-        for place, name in zip(self._corners, CORNERS, strict=True):
+    def _all(self, corners: Sequence[int], weight_g: float | None) -> Dialogue[None]:
+        for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
-            except SkippedError:
+            except _SkippedError:
                 # A finger that is still there would be taken for one on the next corner.
-                if (yield from wait("Skipped. Let go.", free, FREE_SCANS)) is None:
+                if (yield from _wait("Skipped. Let go.", _free, FREE_SCANS)) is None:
                     break
                 continue
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
                 break
             self.answer.presses.append(press)
-        if self._weight_g is not None:
-            self.answer.counts_per_newton = yield from _weigh(self._weight_g)
+        if weight_g is not None:
+            self.answer.counts_per_newton = yield from _weigh(weight_g)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
     ask = f"Press the {name} corner with a finger, about as hard as a stiff doorbell, and hold it."
     for _ in range(TRIES):
-        held = yield from wait(ask, _touched, HOLD_SCANS)
+        held = yield from _wait(ask, _touched, HOLD_SCANS)
         if held is None:
             return None
         mean = np.mean([reading.zeroed for reading in held], axis=0)
         taxel = corner_taxel(mean[2])
         if taxel is not None:
             break
-        yield from wait("That was not a corner. Let go.", free, FREE_SCANS)
+        yield from _wait("That was not a corner. Let go.", _free, FREE_SCANS)
         ask = f"Press the {name} corner itself and hold it."
     else:
         return None
@@ -158,14 +137,14 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     def pushed(reading: Reading) -> bool:
         return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= PUSH_COUNTS)
 
-    felt = yield from wait(
-        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or free(one), PUSH_SCANS
+    felt = yield from _wait(
+        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), PUSH_SCANS
     )
     push = None
     if felt is not None and pushed(felt[-1]):
         x, y = np.mean([reading.shear_counts for reading in felt], axis=0) - before
         push = (float(x), float(y))
-    yield from wait("Good. Let go." if push else "No push was measured. Let go.", free, FREE_SCANS)
+    yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)
 
 
@@ -177,21 +156,18 @@ def _weigh(weight_g: float) -> Dialogue[float | None]:
         steady.append(float(reading.zeroed[2].sum()))
         del steady[:-STEADY_SCANS]
         low, high = min(np.abs(steady)), max(np.abs(steady))
-        return len(steady) == STEADY_SCANS and low > LEAST_WEIGHT_COUNTS and high - low < _leeway(high)
+        still = high - low < max(STEADY_COUNTS, STEADY_SHARE * high)
+        return len(steady) == STEADY_SCANS and low > LEAST_WEIGHT_COUNTS and still
 
-    laid = yield from wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
+    laid = yield from _wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
     if laid is None:
         return None
     counts = abs(float(np.mean(steady)))
-    yield from wait("Good. Take it off.", free, FREE_SCANS)
+    yield from _wait("Good. Take it off.", _free, FREE_SCANS)
     return counts / (weight_g / 1000 * GRAVITY_M_S2)
 
 
-def _leeway(counts: float) -> float:
-    return max(STEADY_COUNTS, STEADY_SHARE * counts)
-
-
-def wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
+def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:
     """Make a request, and return as many readings in a row that fulfil it, or None when patience is at its end."""
     reading = yield say
     end_s = reading.time_s + PATIENCE_S
@@ -209,8 +185,7 @@ def _touched(reading: Reading) -> bool:
     return reading.load_counts >= ON_COUNTS
 
 
-def free(reading: Reading) -> bool:
-    """Return whether nothing presses the pad."""
+def _free(reading: Reading) -> bool:
     return reading.load_counts < OFF_COUNTS
 
 
@@ -231,13 +206,13 @@ class FeltLine:
         """Begin the time of a request."""
         self._asked_s = self._clock_s()
 
-    def show(self, guide: Guide) -> None:
+    def show(self, guide: GuidedPress) -> None:
         """Show the load on the pad, at most ten times a second."""
         now_s = self._clock_s()
         if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
             return
         self._shown_s = now_s
-        full = min(int(BAR * guide.felt_counts / guide.enough_counts), BAR)
+        full = min(int(BAR * guide.felt), BAR)
         left_s = max(PATIENCE_S - (now_s - self._asked_s), 0)
         skip = ", Enter skips" if _stdin_is_terminal() else ""
         self._write(f"felt [{'#' * full:{BAR}}] {left_s:.0f} s left{skip}")

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.findings import Finding, Verdict
+from edge.doctor.findings import Finding, graded, judged
 from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
@@ -169,25 +169,18 @@ def check_noise(samples: Samples) -> Finding:
     noise = np.where(samples.stuck(), np.nan, samples.noise_counts())
     if np.isnan(noise).all():
         return Finding("noise", "not known", "no taxel sends new readings")
-    worst: Verdict = "ok"
-    for axis, (look, wrong) in enumerate(NOISE_LIMITS_COUNTS):
-        largest = np.nanmax(noise[axis])
-        if largest > wrong:
-            worst = "wrong"
-        elif largest > look and worst == "ok":
-            worst = "look"
+    verdicts = {graded(np.nanmax(one), *limits) for one, limits in zip(noise, NOISE_LIMITS_COUNTS, strict=True)}
+    verdict = "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
     limits = np.asarray(NOISE_LIMITS_COUNTS)[:, :1]
     axis, taxel = _farthest(noise / limits)
     medians = ", ".join(f"{name} {np.nanmedian(plane):.1f}" for name, plane in zip(AXES, noise, strict=True))
     measured = f"{medians} counts; most on taxel {taxel} {AXES[axis]}, {noise[axis, taxel]:.1f}"
     norm = f"{NOISE_COUNTS:.0f} counts, up to {' / '.join(f'{look:.0f}' for look, _ in NOISE_LIMITS_COUNTS)}"
     loud = int((noise > limits).any(axis=0).sum())
-    remedy = (
-        "keep motors, magnets and power cables away from the pad, and keep it still"
-        if loud > 1
-        else f"taxel {taxel} alone is noisy: a loose magnet or a broken chip"
-    )
-    return Finding("noise", worst, measured, norm, "" if worst == "ok" else remedy)
+    remedy = f"taxel {taxel} alone is noisy: a loose magnet or a broken chip"
+    if loud > 1:
+        remedy = "keep motors, magnets and power cables away from the pad, and keep it still"
+    return judged("noise", verdict, measured, norm, remedy)
 
 
 def check_rest(samples: Samples) -> Finding:
@@ -201,33 +194,26 @@ def check_rest(samples: Samples) -> Finding:
     axis, taxel = _farthest(stray)
     norm = f"alike within {STRAY_COUNTS:.0f} counts on an axis"
     measured = f"{', '.join(spans)} counts"
-    if stray[axis, taxel] <= STRAY_COUNTS:
-        return Finding("rest levels", "ok", measured, norm)
     remedy = f"taxel {taxel} {AXES[axis]} rests far from the others: pressed, too near a magnet, or broken"
-    return Finding("rest levels", "look", measured, norm, remedy)
+    return judged("rest levels", "look" if stray[axis, taxel] > STRAY_COUNTS else "ok", measured, norm, remedy)
 
 
 def check_drift(samples: Samples) -> Finding:
     """Check the drift of the rest from the first tenth of the time to the last."""
-    duration_s = float(samples.time_s[-1])
     drift = np.where(samples.stuck(), np.nan, samples.drift_counts())
     if np.isnan(drift).all():
         return Finding("drift", "not known", "no taxel sends new readings")
     sizes = np.abs(drift)
     axis, taxel = _farthest(sizes)
     z_sum = float(np.nansum(drift[2]))
-    measured = (
-        f"{drift[axis, taxel]:+.0f} counts on taxel {taxel} {AXES[axis]}, summed z {z_sum:+.0f}, in {duration_s:.0f} s"
-    )
+    most = f"{drift[axis, taxel]:+.0f} counts on taxel {taxel} {AXES[axis]}"
+    measured = f"{most}, summed z {z_sum:+.0f}, in {float(samples.time_s[-1]):.0f} s"
     norm = f"under {CREEP_LIMIT_COUNTS:.0f} on a taxel"
     remedy = "let it warm up for ten minutes, unloaded and still, then zero again"
     if float(np.nanmax(sizes[2])) > LOAD_LIMIT_COUNTS:
         remedy = "more than warming up causes: something pressed or released it meanwhile; free it and measure again"
-    if sizes[axis, taxel] > LONE_DRIFT_COUNTS or abs(z_sum) >= OFF_COUNTS:
-        return Finding("drift", "wrong", measured, norm, remedy)
-    if sizes[axis, taxel] > CREEP_LIMIT_COUNTS:
-        return Finding("drift", "look", measured, norm, remedy)
-    return Finding("drift", "ok", measured, norm)
+    verdict = "wrong" if abs(z_sum) >= OFF_COUNTS else graded(sizes[axis, taxel], CREEP_LIMIT_COUNTS, LONE_DRIFT_COUNTS)
+    return judged("drift", verdict, measured, norm, remedy)
 
 
 def _farthest(values: NDArray[np.floating]) -> tuple[int, int]:

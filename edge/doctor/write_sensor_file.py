@@ -18,11 +18,7 @@ _AS_WIRED = frozenset({"mounting"})
 def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
-    Args:
-        path: of the file.
-        known: sensor file that the doctor started with.
-        presses: presses will be asked for.
-        weighs: a weight will be asked for.
+    The doctor started with what is `known`, and will ask for `presses`, and for a weight where it `weighs`.
 
     Raises:
         SensorFileError: the file cannot be written, or holds values that this visit cannot measure.
@@ -72,50 +68,37 @@ def keep(
         SensorFileError: the file cannot be written, or holds values that were not measured this time.
     """
     with changing(path):
-        return _kept(path, known, port, baselines, found, counts_per_newton, emulated=emulated)
-
-
-def _kept(
-    path: Path,
-    known: SensorFile,
-    port: str | None,
-    baselines: Mapping[str, Baseline],
-    found: Mapping[str, Mounting],
-    counts_per_newton: Mapping[str, float],
-    *,
-    emulated: bool,
-) -> SensorFile:
-    before = _before(path)
-    entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
-    if known.path is not None and known.path.resolve() == path.resolve():  # a run may have learned gains meanwhile
-        for name, entry in before.sensors.items():
-            entries[name] = replace(entries.get(name, entry), learned=entry.learned)
-    for name in sorted({*baselines, *found, *counts_per_newton}):
-        entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
-        parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
-        renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
-        turned = found.get(name, as_wired)
-        baseline = baselines.get(name, entry.baseline)
-        if baseline is not None and turned.moves_taxels:
-            counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
-            baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
-        per_newton = counts_per_newton.get(name, entry.counts_per_newton)
-        pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
-        entries[name] = SensorEntry(
-            entry.mounting.then(turned),
-            per_newton,
-            baseline,
-            *pads,
-            assumed=entry.assumed - renewed,
-            emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
-            frame=entry.frame,
-        )
-    # A sensor of a named source is one of several, each with an adapter of its own.
-    serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
-    written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
-    _refuse_loss(path, before, written)
-    save_sensor_file(path, written)
-    return written
+        before = _before(path)
+        entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
+        if known.path is not None and known.path.resolve() == path.resolve():  # a run may have learned gains meanwhile
+            for name, entry in before.sensors.items():
+                entries[name] = replace(entries.get(name, entry), learned=entry.learned)
+        for name in sorted({*baselines, *found, *counts_per_newton}):
+            entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
+            parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
+            renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
+            turned = found.get(name, as_wired)
+            baseline = baselines.get(name, entry.baseline)
+            if baseline is not None and turned.moves_taxels:
+                counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
+                baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
+            per_newton = counts_per_newton.get(name, entry.counts_per_newton)
+            pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
+            entries[name] = SensorEntry(
+                entry.mounting.then(turned),
+                per_newton,
+                baseline,
+                *pads,
+                assumed=entry.assumed - renewed,
+                emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
+                frame=entry.frame,
+            )
+        # A sensor of a named source is one of several, each with an adapter of its own.
+        serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
+        written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
+        _refuse_loss(path, before, written)
+        save_sensor_file(path, written)
+        return written
 
 
 def _before(path: Path) -> SensorFile:

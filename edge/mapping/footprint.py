@@ -13,13 +13,7 @@ MOST_PX: Final = 2000
 
 
 class Grid(NamedTuple):
-    """Pixels of a map.
-
-    Attributes:
-        pixels: along a side.
-        px_per_mm: pixels per [mm].
-        centre_mm: place of the map's centre in the object's plane.
-    """
+    """Pixels along a map's side, pixels per [mm], and the place of its centre in the object's plane, in [mm]."""
 
     pixels: int
     px_per_mm: float
@@ -65,14 +59,7 @@ def _between(flat: NDArray[np.float32], left: NDArray[np.intp], share: NDArray[n
 
 
 def footprint(grid: Grid, pose: PadPose, shape: tuple[int, ...], pixel_mm: float) -> Footprint | None:
-    """Return the pixels of a map under a pad; None if there are none.
-
-    Args:
-        grid: of the map.
-        pose: of the pad.
-        shape: (H, W) of its patterns.
-        pixel_mm: distance of their pixels, in [mm].
-    """
+    """Return the pixels of a map under a pad whose patterns are (H, W), `pixel_mm` apart; None if there are none."""
     height, width = shape
     cosine, sine = cos(radians(pose.turn_deg)), sin(radians(pose.turn_deg))
     # Only the map's rows and columns that the pad reaches are looked at, however large the map is.

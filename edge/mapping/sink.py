@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.errors import SinkError
-from edge.mapping.live_map import LiveMap, MapState
+from edge.mapping.live_map import MapState
 from edge.mapping.map_files import check_npz, save_npz, save_png
 from edge.mapping.object_map import ObjectMap
 from edge.perception.result import Result
@@ -61,7 +61,7 @@ class MapSink(Sink):
             npz: file of the layers, written on `close`, and at a reset; later maps have a number in their names.
             png: picture, written likewise.
             show: called with the map's state a few times a second; it must not wait.
-            origin: kind of source that the scans come from, where a recording names it.
+            origin: as above.
             clock_ns: monotonic, in [ns].
 
         Raises:
@@ -72,7 +72,7 @@ class MapSink(Sink):
         self.show, self.origin = show, origin
         self._before: Counter[str] = Counter()
         self._written: list[Path] = []
-        self._files = [(path, save) for path, save in ((npz, self._save_npz), (png, self._save_png)) if path]
+        self._files = [(path, save) for path, save in ((npz, save_npz), (png, save_png)) if path]
         self._first_files = self._files
         for path, _ in self._files:
             if path.exists():
@@ -83,11 +83,11 @@ class MapSink(Sink):
                 raise SinkError(f"cannot write {path}: {error.strerror}") from error
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
-        self._live = LiveMap(whole.grid)
         self._clock_ns = clock_ns
         self._pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // SHOWN_PX)
         self._due_ns = 0
         self._unseen = False
+        self._shown = 0
 
     @property
     def fused(self) -> int:  # noqa: D102 - above
@@ -179,16 +179,11 @@ class MapSink(Sink):
             if path in self._written:
                 continue
             try:
-                write_in_place(path, save, check_npz if path.suffix == ".npz" else partial(Path.stat))
+                check = check_npz if path.suffix == ".npz" else Path.stat
+                write_in_place(path, partial(save, whole=self.whole, **self._facts), check)
             except (OSError, ValueError, KeyError) as error:
                 raise SinkError(f"cannot write {path}: {error}") from error
             self._written.append(path)
-
-    def _save_npz(self, path: Path) -> None:
-        save_npz(path, self.whole, **self._facts)
-
-    def _save_png(self, path: Path) -> None:
-        save_png(path, self.whole, **self._facts)
 
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
@@ -197,7 +192,8 @@ class MapSink(Sink):
         whole = self.whole
         seen_ns = max((time_ns for _, time_ns in self._pads.values()), default=0)
         pads = {name: pose for name, (pose, at_ns) in self._pads.items() if seen_ns - at_ns <= SENSOR_SILENT_NS}
-        self.show(self._live.next(*whole.contact(), pads, self._counts))
+        self._shown += 1
+        self.show(MapState(self._shown, whole.grid, *whole.contact(), pads, self._counts))
 
 
 def _numbered(path: Path, number: int) -> Path:

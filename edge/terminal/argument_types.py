@@ -1,15 +1,13 @@
-"""Common parts of the options of all commands: one line for wrong usage, types of numbers, the options of a source."""
+"""Common parts of the options of all commands: one line for wrong usage, and types of numbers."""
 
 import argparse
 import math
 import textwrap
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from edge import __version__
 from edge.terminal.text_wrap import FEWEST_COLUMNS
-from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.schedule import POSITIVE
 
@@ -66,31 +64,6 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """End with the message and a hint at the help."""
         self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help lists all options)\n")
-
-
-def add_source(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
-    """Add the options of every command that reads a sensor; returns the function that adds more to their group."""
-    add = parser.add_argument_group("sensor").add_argument
-    source_help = (
-        "where scans come from (default: the adapter plugged in); for two fingers repeated, as NAME=SRC; "
-        "edge-sr --help lists all"
-    )
-    add("--source", metavar="SRC", action="append", default=[], help=source_help)
-    sensor_help = (
-        "sensor file, which edge-sr doctor writes: how the pad is wired and mounted, and its readings when free; other "
-        "options override it"
-    )
-    add("--sensor", metavar="FILE", type=Path, help=sensor_help)
-    map_help = (
-        f"kind of pad: which CAN message is which taxel: {', '.join(ID_MAPS)}; A and B are boards before 2021 "
-        f"(default {USPA44_MAP.name})"
-    )
-    add("--id-map", metavar="MAP", choices=ID_MAPS, help=map_help)
-    rate_help = "scans a second at which a recording is played; for a device, its expected rate"
-    add("--rate-hz", metavar="R", type=positive, help=rate_help)
-    force_help = "use a sensor file of an emulated sensor on a real one all the same"
-    add("--force", action="store_true", help=force_help)
-    return add
 
 
 def positive(text: str, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> float:

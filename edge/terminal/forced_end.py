@@ -35,9 +35,6 @@ def ended_in_time(numbers: Collection[int]) -> Iterator[None]:
     """End the process by force, with EXIT_FORCED, if the with block lasts longer than END_S after one of these signals.
 
     Files that are being finished get the time they need for as long as they grow. Main thread alone.
-
-    Args:
-        numbers: signals that Python handles.
     """
     waking, woken = socket.socketpair()
     woken.setblocking(False)

@@ -44,13 +44,7 @@ class Panel:
 
 
 def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: str | None) -> Palette:
-    """Return the best palette that the output can show.
-
-    Args:
-        environment: variables; NO_COLOR, TERM and COLORTERM are used.
-        terminal: True if the output is a terminal.
-        encoding: of the output.
-    """
+    """Return the best palette that the output can show, by the variables NO_COLOR, TERM and COLORTERM."""
     try:
         HALF_BLOCK.encode(encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -61,13 +55,9 @@ def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: 
 
 
 def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = WIDEST) -> str:
-    """Draw panels side by side, or below each other if the terminal is too narrow.
+    """Draw panels side by side, or below each other if the terminal of so many columns is too narrow.
 
-    Args:
-        panels: from left to right.
-        columns: width of the terminal; no line is wider.
-        palette: colours or characters of the values.
-        widest: columns of a panel, at most.
+    No panel is wider than `widest` columns.
     """
     width = min(widest, (columns - GAP * (len(panels) - 1)) // len(panels))
     width -= width % SHARP

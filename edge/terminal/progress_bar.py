@@ -124,11 +124,7 @@ class Progress:
 def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = None) -> Iterator[_Thing]:
     """Yield things one after the other under a bar; each counts when the next is requested.
 
-    Args:
-        things: things to go through.
-        what: name of the work, in a word or two.
-        unit: name of one thing, in the singular.
-        total: number of things, if they have no length.
+    `what` and `unit` are those of Progress; `total` is the number of things, if they have no length.
     """
     count = len(things) if total is None and isinstance(things, Sized) else total
     if count is None:

@@ -24,13 +24,9 @@ def drawn(stream: TextIO) -> TextIO:
 
 
 def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:
-    """Wrap text into lines.
+    """Wrap a paragraph into lines of `width` columns, of which the first begins with `start`, the others with `indent`.
 
-    Args:
-        text: a paragraph.
-        width: of a line, in columns; a wider word stays whole, since paths and options are copied from the text.
-        start: prefix of the first line.
-        indent: prefix of the others.
+    A wider word stays whole, since paths and options are copied from the text.
     """
     return textwrap.wrap(
         text, width, initial_indent=start, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False

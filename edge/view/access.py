@@ -1,4 +1,4 @@
-"""Access to the live page: the requests that its server accepts. No I/O.
+"""Access to the live page: the requests that its server accepts, and the addresses at which it can be reached.
 
 A browser runs pages of strangers, which can reach a server on loopback, too. Three things keep them out: the name that
 the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
@@ -13,13 +13,22 @@ import hmac
 import ipaddress
 import re
 import secrets
+import socket
+import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
+from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import parse_qs
 
 from edge.errors import UsageError
+
+try:
+    from fcntl import ioctl
+except ImportError:
+    ioctl = None
 
 PAGE: Final = "/"
 SOCKET: Final = "/ws"
@@ -58,10 +67,7 @@ class Access:
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
         """Return the refusal of a request; None if it is granted.
 
-        Args:
-            path: with its query.
-            hosts: values of its Host header.
-            origins: values of its Origin header; only browsers send it.
+        The path has its query; `hosts` and `origins` are the values of these headers, the latter of browsers alone.
         """
         called = ", ".join(hosts) or "nothing"
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
@@ -90,10 +96,7 @@ class Access:
     def urls(self, port: int, addresses: Sequence[str] = ()) -> list[str]:
         """Return the addresses of the page, the most useful first.
 
-        Args:
-            port: of the server.
-            addresses: of this machine, where the server listens at all of them. Its name is the last: other machines
-                may not know it.
+        Where the server listens at all `addresses` of this machine, its name is the last: others may not know it.
         """
         hosts = [*addresses, self.name] if is_everything(self.host) else [self.host]
         query = "" if self.token is None else f"?token={self.token}"
@@ -160,3 +163,36 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 def _same(given: str, token: str) -> bool:
     return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())
+
+
+_SIOCGIFADDR: Final = 0x8915
+_REQUEST: Final = struct.Struct("16s4x4s232x")
+"""The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses."""
+_IPV6: Final = Path("/proc/net/if_inet6")
+
+
+def own_addresses(host: str) -> list[str]:
+    """Return the addresses of this machine that a server at 0.0.0.0 (IPv4) or :: (IPv6) listens at.
+
+    Those that only this machine reaches, and those that need the name of an interface, are left out.
+    """
+    usable = (ipaddress.ip_address(one) for one in (_ipv6() if ":" in host else _ipv4()))
+    return list(dict.fromkeys(str(one) for one in usable if not (one.is_loopback or one.is_link_local)))
+
+
+def _ipv4() -> list[str]:
+    found: list[str] = []
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            if ioctl is None:
+                break
+            with suppress(OSError):  # an interface without an IPv4 address
+                answer = ioctl(asked, _SIOCGIFADDR, _REQUEST.pack(name.encode(), bytes(4)))
+                found.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
+    return found
+
+
+def _ipv6() -> list[str]:
+    with suppress(OSError):
+        return [socket.inet_ntop(socket.AF_INET6, bytes.fromhex(line[:32])) for line in _IPV6.read_text().splitlines()]
+    return []

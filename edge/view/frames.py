@@ -23,14 +23,9 @@ MAX_FPS: Final = 25
 
 
 class Run(NamedTuple):
-    """Facts that do not change during a run.
+    """Facts that do not change during a run: of its source, and of the model that it begins with.
 
-    Attributes:
-        name: of the source.
-        kind: of the source.
-        model: name of the model that it begins with.
-        contract: of that model.
-        id: of this run alone, by which a viewer that reconnects notices another run.
+    A viewer that reconnects notices by the `id` that this is another run.
     """
 
     name: str
@@ -45,6 +40,7 @@ class Frames:
 
     Attributes:
         now_ns: the moment, in [ns].
+        map: state of the map; None where none is made.
     """
 
     def __init__(self, snapshot: RunSnapshot, now_ns: int, source: SourceKind | None) -> None:
@@ -53,7 +49,7 @@ class Frames:
         self._snapshot = snapshot
         self._newest = dict(snapshot.newest)
         self._packed: dict[tuple[str, int], bytes] = {}
-        self._map = snapshot.map
+        self.map = snapshot.map
         self._maps: dict[int, bytes] = {}
 
     @property
@@ -63,29 +59,22 @@ class Frames:
 
     def result(self, sensor: str, since: int) -> bytes:
         """Return the newest result of a sensor, with the trace after number `since`."""
-        packed = self._packed.get((sensor, since))
-        if packed is None:
-            packed = self._packed[sensor, since] = self._pack(self._newest[sensor], since)
-        return packed
+        if (sensor, since) not in self._packed:
+            self._packed[sensor, since] = self._pack(self._newest[sensor], since)
+        return self._packed[sensor, since]
 
     def events(self, since: int) -> list[tuple[int, bytes]]:
         """Return the latest events after number `since`, with their numbers."""
         return [(sent.number, self._event(sent)) for sent in self._snapshot.events(since)]
 
-    @property
-    def map_number(self) -> int:
-        """Number of the newest state of the map; 0 where none is made."""
-        return 0 if self._map is None else self._map.number
-
-    def map(self, since: int) -> bytes:
-        """Return what has changed on the map since a state that a viewer has; 0 for none."""
-        state = self._map
-        if state is None:
+    def map_since(self, seen: MapState | None) -> bytes:
+        """Return what has changed on the map, which must be made, since a state that a viewer has; None for none."""
+        if self.map is None:
             raise ValueError("no map is made")
-        packed = self._maps.get(since)
-        if packed is None:
-            packed = self._maps[since] = _map_frame(state, since)
-        return packed
+        number = 0 if seen is None else seen.number
+        if number not in self._maps:
+            self._maps[number] = _map_frame(self.map, seen)
+        return self._maps[number]
 
     def silent(self) -> dict[str, float]:
         """Return the silent sensors, and for how long each has been silent, in [s]."""
@@ -118,8 +107,8 @@ class Frames:
         return pack(header, {name: values for name, values in maps.items() if values is not None})
 
 
-def _map_frame(state: MapState, since: int) -> bytes:
-    box = state.since(since)
+def _map_frame(state: MapState, seen: MapState | None) -> bytes:
+    box = state.since(seen)
     header = {
         "kind": "map",
         "number": state.number,

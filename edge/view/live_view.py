@@ -1,6 +1,5 @@
 """Live page of a run: its store, its access, its server, and the recorder that a viewer may start."""
 
-import contextlib
 import secrets
 import socket
 import time
@@ -14,9 +13,8 @@ from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.pipeline.commands import Commands
 from edge.pipeline.sink import Sink
-from edge.view.access import grant, is_everything
+from edge.view.access import grant, is_everything, own_addresses
 from edge.view.frames import Run
-from edge.view.own_addresses import own_addresses
 from edge.view.recorder import FORM, Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.server import Server
@@ -37,19 +35,13 @@ class LiveView:
     """
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        token: str | None,
-        record_dir: Path,
-        contract: Contract,
-        commands: Commands,
+        self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract, commands: Commands
     ) -> None:
-        """Take the port.
+        """Take the port, 0 for any free one.
 
         Args:
             host: name or address to listen at.
-            port: 0 for any free one.
+            port: to listen at.
             token: that requests must carry; None makes one where other machines can reach `host`.
             record_dir: folder in which recordings are made.
             contract: of the run's model.
@@ -65,30 +57,21 @@ class LiveView:
         self._recorder = Recorder(record_dir, self._tell)
         commands.record = self._recorder.record
         import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
-        recorder = self._recorder
-        self._server = Server(
-            self._snapshot,
-            commands,
-            access,
-            port,
-            lambda: recorder.path,
-            lambda: recorder.recorded,
-            failed=self._failed,
-        )
+        self._server = Server(self._snapshot, commands, access, port, self._recorder, failed=self._failed)
         self._view = ViewSink(self._snapshot, lambda: self._server.watched, self._server.wake)
         self._contract = contract
-        self._open = contextlib.ExitStack()
         self.sinks: list[Sink] = [self._recorder, self._view]
         addresses = own_addresses(host) if is_everything(host) else []
         self.url, *self.other_urls = access.urls(self._server.port, addresses)
 
     def __enter__(self) -> Self:
-        self._open.callback(self._server.close)
-        self._open.callback(self._recorder.close)
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._open.close()
+        try:
+            self._recorder.close()
+        finally:
+            self._server.close()
 
     def begin(
         self,

@@ -35,18 +35,10 @@ class Recorder(Sink):
         tell: Callable[[Event], object],
         local_time: Callable[[], time.struct_time] = time.localtime,
     ) -> None:
-        """Start the thread, without a recording.
-
-        Args:
-            directory: folder in which files are made.
-            tell: called with an event for what begins, ends and fails.
-            local_time: names the files.
-        """
+        """Start the thread; what begins, ends and fails is told as events, and `local_time` names the files."""
         self.path: Path | None = None
         self.open_sink: Callable[[str], Sink] | None = None
-        self._directory = directory
-        self._tell = tell
-        self._local_time = local_time
+        self._directory, self._tell, self._local_time = directory, tell, local_time
         self._sink: Sink | None = None
         self._unwritten = 0
         self._aside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")

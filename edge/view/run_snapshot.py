@@ -23,16 +23,7 @@ _POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
 
 
 class Point(NamedTuple):
-    """Values of one scan that are drawn against time.
-
-    Attributes:
-        number: of the sensor's results, from 1.
-        time_ns: of the scan, in [ns].
-        force_counts: or None.
-        area_mm2: or None.
-        force_n: or None.
-        shear_ratio: share of the force that is shear, or None.
-    """
+    """Values of one scan that are drawn against time; `number` counts the sensor's results, from 1."""
 
     number: int
     time_ns: int
@@ -43,15 +34,7 @@ class Point(NamedTuple):
 
 
 class Newest(NamedTuple):
-    """Newest result of a sensor.
-
-    Attributes:
-        number: of the sensor's results, from 1.
-        result: as it came.
-        counters: up to it.
-        received_ns: time of its arrival, in [ns].
-        rate_hz: smoothed rate of the sensor's scans; None before the second.
-    """
+    """Newest result of a sensor, numbered from 1, with its time of arrival; no rate before the second scan."""
 
     number: int
     result: Result
@@ -61,14 +44,7 @@ class Newest(NamedTuple):
 
 
 class NumberedEvent(NamedTuple):
-    """Event with its number and time of arrival.
-
-    Attributes:
-        number: of the run's events, from 1.
-        event: as it came.
-        counters: up to it.
-        received_ns: time of its arrival, in [ns].
-    """
+    """Event of the run, numbered from 1, with its time of arrival."""
 
     number: int
     event: Event

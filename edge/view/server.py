@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
-from pathlib import Path
 from typing import Final
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
@@ -29,6 +28,7 @@ from edge.pipeline.commands import Commands
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.recorder import Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.static_page import load_page
 from edge.view.viewer_commands import LONGEST_BYTES, execute
@@ -62,31 +62,25 @@ class Server:
         commands: Commands,
         access: Access,
         port: int,
-        recording: Callable[[], Path | None] = lambda: None,
-        recorded: Callable[[], tuple[float, int] | None] = lambda: None,
+        recorder: Recorder,
         failed: Callable[[str], object] = lambda text: None,
     ) -> None:
-        """Take the port; pages are answered from `begin` to `close`.
+        """Take the port, 0 for any free one; pages are answered from `begin` to `close`.
 
         Args:
             snapshot: store of what is shown.
             commands: queue for the viewers' commands.
             access: conditions that a request must meet.
-            port: 0 for any free one.
-            recording: returns the file that is recorded into, or None.
-            recorded: returns its length in [s] and its size in bytes, or None.
+            port: that it listens at.
+            recorder: of what viewers record.
             failed: called with the reason when the page ends early, from the server's thread.
 
         Raises:
             SinkError: the page cannot be served there.
         """
         self.watched = False
-        self._snapshot = snapshot
-        self._commands = commands
-        self._access = access
-        self._recording = recording
-        self._recorded = recorded
-        self._failed = failed
+        self._snapshot, self._commands, self._access = snapshot, commands, access
+        self._recorder, self._failed = recorder, failed
         self._page = load_page(access.key)
         self._socket = _listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
@@ -168,12 +162,14 @@ class Server:
                 played = None if self._player is None else self._player.state
                 # A recording that rests is not silent: nothing is wrong with its sensors.
                 silent = {} if played is not None and played.rests else frames.silent()
-                recording = self._recording()
+                recording = self._recorder.path
                 new_state = (recording, len(self._viewers), tuple(silent), played and played[1:])
                 now_s = time.monotonic()
                 if new_state != sent or now_s - sent_s >= STATE_S:
                     sent, sent_s = new_state, now_s
-                    broadcast(self._viewers, state(recording, len(self._viewers), silent, played, self._recorded()))
+                    broadcast(
+                        self._viewers, state(recording, len(self._viewers), silent, played, self._recorder.recorded)
+                    )
                 gone = self._connections.gone
                 if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
                     self._connections.gone, tidied_s, closing = 0, now_s, gone > 0
@@ -204,7 +200,7 @@ class Server:
         with contextlib.suppress(ConnectionClosed):
             try:
                 async with asyncio.timeout(OPEN_S):
-                    await connection.send(hello(run, self._recording()))
+                    await connection.send(hello(run, self._recorder.path))
             except TimeoutError:
                 connection.transport.abort()
                 return

@@ -27,18 +27,8 @@ class ViewSink(Sink):
         wake: Callable[[], object],
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Begin without a result.
-
-        Args:
-            snapshot: store of results and events.
-            watched: returns True while there is a viewer.
-            wake: wakes the server, which has something new to send; never waits.
-            clock_ns: monotonic, in [ns].
-        """
-        self._snapshot = snapshot
-        self._watched = watched
-        self._wake = wake
-        self._clock_ns = clock_ns
+        """Begin without a result; `watched` tells whether there is a viewer, and `wake` never waits."""
+        self._snapshot, self._watched, self._wake, self._clock_ns = snapshot, watched, wake, clock_ns
         self._due_ns = 0
         self._unseen = False
 

@@ -1,5 +1,6 @@
 """State of one viewer: what it has seen, and the frames that are due. No I/O, no clock."""
 
+from edge.mapping.live_map import MapState
 from edge.view.frames import Frames
 
 
@@ -14,7 +15,7 @@ class Viewer:
         self.paused = False
         self._seen: dict[str, int] = {}
         self._sent_number = 0
-        self._seen_map = 0
+        self._seen_map: MapState | None = None
 
     def due(self, frames: Frames) -> list[bytes]:
         """Return the frames that are new since the last call.
@@ -32,7 +33,7 @@ class Viewer:
             if number > seen:
                 due.append(frames.result(sensor, seen))
                 self._seen[sensor] = number
-        if frames.map_number > self._seen_map:
-            due.append(frames.map(self._seen_map))
-            self._seen_map = frames.map_number
+        if frames.map is not None and frames.map is not self._seen_map:
+            due.append(frames.map_since(self._seen_map))
+            self._seen_map = frames.map
         return due

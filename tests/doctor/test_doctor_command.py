@@ -17,9 +17,9 @@ from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
 from edge_samples import ROOT, FakeLink
 
 from edge.cli import main as cli
+from edge.cli.run_options import parser
 from edge.doctor import command, watch
 from edge.doctor import write_sensor_file as keep
-from edge.doctor.options import doctor_parser
 from edge.doctor.pad_orientation import CORNERS, orders
 from firmware_bridge.emulation import pty_port as pseudo_port
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -249,7 +249,7 @@ def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wr
 
 def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     monkeypatch.setattr(command, "GIVEN_UP_S", 0.3)
-    options = doctor_parser().parse_args(["--drift-s", "0.1", "--json"])
+    options = parser("doctor").parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
     monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])
     assert command.run(options, out, Terminal(Person())) == 1

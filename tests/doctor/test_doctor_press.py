@@ -73,7 +73,7 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
     guide = GuidedPress()
     pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
     answer_to([pressed] * 10, guide)
-    assert guide.felt_counts > guide.enough_counts
+    assert guide.felt > 1
     assert guide.skip() == "Skipped. Let go."
     more, _ = answer_to([pressed] * 40, guide)
     assert more[1:] == [], "the finger is still there"

@@ -8,9 +8,9 @@ import pytest
 from doctor_samples import as_scans, healthy_counts
 from edge_samples import FakeLink
 
+from edge.cli.run_options import parser
 from edge.doctor import command, watch
 from edge.doctor.findings import Finding, summary
-from edge.doctor.options import doctor_parser
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
@@ -21,7 +21,7 @@ WELL = as_scans(healthy_counts(200))
 
 def told(*arguments, link=None, out=None):
     """The exit code, and what the doctor printed of a link that is well."""
-    options = doctor_parser().parse_args(["--no-press", *map(str, arguments)])
+    options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
     out = io.StringIO() if out is None else out
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(watch, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()])

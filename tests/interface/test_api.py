@@ -42,7 +42,6 @@ FRONT = {
         "edge.terminal.argument_types",
         "edge.cli.run_options",
         "edge.pipeline.silence_hint",
-        "edge.doctor.options",
         "edge.bench.options",
     ),  # what may be asked
     *(
@@ -63,8 +62,7 @@ FRONT = {
     *(
         "edge.view.live_view",
         "edge.pipeline.replay_setup",
-        "edge.cli.new_recording",
-        "edge.cli.new_map",
+        "edge.cli.run_files",
     ),  # the page, and the notes about a recording and a map
     *(
         "edge.doctor.command",

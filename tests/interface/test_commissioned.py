@@ -8,7 +8,7 @@ from cli_samples import assert_refused, records, run, write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
 
 from edge.api import Stream, open_recording, open_runtime, open_source
-from edge.doctor.options import doctor_parser
+from edge.cli.run_options import parser
 from edge.doctor.write_sensor_file import keep
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
@@ -126,7 +126,7 @@ def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(f
     newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
     save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
     for arguments, expected in (([], BASELINE), (["--baseline", str(tmp_path / "zero.json")], newer)):
-        options = doctor_parser().parse_args(["--sensor", str(file), *arguments])
+        options = parser("doctor").parse_args(["--sensor", str(file), *arguments])
         assert references(options.baseline, settled(options.sensor, None))["4"].id == expected.id
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from edge.errors import SinkError
 from edge.mapping import map_files
-from edge.mapping.live_map import STATES, Box, LiveMap
+from edge.mapping.live_map import Box, MapState
 from edge.mapping.map_files import png
 from edge.mapping.object_map import MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
@@ -163,21 +163,18 @@ def test_states_are_shown_a_few_times_a_second_and_at_the_end():
     assert shown[-1].number == len(shown) and shown[-1].counts["fused"] == sink.whole.fused
 
 
-def test_a_state_holds_what_has_changed_since_an_earlier_one():
+def test_a_state_holds_what_has_changed_since_another():
     whole = ObjectMap()
-    live = LiveMap(whole.grid)
     states = []
-    for pose in [*raster()[:6], None, *raster()[6 : STATES + 6]]:
+    for pose in [*raster()[:6], None, *raster()[6:8]]:
         if pose is not None:
             whole.add(result_of(letter, pose), pose)
-        states.append(live.next(*whole.contact(), {}, {}))
-    assert states[6].since(6) is None and states[6].since(7) is None
-    for state, number in ((states[5], 2), (states[7], 4), (states[-1], STATES), (states[3], 0)):
-        box = state.since(number)
+        states.append(MapState(len(states) + 1, whole.grid, *whole.contact(), {}, {}))
+    assert states[6].since(states[5]) is None and states[6].since(states[6]) is None
+    for state, before in ((states[5], states[1]), (states[7], states[3]), (states[3], None)):
+        box = state.since(before)
         assert box is not None and box != Box(0, 0, 240, 240)
-        before = states[number - 1].contact if number else np.full_like(state.contact, np.nan)
-        patched = before.copy()
+        patched = np.full_like(state.contact, np.nan) if before is None else before.contact.copy()
         part = np.s_[box.top : box.bottom, box.left : box.right]
         patched[part] = state.contact[part]
         assert np.array_equal(patched, state.contact, equal_nan=True)
-    assert states[-1].since(2) == Box(0, 0, 240, 240), "an old page gets it all"

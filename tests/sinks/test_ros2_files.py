@@ -11,7 +11,7 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 from edge_samples import ROOT, make_wrench_result
 from ros2_samples import sink
 
-from edge.cli.run_options import run_parser
+from edge.cli.run_options import parser
 from edge.sinks.registry import check_sink
 
 __all__ = ["sink"]
@@ -27,7 +27,7 @@ def test_the_launch_file_starts_a_command_that_edge_sr_takes():
         command = command.replace(f"$(var {name})", value)
     assert "$(" not in command and values["options"] == ""
     program, *words = shlex.split(command)
-    options = run_parser().parse_args(words)
+    options = parser().parse_args(words)
     assert (program, str(options.sensor)) == ("edge-sr", "s.toml")
     assert [check_sink(one) for one in options.sink] == [("ros2", "skin?commands")]
     (node,) = launch.iter("node")

@@ -1,15 +1,19 @@
-"""File that `edge-sr record` adds to a run."""
+"""Files that `edge-sr record` and `edge-sr map` add to a run."""
 
 import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from math import isfinite
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from edge.errors import SinkError, UsageError
 from edge.pipeline.run_statistics import Statistics
 from edge.sinks.registry import check_apart
+
+if TYPE_CHECKING:
+    from edge.api import MapSink
 
 _NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
 """Suffixes of other formats, which a recording must not be named after."""
@@ -17,10 +21,7 @@ _NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
 
 @contextmanager
 def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Record a run, and report the recording at its end, however it ends.
-
-    Args:
-        options: of edge.cli.run_options.record_parser; a sink is added.
+    """Add a recording to the options of a run, and report it at the end, however the run ends.
 
     Raises:
         UsageError: another kind of file was requested, or a sink writes into it as well.
@@ -52,3 +53,28 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
             held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
             with suppress(OSError):  # the terminal may have gone
                 sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
+
+
+@contextmanager
+def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
+    """Yield the sink of a map, and report what is on it at the end, however the run ends.
+
+    Raises:
+        UsageError: the size is out of range, or a file has another ending.
+        SinkError: a file exists, or cannot be written.
+    """
+    from edge.api import MapSink, ObjectMap
+
+    for path, ending in ((options.out, ".npz"), (options.png, ".png")):
+        if path is not None and path.suffix != ending:
+            raise UsageError(f"{path} is no name of a map's file: expected one that ends in {ending}")
+    if not all(map(isfinite, options.centre_mm)):
+        raise UsageError(f"--centre-mm {options.centre_mm[0]} {options.centre_mm[1]}: expected two finite numbers")
+    whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
+    sink = MapSink(whole, npz=options.out, png=options.png)
+    try:
+        yield sink
+    finally:
+        if sink.fused or sys.exception() is None:
+            with suppress(OSError):  # the terminal may have gone
+                sys.stderr.write(f"{sink.summary()}\n")
