@@ -36,6 +36,7 @@ from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.map_messages import image_map, in_si
 from edge.sinks.ros2.ros_types import LOG
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -100,7 +101,7 @@ class TestSink:
             assert (got.id, got.created_unix_s, got.scans) == (baseline.id, 1000.0, 100)
 
     def test_events_are_on_a_topic_of_their_own(self, tmp_path):
-        sink = McapSink(tmp_path / "out.mcap", SURE, unix_offset_ns=OFFSET_NS)
+        sink = McapSink(tmp_path / "out.mcap", SURE, RunFacts(unix_offset_ns=OFFSET_NS))
         sink.tell(Event(5, "lost", None, "the link is gone"), {})
         sink.write(replace(make_results([make_scan()])[0], events=(Event(9, "zeroed", "4", "baseline b"),)), {})
         sink.close()
@@ -157,7 +158,7 @@ class TestSink:
         drain = McapFile.drain
         monkeypatch.setattr(McapFile, "drain", lambda file: (mended.set(), waited_for.append(1), drain(file)))
         path, results = tmp_path / "out.mcap", make_results([make_scan(number) for number in range(60)])
-        sink = McapSink(path, SURE, lossless=lossless, clock_s=itertools.count(0.0, 0.1).__next__)
+        sink = McapSink(path, SURE, RunFacts(lossless=lossless), clock_s=itertools.count(0.0, 0.1).__next__)
         for result in results[:50]:
             sink.write(result, {})
         assert bool(waited_for) == lossless
@@ -242,7 +243,7 @@ class TestReplay:
 
     def test_a_recording_of_an_emulated_sensor_says_so(self, tmp_path):
         path, results = tmp_path / "out.mcap", make_results([make_scan()], source="emulated")
-        sink = McapSink(path, SURE, unix_offset_ns=OFFSET_NS)
+        sink = McapSink(path, SURE, RunFacts(unix_offset_ns=OFFSET_NS))
         sink.tell(Event(5, "silent", None, "nothing comes"), {})
         sink.write(results[0], {})
         sink.close()

@@ -19,6 +19,7 @@ from mcap_samples import OFFSET_NS, make_results, odd_scans
 from edge.perception.event import Event
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 
@@ -26,7 +27,9 @@ def test_public_readers_find_units_frames_and_marks_in_the_file_of_an_emulated_s
     """By the definitions in the file alone, as Foxglove and Rerun read it."""
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     path = tmp_path / "press.mcap"
-    sink = McapSink(path, make_contract(), unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    sink = McapSink(
+        path, make_contract(), RunFacts(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    )
     for result in results:
         scan = replace(result.scan, device_ns=result.scan.time_ns - 2_000_000)
         sink.write(replace(result, scan=scan), {})
@@ -60,7 +63,7 @@ def topics_of(path):
 @pytest.fixture
 def pressed(tmp_path):
     """A recording of sensor 4 with everything that a model can give, and a frame."""
-    sink = McapSink(tmp_path / "press.mcap", make_contract(), frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    sink = McapSink(tmp_path / "press.mcap", make_contract(), RunFacts(frames={"4": PadFrame("tool0", (0, 0, 50.5))}))
     for number in range(5):
         result = make_wrench_result(number)
         sink.write(replace(result, deviation=result.pattern / 10), {})

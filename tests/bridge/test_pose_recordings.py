@@ -11,6 +11,7 @@ from edge import api
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.sinks.mcap import McapSink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose
@@ -51,7 +52,7 @@ def make_scans(count=6):
 
 def open_for(path):
     contract = FakeModel().contract
-    return McapSink(path, contract, unix_offset_ns=OFFSET_NS)
+    return McapSink(path, contract, RunFacts(unix_offset_ns=OFFSET_NS))
 
 
 def record(path, poses=POSES):
