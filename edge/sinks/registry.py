@@ -44,11 +44,7 @@ def check_sink(text: str) -> tuple[str, str]:
 
 
 def check_apart(texts: Sequence[str]) -> None:
-    """Check that each sink is there once: two would write to the same place.
-
-    Raises:
-        UsageError: a sink is there twice.
-    """
+    """Raise a UsageError where a sink is there twice: both would write to the same place."""
     for text in texts:
         if texts.count(text) > 1:
             raise UsageError(f"sink {text!r} is there {texts.count(text)} times: leave one")
@@ -107,11 +103,7 @@ def _ros2_topic(target: str) -> tuple[str, bool]:
 
 @contextmanager
 def needs_cyclone_dds(text: str) -> Iterator[None]:
-    """State how to install Cyclone DDS where an import within fails without it.
-
-    Raises:
-        UsageError: it is not installed.
-    """
+    """Turn the error of an import without Cyclone DDS into a UsageError that tells how to install it."""
     try:
         yield
     except ModuleNotFoundError as error:

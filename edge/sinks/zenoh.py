@@ -53,12 +53,7 @@ class ZenohSink(Sink):
     """
 
     def __init__(self, target: str, run: RunFacts = LIVE) -> None:
-        """Open a session; it does not matter whether a subscriber is there, now or later.
-
-        Raises:
-            UsageError: the target has another form.
-            SinkError: zenoh is not installed, or the session cannot be opened.
-        """
+        """Open a session; it does not matter whether a subscriber is there, now or later."""
         self._target, self._source = target, run.source
         self._key, self._session = open_session(target)
         import zenoh
@@ -117,11 +112,7 @@ def chunks(sensor: str) -> str:
 
 
 def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
-    """Return key and configuration of a target.
-
-    Raises:
-        UsageError: the target has another form.
-    """
+    """Return key and configuration of a target; a UsageError where it has another form."""
     key, asked, option = target.partition("?")
     if not all(key.split("/")) or set(key) & set("*$#") or key.startswith("@") or "/@" in key:
         raise UsageError(

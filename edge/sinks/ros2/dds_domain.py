@@ -43,11 +43,7 @@ _OPEN: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 
 
 def domain_id(environment: Mapping[str, str]) -> int:
-    """Return ROS_DOMAIN_ID, 0 by default.
-
-    Raises:
-        UsageError: it is not a valid domain number.
-    """
+    """Return ROS_DOMAIN_ID, 0 by default."""
     text = environment.get("ROS_DOMAIN_ID") or "0"
     if not (text.isascii() and text.isdigit() and int(text) <= LARGEST_DOMAIN):
         raise UsageError(f"ROS_DOMAIN_ID is {text!r}, expected a whole number from 0 to {LARGEST_DOMAIN}")
@@ -55,11 +51,7 @@ def domain_id(environment: Mapping[str, str]) -> int:
 
 
 def configuration(environment: Mapping[str, str]) -> str:
-    """Return the configuration of Cyclone DDS, from the variables that ROS reads; CYCLONEDDS_URI comes last, and wins.
-
-    Raises:
-        UsageError: discovery is switched off, so that no node could receive a message.
-    """
+    """Return the configuration of Cyclone DDS by the variables that ROS reads; CYCLONEDDS_URI comes last, and wins."""
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
     if reach == "OFF":
@@ -81,10 +73,7 @@ def configuration(environment: Mapping[str, str]) -> str:
 
 
 def join(environment: Mapping[str, str]) -> tuple[Domain | None, DomainParticipant]:
-    """Take part in the domain; it is left as soon as nothing holds the returned objects.
-
-    Returns:
-        The domain, None where this process had opened it by other means, and a participant.
+    """Take part in the domain (None where this process had opened it otherwise), until nothing holds the two objects.
 
     Raises:
         UsageError: a variable of the environment has a value that cannot be used.
@@ -94,23 +83,16 @@ def join(environment: Mapping[str, str]) -> tuple[Domain | None, DomainParticipa
     domain = _OPEN.get(number)
     try:
         if domain is None:
-            domain = _open(number, wanted)
+            try:
+                domain = _OPEN[number] = Domain(number, wanted)
+            except DDSException as error:
+                if error.code != DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:  # which is: it is open
+                    raise
         return domain, DomainParticipant(number)
     except (DDSException, UnicodeEncodeError) as error:
         raise SinkError(
             f"cannot join DDS domain {number} ({error}): check the network, ROS_DOMAIN_ID and CYCLONEDDS_URI"
         ) from error
-
-
-def _open(number: int, wanted: str) -> Domain | None:
-    try:
-        domain = Domain(number, wanted)
-    except DDSException as error:
-        if error.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
-            return None
-        raise
-    _OPEN[number] = domain
-    return domain
 
 
 def writer(
@@ -119,9 +101,6 @@ def writer(
     """Return a writer that never waits, and keeps `depth` messages for a slow reader; if latched, for later ones too.
 
     It is reliable, because the subscriptions that ROS makes by default accept nothing less.
-
-    Raises:
-        SinkError: the topic cannot be published on.
     """
     durability = Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile
     qos = _qos(kind, depth, Policy.Reliability.Reliable(max_blocking_time=0), durability)
@@ -134,11 +113,7 @@ def writer(
 def reader(
     participant: DomainParticipant, topic: str, kind: MessageType, depth: int, *, reliable: bool
 ) -> DataReader[Any]:
-    """Return a reader that keeps `depth` messages; one that is not reliable takes those of every writer.
-
-    Raises:
-        SinkError: the topic cannot be subscribed to.
-    """
+    """Return a reader that keeps `depth` messages; one that is not reliable takes those of every writer."""
     reliability = Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort
     try:
         topics = Topic(participant, f"rt/{topic}", dds_type(kind))
@@ -163,25 +138,14 @@ def _qos(kind: MessageType, depth: int, *policies: Any) -> Qos:
 
 @cache
 def dds_type(kind: MessageType) -> type[IdlStruct]:
-    """Return the DDS type of a message, named as ROS names it; an instance holds the encoded message.
-
-    All are final, so that they are encoded as plain CDR.
-    """
+    """Return the DDS type of a message, named as ROS names it; final, so plain CDR. An instance holds the message."""
     package, _, name = kind.name.split("/")
     members = {field.name: _member(field) for field in kind.fields}
     made: Any = make_idl_struct(name, f"{package}.msg.dds_.{name}_", members, dataclassify=False)
-    made.__init__ = _hold
-    made.serialize = _held  # called by a writer in place of its own encoder
+    made.__init__ = lambda self, encoded: setattr(self, "encoded", encoded)
+    made.serialize = lambda self, **_: self.encoded  # called by a writer in place of its own encoder
     made.deserialize = made.deserialize_key = classmethod(_received)  # and by a reader
     return final(made)
-
-
-def _hold(self: Any, encoded: bytes) -> None:
-    self.encoded = encoded
-
-
-def _held(self: Any, **_: object) -> bytes:
-    return self.encoded
 
 
 def _received(cls: Any, data: bytes, **_: object) -> Any:

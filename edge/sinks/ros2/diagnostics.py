@@ -25,13 +25,7 @@ _STATES: Final = {"incomplete": Level.ERROR, "zeroing": Level.WARN, "baseline_in
 
 
 class Diagnosis(NamedTuple):
-    """State of a sensor.
-
-    Attributes:
-        level: the worst of all findings.
-        text: every finding, or the state of the result where there is no finding.
-        values: by name, with their units in the names.
-    """
+    """State of a sensor: the worst level of all findings, their text, else the result's state, and values by name."""
 
     level: Level
     text: str
@@ -41,7 +35,7 @@ class Diagnosis(NamedTuple):
 def diagnose(
     result: Result, counters: Mapping[str, int], before: Mapping[str, int], silence_s: float | None, trouble: str | None
 ) -> Diagnosis:
-    """Return the state of a sensor.
+    """Return the state of a sensor by its newest result.
 
     Args:
         result: newest result of the sensor.

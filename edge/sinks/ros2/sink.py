@@ -97,10 +97,6 @@ class Ros2Sink(Sink):
             run: with commands only where they are to be taken.
             clock_ns: the clock of the scans that are of now, in [ns].
             unix_ns: wall time, in [ns]; read once, because the clock may be set during the run.
-
-        Raises:
-            UsageError: the topic, or the environment, is not valid in ROS.
-            SinkError: the domain cannot be joined.
         """
         self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
         self._of_now = run.unix_offset_ns is None
