@@ -47,6 +47,7 @@ from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, settled, with_recorded
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
+from edge.sinks.run_facts import RunFacts
 from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,
@@ -262,9 +263,7 @@ def open_sink(
         UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open.
         SinkError: it cannot be opened.
     """
-    return forms.open_sink(
-        text,
-        contract,
+    run = RunFacts(
         lossless=source.kind == "replay",
         mountings=source.sensor_file.mountings,
         frames=source.sensor_file.frames,
@@ -272,10 +271,11 @@ def open_sink(
         unix_offset_ns=source.unix_offset_ns,
         source=source.kind,
         origin=source.origin,
-        stop=stop,
+        stop=threading.Event() if stop is None else stop,
         commands=commands,
         fields=fields,
     )
+    return forms.open_sink(text, contract, run)
 
 
 def devices() -> "tuple[list[Found], list[str]]":

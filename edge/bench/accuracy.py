@@ -1,9 +1,8 @@
 """Error on the frozen test set: every metric of a subject, by the number of taps that it gets."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,8 @@ FORCE_RANGE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's depth limit comes first."""
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorRow:
-    """Errors of a subject.
-
-    Attributes:
-        name: of the subject.
-        given: number of newest taps in its input.
-        error: metric to its mean over all frames; "force_percent" is that of `force_error_percent`.
-    """
+class ErrorRow(NamedTuple):
+    """Errors of a subject that is given its newest taps: the mean of each metric over all frames, and of the force."""
 
     name: str
     given: int
@@ -43,31 +35,23 @@ def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
         ModelError: the model cannot be used, or was made for another scale than the test set.
         FrozenSetError: the model takes more taps than the test set has.
     """
+
+    def row(given: int, patterns: NDArray[np.floating], errors: dict[str, NDArray[np.float64]]) -> ErrorRow:
+        force_percent = round(force_error_percent(patterns, frozen), 4)
+        return ErrorRow(subject.name, given, mean_error(errors) | {"force_percent": force_percent})
+
     if subject.path is None:
         newest = frozen.newest.astype(np.float32)
         patterns = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name](newest)
-        yield _row(subject, 1, patterns, judge(patterns, frozen, CONTACT_LEVEL), frozen)
-    else:
-        session = ModelSession(Path(subject.path))
-        contract = session.contract
-        if contract.scale != frozen.scale:
-            raise ModelError(
-                f"{subject.path}: contract key 'scale' is {contract.scale}, the test set's is {frozen.scale}"
-            )
-        for given in sorted({1, contract.taps}):
-            patterns, half_width_mm = infer_with_intervals(session, frozen, given)
-            yield _row(subject, given, patterns, judge(patterns, frozen, contract.contact_level, half_width_mm), frozen)
-
-
-def _row(
-    subject: Subject,
-    given: int,
-    patterns: NDArray[np.floating],
-    errors: dict[str, NDArray[np.float64]],
-    frozen: FrozenSet,
-) -> ErrorRow:
-    error = mean_error(errors) | {"force_percent": round(force_error_percent(patterns, frozen), 4)}
-    return ErrorRow(subject.name, given, error)
+        yield row(1, patterns, judge(patterns, frozen, CONTACT_LEVEL))
+        return
+    session = ModelSession(Path(subject.path))
+    contract = session.contract
+    if contract.scale != frozen.scale:
+        raise ModelError(f"{subject.path}: contract key 'scale' is {contract.scale}, the test set's is {frozen.scale}")
+    for given in sorted({1, contract.taps}):
+        patterns, half_width_mm = infer_with_intervals(session, frozen, given)
+        yield row(given, patterns, judge(patterns, frozen, contract.contact_level, half_width_mm))
 
 
 def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:

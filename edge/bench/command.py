@@ -3,7 +3,6 @@
 import argparse
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
@@ -12,10 +11,9 @@ from edge.bench import contenders
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
 from edge.bench.contenders import Subject
 from edge.bench.errors import BenchError
-from edge.bench.live_report import Page, head, line
-from edge.bench.machine import this_machine
+from edge.bench.live_report import Page, line
 from edge.bench.processes import measured, start_up
-from edge.bench.provenance import provenance, with_head
+from edge.bench.provenance import provenance, this_machine, with_head
 from edge.bench.system import show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
@@ -24,13 +22,13 @@ INTERRUPTED: Final = 130
 """Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
 FULL_TICKS: Final = 3000
 """Fewest ticks for which p99.9 rests on more than the longest few."""
-ERROR_COLUMNS: Final = (
+_ERROR_COLUMNS: Final = (
     *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),
     "force error %",
 )
-FIGURES: Final = ("p50_us", "p99_us", "p999_us", "max_us")
+_FIGURES: Final = ("p50_us", "p99_us", "p999_us", "max_us")
 _PERCENTILES: Final = ("p50 us", "p99 us", "p99.9 us", "max us")
-FRONT_COLUMNS: Final = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
+_FRONT_COLUMNS: Final = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
 _RUN_TIME: Final = (
     "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is faster "
     "with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. Start-up is "
@@ -40,19 +38,18 @@ _FRONT: Final = "On {} thread{}. * is on the Pareto front: no other is at least 
 
 
 def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
-    """Measure, show and write; returns the exit code.
-
-    Args:
-        options: of edge.bench.options.bench_parser.
-        command: command line of the bench.
-        out: for the page.
-        err: for progress and warnings.
+    """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
 
     Raises:
         EdgeError: an input cannot be used, or a measurement failed; the measurements so far are written first.
     """
     page = Page(out, err)
-    _make_folder(options.out)
+    try:
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        where = f"--out {options.out}"
+        raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
     frozen = load_frozen_set(contenders.FROZEN_FILE)
     everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
     system = options.system or options.sensors is not None or options.against is not None
@@ -82,21 +79,13 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     return 0
 
 
-def _make_folder(folder: Path | None) -> None:
-    try:
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {folder}: cannot be made: {error.strerror}: name a folder to write in") from error
-
-
 def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: Page) -> list[ErrorRow]:
     text = (
         f"Frozen test set, means over all frames. Force error is RMS in % of {FORCE_RANGE_N:g} N, of what patterns sum "
         f"up to, by the one factor that suits true patterns best: those themselves are "
         f"{force_floor_percent(frozen):.2f} % off."
     )
-    page.section("Error", text, head(ERROR_COLUMNS))
+    page.section("Error", text, _ERROR_COLUMNS)
     rows: list[ErrorRow] = []
     for subject in page.tracked(everyone, "error"):
         page.progress(f"error of {subject.name}")
@@ -104,14 +93,13 @@ def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str
             for row in error_rows(subject, frozen):
                 rows.append(row)
                 lines.append({"method": row.name, "taps_given": row.given} | row.error)
-                page.say(_error_line(row))
+                page.say(_error_line(row.name, row.given, row.error))
         except EdgeError as error:
             page.warn(f"run time only of {subject.name}: {error}")
     return rows
 
 
-def _error_line(row: ErrorRow) -> str:
-    error = row.error
+def _error_line(name: str, given: int, error: dict[str, float]) -> str:
     cells = (
         f"{error['psnr_db']:.2f}",
         f"{error['rmse_percent']:.2f}",
@@ -120,7 +108,7 @@ def _error_line(row: ErrorRow) -> str:
         f"{100 * error['coverage_90']:.1f}" if "coverage_90" in error else "-",
         f"{error['force_percent']:.2f}",
     )
-    return line((row.name, str(row.given), *cells))
+    return line((name, str(given), *cells))
 
 
 def _run_times(
@@ -133,26 +121,18 @@ def _run_times(
 ) -> None:
     columns = ("method", "threads", *(f"back to back {figure}" for figure in _PERCENTILES))
     columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _PERCENTILES), "missed", "CPU %")
-    page.section("Run time", _RUN_TIME, head((*columns, "start-up ms", "MB")))
+    page.section("Run time", _RUN_TIME, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
-    rows = [(subject, count) for count in threads for subject in everyone]
-    for subject, count in page.tracked(rows, "run times"):
+    for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
         page.progress(f"run time of {subject.name}, {count} thread{'s' * (count > 1)}")
-        job = {"subject": asdict(subject), "threads": count}
+        job = {"subject": subject._asdict(), "threads": count}
         start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count)
         answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
-        back_to_back, paced = answer["back_to_back"], answer["paced"]
-        cells = (
-            *_percentiles(back_to_back),
-            *_percentiles(paced["times"]),
-            f"{paced['missed']} of {paced['ticks']}",
-            f"{paced['cpu_percent']:.1f}",
-            f"{start_up_ms:.0f}",
-            "-" if resident_mb is None else f"{resident_mb:.0f}",
-        )
-        page.say(line((subject.name, str(count), *cells)))
-        figures = {f"back_to_back_{figure}": back_to_back[figure] for figure in FIGURES}
-        figures |= {f"paced_{figure}": paced["times"][figure] for figure in FIGURES}
+        paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
+        cells = [cell for times in both.values() for cell in _percentiles(times)]
+        cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}", f"{start_up_ms:.0f}"]
+        page.say(line((subject.name, str(count), *cells, "-" if resident_mb is None else f"{resident_mb:.0f}")))
+        figures = {f"{how}_{figure}": times[figure] for how, times in both.items() for figure in _FIGURES}
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
         about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
         lines.append(about | figures)
@@ -168,7 +148,7 @@ def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads:
     rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
     if not rows:
         return
-    page.section("Pareto front", _FRONT.format(threads, "s" * (threads > 1)), head(FRONT_COLUMNS))
+    page.section("Pareto front", _FRONT.format(threads, "s" * (threads > 1)), _FRONT_COLUMNS)
     best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
     for row, is_best in zip(rows, best, strict=True):
         figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")
@@ -183,7 +163,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 def _write(
     folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
 ) -> None:
-    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing", "worker"))]
+    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing"))]
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:

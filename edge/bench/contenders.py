@@ -1,9 +1,8 @@
 """Subjects of a bench: methods without a network, and models."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +19,8 @@ Infer = Callable[[NDArray[np.float32]], object]
 """Inference on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
 
 
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """Method or model that can be measured.
-
-    Attributes:
-        name: as tables show it.
-        path: of the model; None for a method without a network.
-        scale: pattern pixels per taxel pitch that such a method makes.
-    """
+class Subject(NamedTuple):
+    """Method or model that can be measured: the path of a model, or the scale of a method without a network."""
 
     name: str
     path: str | None = None
@@ -36,12 +28,9 @@ class Subject:
 
 
 def subjects(scale: int, folder: Path | None, refused: Callable[[str], object]) -> list[Subject]:
-    """Return the methods without a network, the bundled models, and the user's own, named FOLDER/NAME.
+    """Return the methods without a network, the bundled models, and the user's own in a folder, named FOLDER/NAME.
 
-    Args:
-        scale: of the test set.
-        folder: of the user's own models, or None.
-        refused: gets a line for each file in it that is no usable model.
+    `refused` gets a line for each file in it that is no usable model; `scale` is that of the test set.
 
     Raises:
         UsageError: no such folder, or no .onnx in it.
@@ -81,11 +70,7 @@ def chosen(everyone: list[Subject], names: list[str] | None) -> list[Subject]:
 
 
 def opened(subject: Subject, threads: int) -> Infer:
-    """Return the subject ready to run.
-
-    Raises:
-        ModelError: it cannot be used.
-    """
+    """Return the subject ready to run."""
     if subject.path is None:
         method = fitted_methods(CLASSICAL_FILE, subject.scale)[subject.name]
         return lambda window: method(window[None, 0])

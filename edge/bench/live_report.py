@@ -1,24 +1,17 @@
 """Live report of a bench: the page on stdout, kept for the file, and one line of progress."""
 
-from collections.abc import Iterable, Iterator, Sequence, Sized
-from typing import Final, TextIO, TypeVar
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from typing import TextIO, TypeVar
 
 from edge.terminal.progress_bar import Progress
-from edge.terminal.text_wrap import drawn
-from firmware_bridge.errors import harmless
 
-_CLEAR_LINE: Final = "\r\x1b[K"
 _Thing = TypeVar("_Thing")
 
 
 def line(cells: Sequence[str]) -> str:
     """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
-
-
-def head(columns: Sequence[str]) -> str:
-    """Return the head of a Markdown table."""
-    return f"{line(columns)}\n{'|---' * len(columns)}|"
 
 
 class Page:
@@ -30,9 +23,7 @@ class Page:
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
         self.lines: list[str] = []
-        self._out = out
-        self._err = err
-        self._watched = err.isatty()
+        self._out, self._err = out, err
         self._bar: Progress | None = None
 
     def say(self, text: str) -> None:
@@ -40,29 +31,22 @@ class Page:
         self.lines.append(text)
         self._write(self._out, text)
 
-    def section(self, title: str, text: str, table_head: str) -> None:
+    def section(self, title: str, text: str, columns: Sequence[str]) -> None:
         """Begin a section and its table."""
-        self.say(f"\n## {title}\n\n{text}\n\n{table_head}")
+        self.say(f"\n## {title}\n\n{text}\n\n{line(columns)}\n{'|---' * len(columns)}|")
 
     def warn(self, text: str) -> None:
         """Show a line on stderr."""
         self._write(self._err, f"edge-sr: {text}")
 
     def progress(self, text: str) -> None:
-        """Show the current step: after the bar where there is one, else over the step before."""
+        """Show the current step after the bar."""
         if self._bar is not None:
             self._bar.note(text, at_once=True)
-        elif self._watched:
-            drawn(self._err).write(f"{_CLEAR_LINE}{harmless(text)}")
-            self._err.flush()
 
-    def tracked(
-        self, things: Iterable[_Thing], what: str, unit: str = "row", total: int | None = None
-    ) -> Iterator[_Thing]:
+    def tracked(self, things: Sequence[_Thing], what: str) -> Iterator[_Thing]:
         """Yield the things, one after the other, with a progress bar that makes room for lines shown meanwhile."""
-        self.progress("")
-        count = len(things) if total is None and isinstance(things, Sized) else total
-        with Progress(what, count or 0, unit, stream=self._err) as bar:
+        with Progress(what, len(things), "row", stream=self._err) as bar:
             self._bar = bar
             try:
                 for thing in things:
@@ -72,11 +56,6 @@ class Page:
                 self._bar = None
 
     def _write(self, stream: TextIO, text: str) -> None:
-        if self._bar is None:
-            self.progress("")
-            stream.write(text + "\n")
-            stream.flush()
-            return
-        with self._bar.aside():
+        with nullcontext() if self._bar is None else self._bar.aside():
             stream.write(text + "\n")
             stream.flush()

@@ -9,6 +9,8 @@ changed: a model, a set, or one of the few sources that its maker names. It is a
 import argparse
 import hashlib
 import json
+import os
+import platform
 import re
 import subprocess
 import sys
@@ -19,14 +21,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from edge.bench.machine import this_machine
+import numpy as np
+import onnxruntime
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 """Folder of the packages: the checkout's, where there is one."""
-DIGITS: Final = 12
-"""Number of digits kept of a SHA-256."""
 UNKNOWN: Final = "unknown"
-"""Word for a commit outside a checkout, and for the hash of an input of which none was kept."""
 _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MULTILINE)
 
 
@@ -39,9 +39,9 @@ class Provenance:
         date: ISO 8601, UTC.
         commit: checked out meanwhile, or UNKNOWN.
         tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
-        machine: processor, cores and versions.
+        machine: as of `this_machine`.
         seed: of all chance, or None where each source has its own.
-        models: file below ROOT -> hash, of each model or set that it used.
+        models: file below ROOT -> hash, or UNKNOWN, of each model or set that it used.
         sources: the same of the files and folders that make it.
     """
 
@@ -78,14 +78,7 @@ class Provenance:
 def provenance(
     command: str, sources: Sequence[str | Path], models: Iterable[Path] = (), seed: int | None = None
 ) -> Provenance:
-    """Return the head of a report that is being made.
-
-    Args:
-        command: that makes it.
-        sources: the few files or folders, below ROOT, by which its figures would change.
-        models: files of models and frozen sets that it uses.
-        seed: of all chance.
-    """
+    """Return the head of a report that is being made; its sources are those by which its figures would change."""
     changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!reports")
     return Provenance(
         command=command,
@@ -117,10 +110,30 @@ def with_head(page: str, made: Provenance) -> str:
     return f"{title}\n\n{made}\n{rest}"
 
 
+def this_machine() -> str:
+    """Return what run times depend on: processor, cores and versions."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (
+        f"{_cpu()}, {platform.machine()}, {cores} of {os.cpu_count() or 1} cores, "
+        f"Python {platform.python_version()}, numpy {np.__version__}, onnxruntime {onnxruntime.__version__}"
+    )
+
+
+def _cpu() -> str:
+    """Return the model name of the processor; on ARM, where /proc/cpuinfo has none, the board's name."""
+    for path, start in (("/proc/cpuinfo", "model name"), ("/proc/device-tree/model", "")):
+        file = Path(path)
+        lines = file.read_text(errors="replace").replace("\0", "").splitlines() if file.exists() else []
+        for line in lines:
+            if line.startswith(start) and line:
+                return line.partition(":")[2].strip() if start else line
+    return platform.processor() or "unknown CPU"
+
+
 def file_hash(path: Path) -> str:
     """Return a hash of a file's bytes, or of all Python files below a folder."""
     files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:DIGITS]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 def _below_root(path: Path) -> str:

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from edge.bench.errors import BenchError
-from edge.bench.live_report import Page, head, line
+from edge.bench.live_report import Page, line
 from edge.bench.ratios import ratio_of
 from edge.pipeline.pump import uncollected
 from firmware_bridge.recording.csv_reader import CSV_HEADER
@@ -60,18 +60,15 @@ class Cost(NamedTuple):
 class Program:
     """Process that reads emulated sensors, and its records where it writes any."""
 
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        self._process = process
+    def __init__(self, process: subprocess.Popen[bytes], *, silent: bool) -> None:
+        self._process, self._silent = process, silent
         self._folder = Path(f"/proc/{process.pid}")
 
     def records(self, seconds: float) -> list[tuple[int, dict[str, Any]]]:
-        """Return the records of so long without their maps, each with its time of arrival in [ns].
-
-        Raises:
-            BenchError: the program ended.
-        """
-        if self._process.stdout is None:
-            raise ValueError("the program's stdout is not a pipe")
+        """Return the records of so long without their maps, each with its time of arrival in [ns]."""
+        if self._silent or self._process.stdout is None:
+            time.sleep(seconds)
+            return []
         heads: list[tuple[int, bytes]] = []  # parsed later: a pause to parse them would fill the pipe
         end_ns = time.monotonic_ns() + int(seconds * 1e9)
         while not heads or heads[-1][0] < end_ns:
@@ -112,18 +109,14 @@ def tree_of(commit: str, folder: Path) -> Path:
 def show_system(scans: int, sensors: int, against: str | None, page: Page) -> list[dict[str, Any]]:
     """Measure the whole program, in turn with another commit where one is named, and show it row by row.
 
-    Args:
-        scans: of each sensor, in all rounds of a row.
-        sensors: number of them.
-        against: the other commit.
-        page: shows it.
+    Each sensor makes so many scans in all rounds of a row.
 
     Raises:
         BenchError: a process ended, or there is no such commit.
     """
     found: list[dict[str, Any]] = []
     round_s = scans / RATE_HZ / ROUNDS
-    page.section("The whole program", _TEXT.format(ROUNDS, round_s), head(COLUMNS))
+    page.section("The whole program", _TEXT.format(ROUNDS, round_s), COLUMNS)
     with tempfile.TemporaryDirectory() as name:
         trees = {"": ROOT}
         if against is not None:
@@ -137,7 +130,9 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
                 costs[part + tree].append(measured(part, sensors, round_s, folder))
             if number == ROUNDS - 1:
                 for tree in trees:
-                    found.append(_row(f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}", costs[part + tree]))
+                    cells = map(_middle, zip(*costs[part + tree], strict=True))
+                    name = f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}"
+                    found.append({"method": name} | dict(zip(COLUMNS[1:], cells, strict=True)))
                     page.say(line([str(cell) for cell in found[-1].values()]))
                 if against is not None:
                     page.say(line(_ratios(f"{part}, ratio", costs[part], costs[f"{part}, {against}"])))
@@ -145,21 +140,11 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
 
 
 def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost:
-    """Measure one round of the program as it is in a tree.
-
-    Raises:
-        BenchError: a process ended.
-    """
+    """Measure one round of the program as it is in a tree; raises as `show_system`."""
     with tempfile.TemporaryDirectory() as name, edge_sr(Path(name), part, sensors, tree) as program:
-        if part == "at rest":
-            time.sleep(SETTLE_S)
-            before_s, start_s = program.cpu_s(), time.monotonic()
-            time.sleep(seconds)
-            records: list[tuple[int, dict[str, Any]]] = []
-        else:
-            program.records(SETTLE_S)
-            before_s, start_s = program.cpu_s(), time.monotonic()
-            records = program.records(seconds)
+        program.records(SETTLE_S)
+        before_s, start_s = program.cpu_s(), time.monotonic()
+        records = program.records(seconds)
         cpu_percent = 100 * (program.cpu_s() - before_s) / (time.monotonic() - start_s)
         resident_mb, stamps = program.resident_mb(), (Path(name) / "stamps.txt").read_text()
     times_ns: dict[str, list[int]] = defaultdict(list)
@@ -178,11 +163,7 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
 
 @contextmanager
 def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterator[Program]:
-    """Run `edge-sr` of a tree over emulated sensors, with stored baselines; all files lie in `folder`.
-
-    Raises:
-        BenchError: the emulators did not start.
-    """
+    """Run `edge-sr` of a tree over emulated sensors, with stored baselines; all files lie in `folder`."""
     buses = -(-sensors // len(CONTROLLERS))
     prefixes = [""] if buses == 1 else [f"bus{bus}/" for bus in range(buses)]
     names = [prefixes[number % buses] + CONTROLLERS[number // buses] for number in range(sensors)]
@@ -220,7 +201,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 ) as process,
             ):
                 try:
-                    yield Program(process)
+                    yield Program(process, silent=part == "at rest")
                 finally:
                     process.kill()  # its last records are of no interest
         finally:
@@ -249,11 +230,6 @@ def write_recording(path: Path, number: int, *, pressed: bool) -> Path:
 
 def _rest_counts() -> Any:
     return np.array([16_000, 16_400, 38_600]) + 37 * np.arange(16)[:, None]
-
-
-def _row(name: str, costs: Sequence[Cost]) -> dict[str, Any]:
-    columns = zip(*costs, strict=True)
-    return {"method": name} | dict(zip(COLUMNS[1:], map(_middle, columns), strict=True))
 
 
 def _middle(values: Sequence[float | None]) -> str:

@@ -1,12 +1,20 @@
-"""Run times, back to back and at the sensor's rate, on an injected clock."""
+"""Run times, back to back and at the sensor's rate, on an injected clock, and the process that they are measured in.
 
+It takes one job as JSON on stdin, and writes the result as JSON on stdout.
+"""
+
+import json
+import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 
+from edge.bench.contenders import FROZEN_FILE, Subject, opened
+from edge.errors import EdgeError
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
 _BUDGET_NS: Final = 2_000_000_000
@@ -19,15 +27,7 @@ Run = Callable[[int], object]
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Run times.
-
-    Attributes:
-        runs: number of timed runs.
-        p50_us: median, in [us].
-        p99_us: 99th percentile, in [us].
-        p999_us: 99.9th percentile, in [us]; of fewer than 1000 runs it is the longest.
-        max_us: longest, in [us].
-    """
+    """Percentiles of run times in [us]; of fewer than 1000 runs `p999_us` is the longest."""
 
     runs: int
     p50_us: float
@@ -43,8 +43,8 @@ class Pace:
     Attributes:
         times: of all runs.
         ticks: number of ticks.
-        missed: number of ticks whose run was not done, or not even begun, when the next one was due.
-        cpu_percent: processor time of the whole process, in [% of one core].
+        missed: ticks whose run was not done, or not even begun, when the next one was due.
+        cpu_percent: of the whole process, in [% of one core].
     """
 
     times: Times
@@ -60,7 +60,7 @@ def summary(took_ns: Sequence[int]) -> Times:
     return Times(len(took_us), float(p50), float(p99), float(p999), float(took_us.max()))
 
 
-def timed(run: Run, numbers: Sequence[int], clock: Clock = time.perf_counter_ns) -> list[int]:
+def _timed(run: Run, numbers: Sequence[int], clock: Clock) -> list[int]:
     """Return the time of each of these runs, one after the other, in [ns]."""
     took_ns: list[int] = []
     for number in numbers:
@@ -72,9 +72,9 @@ def timed(run: Run, numbers: Sequence[int], clock: Clock = time.perf_counter_ns)
 
 def back_to_back(run: Run, most_runs: int, clock: Clock = time.perf_counter_ns) -> Times:
     """Time as many runs as fit into two seconds, 90 at least and `most_runs` at most, one right after the other."""
-    estimate_ns = max(1, min(timed(run, range(5), clock)))
+    estimate_ns = max(1, min(_timed(run, range(5), clock)))
     runs = min(most_runs, max(_LEAST_RUNS, _BUDGET_NS // estimate_ns))
-    return summary(timed(run, range(runs), clock))
+    return summary(_timed(run, range(runs), clock))
 
 
 def paced(
@@ -85,16 +85,7 @@ def paced(
     sleep: Sleep = time.sleep,
     cpu_clock: Clock = time.process_time_ns,
 ) -> Pace:
-    """Time one run at each tick, idle between; ticks that pass during a longer run have none.
-
-    Args:
-        run: called with the tick's number, from 1.
-        rate_hz: of the ticks, in [Hz].
-        ticks: number of ticks.
-        clock: in [ns].
-        sleep: to the next tick.
-        cpu_clock: processor time of the process, in [ns].
-    """
+    """Time one run at each tick from 1 on, idle between; ticks that pass during a longer run have none."""
     took_ns: list[int] = []
     in_time = 0
     cpu_before_ns, before_ns = cpu_clock(), clock()
@@ -110,3 +101,42 @@ def paced(
     wall_ns = clock() - before_ns
     cpu_percent = 100 * (cpu_clock() - cpu_before_ns) / wall_ns
     return Pace(summary(took_ns), ticks, ticks - in_time, cpu_percent)
+
+
+def main() -> int:
+    """Do a job, of which "do" is the name in JOBS; returns 1, with a line on stderr, where it cannot be done."""
+    job = json.load(sys.stdin)
+    try:
+        result = JOBS[job.pop("do")](**job)
+    except EdgeError as error:
+        sys.stderr.write(f"{' '.join(str(error).split())}\n")
+        return 1
+    sys.stdout.write(json.dumps(result))
+    return 0
+
+
+def _first(subject: dict[str, Any], threads: int, window: list[Any]) -> dict[str, Any]:
+    """Return the time of the first pattern, and the most memory in [MB] that this process has held by then."""
+    infer = opened(Subject(**subject), threads)
+    infer(np.array(window, dtype=np.float32))
+    first_ns, status = time.monotonic_ns(), Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    resident_mb = next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM:")), None)
+    return {"first_ns": first_ns, "resident_mb": resident_mb}
+
+
+def _time(subject: dict[str, Any], threads: int, rate_hz: float, ticks: int) -> dict[str, Any]:
+    """Return run times on the test set's windows in turn, with all taps that there are."""
+    from edge.evaluation.test_set import load_frozen_set  # here, or it would add to the start-up
+
+    frozen = load_frozen_set(FROZEN_FILE)
+    windows = frozen.windows(1 + frozen.earlier.shape[1])
+    infer = opened(Subject(**subject), threads)
+
+    def run(number: int) -> object:
+        return infer(windows[number % len(windows)])
+
+    return {"back_to_back": asdict(back_to_back(run, ticks)), "paced": asdict(paced(run, rate_hz, ticks))}
+
+
+JOBS: Final = {"first": _first, "time": _time}

@@ -135,12 +135,15 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.mcap_scans import McapScans
+    from edge.sinks.mcap import McapScans
+    from edge.sinks.run_facts import RunFacts
 
     recording = replay.recordings[0]
     kind = recording.origin or "replay"
     # 0: the time of recording is unknown.
-    to = McapScans(path, recording.tracks[0].geometry, recording.mountings, unix_offset_ns=0)
+    to = McapScans(
+        path, RunFacts(mountings=recording.mountings, geometry=recording.tracks[0].geometry, unix_offset_ns=0)
+    )
     try:
         for scan, poses in _scans(replay):
             baseline = recording.baselines.get(scan.sensor)

@@ -14,9 +14,7 @@ CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""
 
 _CUBIC_A: Final = -0.5
-
-MOST_BYTES: Final = 1 << 28
-
+_MOST_BYTES: Final = 1 << 28
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
@@ -25,31 +23,27 @@ def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     """Return the methods by name, with the parameters fitted on training taps.
 
     Args:
-        path: npz of bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels); bicubic is
-            left out if the file, of an earlier version, has no gain for it.
+        path: npz of bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels).
         scale: pattern pixels per taxel pitch.
 
     Raises:
         EdgeError: the file cannot be read.
     """
     try:
-        arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), MOST_BYTES)
-        gain, matrix = float(arrays["bilinear_gain"]), arrays["linear_map"]
-        cubic_gain = float(arrays["bicubic_gain"]) if "bicubic_gain" in arrays else None
+        arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), _MOST_BYTES)
+        gain, matrix, cubic_gain = float(arrays["bilinear_gain"]), arrays["linear_map"], float(arrays["bicubic_gain"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
-
-    def by_gain(newest: NDArray[np.floating]) -> NDArray[np.floating]:
-        return bilinear(newest[:, 2], scale) * gain
 
     def by_map(newest: NDArray[np.floating]) -> NDArray[np.floating]:
         rows, cols = newest.shape[-2:]
         return (newest.reshape(len(newest), -1) @ matrix).reshape(-1, rows * scale, cols * scale)
 
-    methods: dict[str, Method] = {"bilinear": by_gain, "linear map": by_map}
-    if cubic_gain is not None:
-        methods["bicubic"] = lambda newest: bicubic(newest[:, 2], scale) * cubic_gain
-    return methods
+    return {
+        "bilinear": lambda newest: bilinear(newest[:, 2], scale) * gain,
+        "linear map": by_map,
+        "bicubic": lambda newest: bicubic(newest[:, 2], scale) * cubic_gain,
+    }
 
 
 def method_macs(name: str, scale: int, rows: int = 4, cols: int = 4) -> int:
@@ -75,19 +69,11 @@ def bilinear(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float
 def _weights(taxels: int, scale: int) -> NDArray[np.float64]:
     """Return the interpolation matrix (taxels*scale, taxels) along one axis."""
     position = np.clip((np.arange(taxels * scale) + 0.5) / scale - 0.5, 0, taxels - 1)
-    low = np.minimum(np.floor(position).astype(int), max(taxels - 2, 0))
-    matrix = np.zeros((taxels * scale, taxels))
-    pixel = np.arange(taxels * scale)
-    matrix[pixel, low] = 1 - (position - low)
-    matrix[pixel, np.minimum(low + 1, taxels - 1)] += position - low
-    return matrix
+    return np.maximum(0, 1 - np.abs(position[:, None] - np.arange(taxels)))
 
 
 def bicubic(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float64]:
-    """Interpolate taxels (..., rows, cols) to (..., rows*scale, cols*scale) by cubic convolution.
-
-    Pixels lie as those of `bilinear`, and outside the outer taxels the value is held likewise; the curve between taxels
-    may overshoot.
+    """Interpolate as `bilinear` does, yet by cubic convolution; the curve between taxels may overshoot.
 
     Source: Keys 1981, Eq. 4, with a = -1/2 (Catmull-Rom), which alone is exact on parabolas.
     """

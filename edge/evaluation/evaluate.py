@@ -33,8 +33,7 @@ def judge(
         patterns: (n, H, W) in [mm].
         frozen: the test set.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        half_width_mm: (n, H, W), half widths of the 90 % intervals, in [mm]; "coverage_90", the share of pixels that
-            they hold, is left out without them.
+        half_width_mm: (n, H, W), half widths of the 90 % intervals; "coverage_90" is left out without them.
         pitch_mm: of the taxels, in [mm].
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
@@ -52,10 +51,7 @@ def judge(
 
 
 def judge_model(model: Model, frozen: FrozenSet, given: int | None = None) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each, of a model with the newest `given` taps or all that it takes.
-
-    One run a frame gives the patterns and, if the model has them, the deviations.
-    """
+    """Return every metric of every frame, (n,) each, of a model with the newest `given` taps or all that it takes."""
     patterns, half_width_mm = infer_with_intervals(model, frozen, given)
     return judge(patterns, frozen, model.contract.contact_level, half_width_mm, model.contract.pitch_mm)
 
@@ -105,13 +101,6 @@ def infer_all(
     frozen: FrozenSet,
     given: int | None = None,
 ) -> NDArray[np.float32]:
-    """Return the patterns (n, H, W) of a model for every frame, with the newest `given` taps or all that it takes.
-
-    Args:
-        run: returns the pattern (H, W) of a window (taps, 3, rows, cols) in network input units.
-        contract: contract of the model.
-        frozen: the test set.
-        given: number of taps in the window; older ones are zero.
-    """
+    """Return the patterns (n, H, W) for every frame, of which `run` makes one of a window in network input units."""
     windows = windows_of(frozen, contract, given)
     return np.stack([run(contract.scale_window(window)).copy() for window in windows])

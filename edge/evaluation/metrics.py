@@ -5,6 +5,7 @@ return one value per pattern, shape (...). Equal maps give an infinite PSNR, an 
 both are constant or zero.
 """
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -41,14 +42,8 @@ def ssim_global(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDAr
     Source: Wu and Liu 2024, Eq. 12-13, with C = (0.01 L)^2 and (0.03 L)^2.
     """
     a, b = _pair(pattern, truth, full_scale)
-    mean_a, mean_b = a.mean(axis=(-2, -1)), b.mean(axis=(-2, -1))
     count = a.shape[-2] * a.shape[-1]
-    centred_a = a - mean_a[..., None, None]
-    centred_b = b - mean_b[..., None, None]
-    var_a = np.sum(centred_a**2, axis=(-2, -1)) / (count - 1)
-    var_b = np.sum(centred_b**2, axis=(-2, -1)) / (count - 1)
-    covariance = np.sum(centred_a * centred_b, axis=(-2, -1)) / (count - 1)
-    return _similarity(mean_a, mean_b, var_a, var_b, covariance, full_scale)
+    return _similarity(a, b, full_scale, lambda maps: maps.mean(axis=(-2, -1)), count / (count - 1))
 
 
 def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.float64]:
@@ -60,11 +55,7 @@ def ssim(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> NDArray[np.
     a, b = _pair(pattern, truth, full_scale)
     if min(a.shape[-2:]) <= 2 * _WINDOW_RADIUS_PX:
         raise ValueError(f"pattern of shape {a.shape[-2:]} is smaller than the 11 x 11 window of ssim")
-    mean_a, mean_b = _blur(a), _blur(b)
-    var_a = _blur(a * a) - mean_a**2
-    var_b = _blur(b * b) - mean_b**2
-    covariance = _blur(a * b) - mean_a * mean_b
-    return _similarity(mean_a, mean_b, var_a, var_b, covariance, full_scale).mean(axis=(-2, -1))
+    return _similarity(a, b, full_scale, _blur, 1.0).mean(axis=(-2, -1))
 
 
 def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.float64]:
@@ -72,9 +63,7 @@ def contact_iou(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -
 
     If both are empty they agree: 1.
     """
-    found = touched(np.asarray(pattern), level)
-    if found.shape != touching.shape:
-        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
+    found = _touched(pattern, touching, level)
     union = np.sum(found | touching, axis=(-2, -1))
     overlap = np.sum(found & touching, axis=(-2, -1))
     return np.where(union > 0, overlap / np.maximum(union, 1), 1.0)
@@ -85,20 +74,10 @@ def boundary_distance_mm(
 ) -> NDArray[np.float64]:
     """Return the distance between the outlines of two contacts: pixel of one to nearest of the other, mean of both.
 
-    If both are empty they agree: 0. If only one is, they are the map's diagonal apart.
-
-    Args:
-        pattern: (n, H, W), touched where it reaches `level` of its maximum.
-        touching: (n, H, W), the pixels that truly touch.
-        level: share of a pattern's maximum.
-        pixel_mm: pixel size, in [mm].
-
-    Returns:
-        (n,) in [mm].
+    Takes and returns as `contact_iou`, (n, H, W) and (n,), in [mm]. If both contacts are empty they agree: 0. If only
+    one is, they are the map's diagonal apart.
     """
-    found = touched(np.asarray(pattern), level)
-    if found.shape != touching.shape:
-        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
+    found = _touched(pattern, touching, level)
     ours, theirs = _outlines(found), _outlines(touching)
     distance_px = np.zeros(len(found))
     for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
@@ -108,6 +87,13 @@ def boundary_distance_mm(
         elif one.any() or other.any():
             distance_px[i] = np.hypot(*found.shape[1:])
     return distance_px * pixel_mm
+
+
+def _touched(pattern: ArrayLike, touching: NDArray[np.bool_], level: float) -> NDArray[np.bool_]:
+    found = touched(np.asarray(pattern), level)
+    if found.shape != touching.shape:
+        raise ValueError(f"pattern of shape {found.shape} against contact of shape {touching.shape}, expected equal")
+    return found
 
 
 def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -124,12 +110,7 @@ def _pixels_apart(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[n
 
 
 def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
-    """Return the volume of patterns over their area, (...) in [mm3].
-
-    Args:
-        patterns: (..., H, W) in [mm].
-        pixel_mm: pixel size, in [mm].
-    """
+    """Return the volume of patterns (..., H, W) in [mm] over their area, (...) in [mm3]."""
     return np.asarray(patterns).sum(axis=(-2, -1)) * pixel_mm**2
 
 
@@ -153,13 +134,18 @@ def _pair(pattern: ArrayLike, truth: ArrayLike, full_scale: float) -> tuple[NDAr
 
 
 def _similarity(
-    mean_a: NDArray[np.float64],
-    mean_b: NDArray[np.float64],
-    var_a: NDArray[np.float64],
-    var_b: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
     full_scale: float,
+    mean: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    sampled: float,
 ) -> NDArray[np.float64]:
+    """Return the similarity within windows, over which `mean` averages; `sampled` corrects their variances."""
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b, covariance = (
+        sampled * (mean(one * other) - at_one * at_other)
+        for one, other, at_one, at_other in ((a, a, mean_a, mean_a), (b, b, mean_b, mean_b), (a, b, mean_a, mean_b))
+    )
     c1, c2 = (_K1 * full_scale) ** 2, (_K2 * full_scale) ** 2
     return ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
 

@@ -13,7 +13,7 @@ from edge.errors import EdgeError
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_reader import read_npz
 
-MOST_BYTES: Final = 1 << 31
+_MOST_BYTES: Final = 1 << 31
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "newest": ("int16", "n3rc"),
     "earlier": ("int16", "tk3rc"),
@@ -109,11 +109,7 @@ class FrozenSet:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write the set as a compressed npz, in place.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the set as a compressed npz, in place."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         write_in_place(path, lambda draft: np.savez_compressed(draft, **arrays), load_frozen_set)
 
@@ -125,7 +121,7 @@ def load_frozen_set(path: Path) -> FrozenSet:
         FrozenSetError: the file is missing, or an array is missing or of another type or shape; the message names it.
     """
     try:
-        arrays = read_npz(path, (field.name for field in fields(FrozenSet)), MOST_BYTES)
+        arrays = read_npz(path, (field.name for field in fields(FrozenSet)), _MOST_BYTES)
         _check_axes(arrays)
     except (OSError, ValueError) as error:
         raise FrozenSetError(

@@ -1,12 +1,17 @@
-"""Registry of the sources of poses, by the names that a user writes."""
+"""Sources of poses beside stdin, by the names that a user writes, and that over zenoh."""
 
 import re
-from typing import Final, NamedTuple, Protocol
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseQueue
+from edge.sinks.registry import needs_cyclone_dds
 from edge.sinks.ros2.topic_names import base_topic
-from firmware_bridge.extras import how_to_install
+from edge.sinks.zenoh import close_session, open_session, opening, understood
+
+if TYPE_CHECKING:
+    import zenoh
 
 FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC")
 DEFAULT_KEY: Final = "pose"
@@ -30,10 +35,7 @@ class Wanted(NamedTuple):
 
 
 def check_poses(text: str) -> Wanted:
-    """Return the source of poses that `text` names; nothing is opened.
-
-    Args:
-        text: one of FORMS, or SENSOR=FORM for the poses of one sensor.
+    """Return the source of poses that `text` names: one of FORMS, or SENSOR=FORM; nothing is opened.
 
     Raises:
         UsageError: no such form.
@@ -42,8 +44,6 @@ def check_poses(text: str) -> Wanted:
     sensor, form_text = (match[1], match[2]) if match else (None, text)
     form, _, target = form_text.partition(":")
     if form == "zenoh":
-        from edge.sinks.zenoh import understood
-
         target = target or DEFAULT_KEY
         understood(target)
     elif form == "ros2" and target:
@@ -54,11 +54,7 @@ def check_poses(text: str) -> Wanted:
 
 
 def open_poses(text: str, queue: PoseQueue) -> PoseSource:
-    """Open the source of poses that `text` names.
-
-    Args:
-        text: as for `check_poses`.
-        queue: of the poses that it receives.
+    """Open the source of poses that `text` names, as for `check_poses`; they go to the queue.
 
     Raises:
         UsageError: no such form, or what it needs is not installed.
@@ -66,13 +62,28 @@ def open_poses(text: str, queue: PoseQueue) -> PoseSource:
     """
     sensor, form, target = check_poses(text)
     if form == "zenoh":
-        from edge.pose_sources.zenoh_poses import ZenohPoses
-
         return ZenohPoses(target, queue, sensor)
-    try:
+    with needs_cyclone_dds(text):
         from edge.pose_sources.ros2_poses import Ros2Poses
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "cyclonedds":
-            raise
-        raise UsageError(f"{text} needs Cyclone DDS: {how_to_install('ros2')}") from error
     return Ros2Poses(target, queue, sensor)
+
+
+class ZenohPoses:
+    """Subscriber to a key of poses, the same JSON as on stdin, one a message; `sensor` is that of those with none."""
+
+    def __init__(self, target: str, queue: PoseQueue, sensor: str | None) -> None:
+        """Open a session; it does not matter whether a publisher is there, now or later."""
+        key, self._session = open_session(target)
+        import zenoh
+
+        def take(sample: "zenoh.Sample") -> None:
+            queue.put_json(sample.payload.to_bytes(), time.monotonic_ns(), sensor)
+
+        with opening():
+            # In zenoh's thread, since a thread in between would add its own delay to a time of arrival.
+            called = zenoh.handlers.Callback(take, indirect=False)
+            self._subscriber = self._session.declare_subscriber(key, called)
+
+    def close(self) -> None:
+        """End the session."""
+        close_session(self._session)

@@ -3,41 +3,22 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from collections.abc import Mapping
+from typing import Any, Final
 
-from cyclonedds.core import DDSException, GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
-from cyclonedds.internal import InvalidSample
-from cyclonedds.qos import Policy, Qos
-from cyclonedds.sub import DataReader
-from cyclonedds.topic import Topic
+from cyclonedds.core import GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.util import duration
 
-from edge.errors import SinkError
 from edge.pipeline.pose_queue import PoseError, PoseQueue
-from edge.pose_sources.stamp_clock import StampClock
-from edge.pose_sources.tool_frame import pad_pose, placed
-from edge.sinks.ros2.dds_domain import join
-from edge.sinks.ros2.dds_types import dds_type
+from edge.pose_sources.stamped_poses import StampClock, pad_pose, placed
+from edge.sinks.ros2.dds_domain import join, reader, taken
 from edge.sinks.ros2.ros_types import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED
 from firmware_bridge.errors import CdrError
-from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import MessageType
 
 _KEPT: Final = 128
 """Messages of a topic that wait until they are read."""
-_WAIT: Final = duration(seconds=1)
-_CDR: Final = Policy.DataRepresentation(use_cdrv0_representation=True)
-# A best-effort reader takes messages of reliable and of best-effort writers.
-_STREAM: Final = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(_KEPT), _CDR)
-
-
-class _Read(NamedTuple):
-    """Pose in a message, and its time in [ns] since 1970."""
-
-    pose: PadPose
-    stamp_ns: int
 
 
 class Ros2Poses:
@@ -64,17 +45,12 @@ class Ros2Poses:
         self._end = GuardCondition(self._participant)
         self._waiting = WaitSet(self._participant)
         self._waiting.attach(self._end)
-        self._readers: list[tuple[DataReader[Any], MessageType]] = []
-        self._conditions: list[ReadCondition] = []
+        kinds = (POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED)
+        self._readers = [(reader(self._participant, topic, kind, _KEPT, reliable=False), kind) for kind in kinds]
         state = SampleState.NotRead | ViewState.Any | InstanceState.Any
-        for kind in _READ:
-            try:
-                reader = DataReader(self._participant, Topic(self._participant, f"rt/{topic}", dds_type(kind)), _STREAM)
-            except DDSException as error:
-                raise SinkError(f"cannot subscribe to /{topic}: {error}") from error
-            self._readers.append((reader, kind))
-            self._conditions.append(ReadCondition(reader, state))
-            self._waiting.attach(self._conditions[-1])
+        self._conditions = [ReadCondition(one, state) for one, _ in self._readers]
+        for condition in self._conditions:
+            self._waiting.attach(condition)
         self._ended = False
         self._thread = threading.Thread(target=self._follow, name="ros2-poses", daemon=True)
         self._thread.start()
@@ -89,46 +65,30 @@ class Ros2Poses:
 
     def _follow(self) -> None:
         while not self._ended:
-            self._waiting.wait(_WAIT)
-            for reader, kind in self._readers:
-                for sample in reader.take(N=_KEPT):
-                    if not isinstance(sample, InvalidSample):  # else its writer has gone
-                        self._take(sample.encoded, kind, time.monotonic_ns())
+            self._waiting.wait(duration(seconds=1))
+            for waiting, kind in self._readers:
+                for data in taken(waiting, _KEPT):
+                    self._take(data, kind, time.monotonic_ns())
 
     def _take(self, data: bytes, kind: MessageType, arrival_ns: int) -> None:
         try:
-            read = _READ[kind](kind.decode(data))
-        except (CdrError, PoseError) as error:
-            refusal = error if isinstance(error, PoseError) else PoseError("cdr", str(error))
-            self._queue.refuse(refusal)
-            return
-        time_ns = self._clock.monotonic_ns(read.stamp_ns, arrival_ns)
-        self._queue.put(TimedPose(read.pose, time_ns, self._sensor))
+            message = kind.decode(data)
+            pose = pad_pose(*_placed(message))
+        except PoseError as error:
+            self._queue.refuse(error)
+        except CdrError as error:
+            self._queue.refuse(PoseError("cdr", str(error)))
+        else:
+            stamp = message["header"]["stamp"]
+            time_ns = self._clock.monotonic_ns(stamp["sec"] * 1_000_000_000 + stamp["nanosec"], arrival_ns)
+            self._queue.put(TimedPose(pose, time_ns, self._sensor))
 
 
-def _stamp_ns(message: Mapping[str, Any]) -> int:
-    stamp = message["header"]["stamp"]
-    return stamp["sec"] * 1_000_000_000 + stamp["nanosec"]
-
-
-def _of_pose(message: Mapping[str, Any]) -> _Read:
+def _placed(message: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the place in a message of any of the types, and its covariance, which is empty without one."""
+    if (transform := message.get("transform")) is not None:
+        return placed(transform["translation"], transform["rotation"]), ()
     pose = message["pose"]
-    return _Read(pad_pose(placed(pose["position"], pose["orientation"])), _stamp_ns(message))
-
-
-def _of_uncertain_pose(message: Mapping[str, Any]) -> _Read:
-    pose, covariance = message["pose"]["pose"], message["pose"]["covariance"]
-    return _Read(pad_pose(placed(pose["position"], pose["orientation"]), covariance), _stamp_ns(message))
-
-
-def _of_transform(message: Mapping[str, Any]) -> _Read:
-    transform = message["transform"]
-    return _Read(pad_pose(placed(transform["translation"], transform["rotation"])), _stamp_ns(message))
-
-
-_READ: Final[Mapping[MessageType, Callable[[Mapping[str, Any]], _Read]]] = {
-    POSE_STAMPED: _of_pose,
-    POSE_WITH_COVARIANCE_STAMPED: _of_uncertain_pose,
-    TRANSFORM_STAMPED: _of_transform,
-}
-"""Reader of the pose in a decoded message, by its type."""
+    covariance = pose.get("covariance", ())
+    pose = pose.get("pose", pose)
+    return placed(pose["position"], pose["orientation"]), covariance

@@ -23,12 +23,7 @@ _FLOAT32: Final = np.dtype("<f4")
 
 
 def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) -> bytes:
-    """Return one message.
-
-    Args:
-        header: values that JSON can hold, and arrays; "maps" is added.
-        maps: by name, of any shape.
-    """
+    """Return one message of a header, of what JSON can hold and arrays, and of maps of any shape by name."""
     listed = [[name, values.shape] for name, values in maps.items()]
     text = orjson.dumps({**header, "maps": listed}, option=orjson.OPT_SERIALIZE_NUMPY)
     text += b" " * (-(_LENGTH.size + len(text)) % _FLOAT32.itemsize)
@@ -37,11 +32,7 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
 
 
 def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Return header and maps of a message; the maps are read-only views of it.
-
-    Raises:
-        MessageError: the bytes are not a packed message.
-    """
+    """Return header and maps, read-only views, of a message; a MessageError where the bytes are none."""
     try:
         (length,) = _LENGTH.unpack_from(message)
         header = orjson.loads(message[_LENGTH.size : _LENGTH.size + length])

@@ -35,9 +35,6 @@ def write_csv(
         mounting: of the sensor: a CSV holds the taxels in the order of the id map.
         poses: of the pad, on the same clock, in the order of the scans that they served first.
         emulated: the sensor is emulated.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     taxels = track.geometry.taxel_count
     counts = track.counts.reshape(len(times_ns), len(AXES), taxels)[:, :, np.argsort(mounting.order)]

@@ -30,19 +30,10 @@ class MessageSink(Sink):
         first: str | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin without an event.
-
-        Args:
-            stream: output; stderr by default.
-            hint: returns advice while no scan has come at all; it is printed at growing intervals.
-            first: printed with the first result.
-            clock_s: monotonic, in [s].
-        """
-        self._first = first
+        """Print on stderr by default, `first` with the first result, and `hint()` now and then until a scan comes."""
+        self._first, self._hint = first, hint
         self._stream = sys.stderr if stream is None else stream
-        self._hint = hint
-        self._clock_s = clock_s
-        self._begun_s = clock_s()
+        self._clock_s, self._begun_s = clock_s, clock_s()
         self._patience_s = FIRST_HINT_S
         self._doubted: set[str] = set()
 

@@ -25,12 +25,7 @@ class Fan(Sink):
     """
 
     def __init__(self, tell: Callable[[Event], object], clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Begin without a sink.
-
-        Args:
-            tell: called first with the event of a sink that is given up or reports trouble.
-            clock_ns: monotonic, in [ns].
-        """
+        """Begin without a sink; `tell` is called first with the event of one that is given up or reports trouble."""
         self.failures: list[SinkError] = []
         self._sinks: list[Sink] = []
         self._given_up_unwritten = 0
@@ -50,31 +45,23 @@ class Fan(Sink):
         return "; ".join(sorted(self._troubles())) or None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Pass on one result.
-
-        Raises:
-            SinkError: no sink is left; SinkClosedError if none failed and their readers have gone.
-        """
+        """Pass on one result, or raise where no sink is left; a SinkClosedError if only their readers have gone."""
         self._each(methodcaller("write", result, counters), counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Pass on one event; raises as `write` does."""
+        """Pass on one event."""
         self._each(methodcaller("tell", event, counters), counters)
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
-        """Pass on poses; raises as `write` does."""
+        """Pass on poses."""
         self._each(methodcaller("pose", poses), self._counters)
 
     def wait(self) -> None:
-        """Pass on that no scan came; raises as `write` does."""
+        """Pass on that no scan came."""
         self._each(methodcaller("wait"), self._counters)
 
     def close(self) -> None:
-        """Close every sink that is left, even if others fail to close.
-
-        Raises:
-            SinkError: of the first sink that failed, now or before, unless another error ends the run.
-        """
+        """Close every sink; raises the error of the first that failed, now or before, unless another ends the run."""
         for sink in self._sinks:
             try:
                 sink.close()

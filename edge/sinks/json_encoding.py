@@ -25,12 +25,7 @@ class RecordForm:
     """Choice of the fields of a record; what is not chosen is not made."""
 
     def __init__(self, names: Collection[str] | None = None, *, maps: bool = False) -> None:
-        """Choose fields.
-
-        Args:
-            names: of `chosen_fields`, to which those of ALWAYS are added; None for all.
-            maps: append maps: those named, or all.
-        """
+        """Choose fields: those of `chosen_fields` beside those of ALWAYS, or all; `maps` appends maps as well."""
         wanted = _ALL if names is None else {*ALWAYS, *names}
         heads = [field for field in _HEADS if field.name in wanted]
         appended = [field for field in MAPS if maps and field.name in wanted]
@@ -40,10 +35,7 @@ class RecordForm:
         self._columns = Columns(field.in_record() for field in (*heads, *appended))
 
     def of(self, result: Result, counters: Mapping[str, int] | None = None) -> dict[str, Any]:
-        """Return a result; absent is None, masks have bit i for taxel i. Counts and maps may be arrays.
-
-        Without counters there is no such key.
-        """
+        """Return a result; absent is None. Counts and maps may be arrays; without counters there is no such key."""
         values = self._columns.of(result)
         fields: dict[str, Any] = dict(zip(self._names, values, strict=False))
         for name in self._left_out:

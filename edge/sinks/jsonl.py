@@ -1,11 +1,14 @@
 """One JSON record a line, flushed as it is written, since a robot reads it live."""
 
 import errno
+import fcntl
 import os
+import select
 import stat
+import struct
 import sys
-import threading
-from collections.abc import Collection, Mapping
+import termios
+from collections.abc import Mapping
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
@@ -17,9 +20,12 @@ from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import CountersInTurn, RecordForm, event_record
-from edge.sinks.pipe_capacity import has_room, widen
+from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
+from edge.sinks.run_facts import NOW, RunFacts
 
+PIPE_BYTES: Final = 1 << 20
+"""Most that Linux gives to any user: at least a quarter of a second of two sensors' patterns, usually the double."""
+_PAGE_BYTES: Final = 4096
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _ALL: Final = RecordForm(maps=True)
 _ROOM_S: Final = 0.002
@@ -33,32 +39,16 @@ class JsonLinesSink(Sink):
     and its next record carries the count, as of any other counter that changes. A run that ends waits for no reader.
     """
 
-    def __init__(
-        self,
-        target: str,
-        *,
-        lossless: bool = True,
-        source: str | None = None,
-        stop: threading.Event | None = None,
-        fields: Collection[str] | None = None,
-    ) -> None:
+    def __init__(self, target: str, run: RunFacts = NOW) -> None:
         """Open the target; a file that exists is replaced.
 
-        Args:
-            target: path, or "-".
-            lossless: wait for a slow reader, rather than leave records out.
-            source: kind of the source, written with every event.
-            stop: set when the run is to end, which ends all patience.
-            fields: those of the records, as `chosen_fields` returns them; None for all.
-
         Raises:
+            UsageError: a record has no such field.
             SinkError: the target cannot be opened.
         """
         self._target = "stdout" if target == "-" else target
-        self._stop = threading.Event() if stop is None else stop
-        self._lossless = lossless
-        self._form = _ALL if fields is None else RecordForm(fields, maps=True)
-        self._source = source
+        self._run = run
+        self._form = _ALL if run.fields is None else RecordForm(chosen_fields(run.fields), maps=True)
         self.unwritten = 0
         self._turns = CountersInTurn()
         try:
@@ -67,7 +57,7 @@ class JsonLinesSink(Sink):
             if error.errno == errno.ENXIO:
                 raise SinkError(f"nobody reads {self._target}: start its reader first") from error
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
-        widen(self._file.fileno())
+        _widen(self._file.fileno())
         self._may_be_full = not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -77,11 +67,12 @@ class JsonLinesSink(Sink):
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
-        self._write(event_line(event, {**counters, "unwritten": self.unwritten}, self._source))
+        fields = event_record(event, {**counters, "unwritten": self.unwritten}, self._run.source)
+        self._write(orjson.dumps(fields, option=orjson.OPT_APPEND_NEWLINE))
 
     def _write(self, line: bytes) -> None:
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
-            if not self._lossless or self._stop.wait(_ROOM_S):
+            if not self._run.lossless or self._run.stop.wait(_ROOM_S):
                 self.unwritten += 1
                 return
         written = 0
@@ -107,9 +98,31 @@ def record_line(result: Result, counters: Mapping[str, int] | None, form: Record
     return orjson.dumps(form.of(result, counters), option=_OPTIONS)
 
 
-def event_line(event: Event, counters: Mapping[str, int], source: str | None) -> bytes:
-    """Return an event as one line of JSON."""
-    return orjson.dumps(event_record(event, counters, source), option=orjson.OPT_APPEND_NEWLINE)
+def has_room(descriptor: int, wanted_bytes: int) -> bool:
+    """Return True if so many bytes can be written without waiting. A pipe whose reader has gone has room."""
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    events = poll.poll(0)
+    if not events or events[0][1] & (select.POLLERR | select.POLLNVAL) or not _is_pipe(descriptor):
+        return bool(events)
+    if sys.platform != "linux":
+        return True
+    waiting_bytes = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))[0]
+    if waiting_bytes == 0:
+        return True  # the pipe may be too small for a record, and a reader that has taken everything is not slow
+    # A pipe holds pages, and a record may begin a new page, so up to half of their room stays empty.
+    return 2 * waiting_bytes + wanted_bytes + 2 * _PAGE_BYTES <= fcntl.fcntl(descriptor, fcntl.F_GETPIPE_SZ)
+
+
+def _widen(descriptor: int) -> None:
+    """Enlarge a pipe to PIPE_BYTES if that is allowed; anything else stays as it is."""
+    if sys.platform == "linux" and _is_pipe(descriptor):
+        with suppress(OSError):  # other pipes have taken the pages that a user may have
+            fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+
+
+def _is_pipe(descriptor: int) -> bool:
+    return stat.S_ISFIFO(os.fstat(descriptor).st_mode)
 
 
 def _open(target: str) -> FileIO:

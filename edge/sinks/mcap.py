@@ -3,35 +3,169 @@
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
 from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
-from edge.perception.result import Result
+from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import CountersInTurn, record
-from edge.sinks.mcap_scans import McapScans
-from edge.sinks.ros2.cdr_messages import (
-    RESULT,
-    frame_of,
-    log_message,
-    result_message,
-    wrench,
-)
-from edge.sinks.ros2.map_messages import image, in_si
-from edge.sinks.ros2.ros_types import IMAGE, LOG, WRENCH_STAMPED
+from edge.sinks.mcap_writer import McapFile
+from edge.sinks.ros2.cdr_messages import RESULT, frame_of, log_message, result_message, transforms, wrench
+from edge.sinks.ros2.map_messages import UNITS, image, in_si
+from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
+from edge.sinks.ros2.topic_names import sensor_path
+from edge.sinks.run_facts import NOW, RunFacts
 from edge.terminal.forced_end import finishing
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.poses.timed_pose import TimedPose
-from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.scan_messages import (
+    POSE,
+    SENSOR,
+    baseline_type,
+    encode_baseline,
+    encode_pose,
+    encode_scan,
+    encode_sensor,
+    mounting_text,
+    scan_type,
+)
+from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
+from firmware_bridge.scans.scan import Scan
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.zeroing.baseline import Baseline
 
-EVENTS_TOPIC: Final = "/events"
+REPEAT_NS: Final = NS_PER_S
+"""Time from which on a sensor's facts and baseline are repeated, in [ns]: a part of a file has them, too."""
+
+
+class McapScans:
+    """Writer of scans and poses, and what they mean, into a new file; `add` puts other messages next to them.
+
+    Its methods raise an OSError where an earlier record cannot be written.
+
+    Attributes:
+        file: the file, on the disk as a whole up to the last second.
+        offset_ns: added to a time of the scans gives [ns] since 1970.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        run: RunFacts,
+        facts: Mapping[str, Mapping[str, str]] | None = None,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Begin the file; one that exists is left alone.
+
+        Without the mountings of the run, axes would point elsewhere when the file is played again.
+
+        Args:
+            path: of the file.
+            run: its offset is 0 where the time of recording is unknown, and None for the clocks as they are now.
+            facts: further metadata, by name.
+            clock_s: monotonic, in [s].
+
+        Raises:
+            SinkError: the file exists, or cannot be written.
+        """
+        offset_ns = run.unix_offset_ns
+        self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._baselines: dict[str, Baseline | None] = {}
+        self._frames = dict(run.frames)
+        self._facts = {
+            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(run.geometry).items()},
+            "units": {name: unit.name for name, unit in UNITS.items()},
+        }
+        self._mountings = {
+            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in run.mountings.items()
+        }
+        self._repeat_ns: dict[str, int] = {}
+        self._scan, self._baseline = scan_type(run.geometry.taxel_count), baseline_type(run.geometry.taxel_count)
+        self._source_told = False
+        release = "0"  # of a checkout
+        with suppress(PackageNotFoundError):
+            release = version("tactile-edge-sr")
+        try:
+            self.file = McapFile(path, "ros2", f"tactile-edge-sr {release}", clock_s)
+            try:
+                for name, fields in (facts or {}).items():
+                    self.file.add_metadata(name, fields)
+                self.file.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
+                for fields in self._mountings.values():
+                    self.file.add_metadata(MOUNTING_METADATA, fields)
+            except OSError:
+                self.file.abandon()
+                raise
+        except FileExistsError as error:
+            raise SinkError(f"{path} exists: give another name, or delete it first") from error
+        except OSError as error:
+            raise SinkError(f"cannot record into {path}: {error.strerror or error}") from error
+
+    @property
+    def scans(self) -> int:
+        """Number of scans on the disk so far, of all sensors."""
+        return sum(self.file.written.get(number, 0) for (_, name), number in self._channels.items() if name == "scan")
+
+    def add_scan(
+        self, scan: Scan, kind: SourceKind, frame: str, baseline: Baseline | None, baseline_age_s: float | None
+    ) -> None:
+        """Add one scan; what it means, and a new baseline, come first.
+
+        Args:
+            scan: the scan.
+            kind: of the source that it comes from.
+            frame: frame_id of its message.
+            baseline: that is subtracted from it; None without.
+            baseline_age_s: None where that is unknown.
+        """
+        sensor, unix_ns = scan.sensor, scan.time_ns + self.offset_ns
+        source = {"kind": kind}
+        if not self._source_told:
+            self.file.add_metadata(SOURCE_METADATA, source)
+            self._source_told = True
+        repeat = unix_ns >= self._repeat_ns.get(sensor, 0)
+        if repeat:
+            self._repeat_ns[sensor] = unix_ns + REPEAT_NS
+            facts = self._facts | {SOURCE_METADATA: source}
+            if sensor in self._mountings:
+                facts[MOUNTING_METADATA] = self._mountings[sensor]
+            self.add(sensor, "sensor", SENSOR, unix_ns, encode_sensor(sensor, frame, json.dumps(facts), unix_ns))
+        if baseline is not None and (repeat or self._baselines.get(sensor) is not baseline):
+            data = encode_baseline(baseline, frame, baseline_age_s, unix_ns)
+            self.add(sensor, "baseline", self._baseline, unix_ns, data)
+            self._baselines[sensor] = baseline
+        if sensor in self._frames:
+            self.add("", "/tf_static", TF_MESSAGE, unix_ns, transforms({frame: self._frames.pop(sensor)}, unix_ns))
+        masks = mask_bits(scan.fresh), mask_bits(scan.renewed)
+        self.add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, frame, scan.on_bus_ns + self.offset_ns, *masks))
+
+    def add_poses(self, poses: Sequence[TimedPose]) -> None:
+        """Add poses."""
+        for pose in poses:
+            unix_ns = pose.time_ns + self.offset_ns
+            self.add("", "/poses", POSE, unix_ns, encode_pose(pose, unix_ns))
+
+    def add(self, sensor: str, name: str, kind: MessageType, unix_ns: int, data: bytes) -> None:
+        """Add a message to a topic of a sensor, or to the topic `name` itself where `sensor` is empty."""
+        channel = self._channels.get((sensor, name))
+        if channel is None:
+            if kind.name not in self._schemas:
+                self._schemas[kind.name] = self.file.add_schema(kind.name, "ros2msg", kind.definition)
+            topic = f"/{sensor_path(sensor)}/{name}" if sensor else name
+            about = {"sensor": sensor} | ({"unit": UNITS[name].name} if name in UNITS else {})
+            channel = self.file.add_channel(topic, "cdr", self._schemas[kind.name], about)
+            self._channels[sensor, name] = channel
+        self.file.add_message(channel, unix_ns, data)
 
 
 class McapSink(Sink):
@@ -41,50 +175,15 @@ class McapSink(Sink):
     """
 
     def __init__(
-        self,
-        path: Path,
-        contract: Contract,
-        *,
-        lossless: bool = True,
-        mountings: Mapping[str, Mounting] | None = None,
-        frames: Mapping[str, PadFrame] | None = None,
-        geometry: SensorGeometry = USPA44,
-        unix_offset_ns: int | None = None,
-        origin: SourceKind | None = None,
-        clock_s: Callable[[], float] = time.monotonic,
+        self, path: Path, contract: Contract, run: RunFacts = NOW, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin the file; what is not explained here is as in McapScans.
-
-        Args:
-            path: of the file; one that exists is left alone.
-            contract: of the model that the run begins with.
-            lossless: wait for a slow disk, rather than leave records out.
-            mountings: of the sensors, by name.
-            frames: places of the pads on the robot, by sensor name.
-            geometry: of the sensors.
-            unix_offset_ns: added to the time of a scan gives [ns] since 1970; by default as the clocks are now.
-            origin: kind of source that the scans come from, where results are of a recording; else that of the results.
-            clock_s: monotonic, in [s].
-
-        Raises:
-            SinkError: the file exists, or cannot be written.
-        """
-        self._path = path
-        self._geometry = geometry
-        self._origin: SourceKind | None = origin
-        self._lossless = lossless
+        """Begin the file, as McapScans does; the contract is that of the model that the run begins with."""
+        self._path, self._run = path, run
         self._turns = CountersInTurn()
         self.unwritten = 0
         self._failed = False
-        self._to = McapScans(
-            path,
-            geometry,
-            mountings or {},
-            unix_offset_ns=time.time_ns() - time.monotonic_ns() if unix_offset_ns is None else unix_offset_ns,
-            frames=frames,
-            facts={"contract": {key: json.dumps(one) for key, one in asdict(contract).items()}},
-            clock_s=clock_s,
-        )
+        facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
+        self._to = McapScans(path, run, facts, clock_s)
         self._file = self._to.file
 
     @property
@@ -92,58 +191,21 @@ class McapSink(Sink):
         """Number of scans on the disk so far, of all sensors."""
         return self._to.scans
 
-    @property
-    def size_bytes(self) -> int:
-        """Size on the disk so far, in bytes."""
-        return self._file.size_bytes
-
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Add the messages of one scan."""
-        if not self._has_room():
-            return
-        scan, to = result.scan, self._to
-        sensor, unix_ns, frame = scan.sensor, scan.time_ns + to.offset_ns, frame_of(result)
-        on_bus_unix_ns = scan.on_bus_ns + to.offset_ns
-        fields = record(result, self._turns.of(result, counters))
-        try:
-            to.add_scan(scan, self._origin or result.source, frame, result.baseline, result.baseline_age_s)
-            to.add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
-            for name, values in maps_of(result).items():
-                to.add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
-            force = wrench(result, self._geometry, on_bus_unix_ns)
-            if force is not None:
-                to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
-            for event in result.events:
-                self._log(event)
-            self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
-        except OSError as error:
-            raise self._failure(error) from error
+        self._try_if_room(self._add_result, result, counters)
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
         """Add poses."""
-        if not self._has_room():
-            return
-        try:
-            self._to.add_poses(poses)
-        except OSError as error:
-            raise self._failure(error) from error
+        self._try_if_room(self._to.add_poses, poses)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Add an event."""
-        if not self._has_room():
-            return
-        try:
-            self._log(event)
-            self._file.look()
-        except OSError as error:
-            raise self._failure(error) from error
+        self._try_if_room(self._add_events, (event,))
 
     def wait(self) -> None:
         """Pass on the open chunk when it is due, while no scan comes."""
-        try:
-            self._file.look()
-        except OSError as error:
-            raise self._failure(error) from error
+        self._try(self._file.look)
 
     def close(self) -> None:
         """Finish the file; one without a message is deleted."""
@@ -151,28 +213,47 @@ class McapSink(Sink):
             if self._failed:
                 self._file.abandon()
                 return
-            try:
-                self._file.close()
-            except OSError as error:
-                raise self._failure(error) from error
+            self._try(self._file.close)
         if not self._file.messages:
             self._path.unlink(missing_ok=True)
 
-    def _has_room(self) -> bool:
-        """Return True if there is room for one more record; else count it as left out."""
+    def _add_result(self, result: Result, counters: Mapping[str, int]) -> None:
+        scan, to = result.scan, self._to
+        sensor, unix_ns, frame = scan.sensor, scan.time_ns + to.offset_ns, frame_of(result)
+        on_bus_unix_ns = scan.on_bus_ns + to.offset_ns
+        fields = record(result, self._turns.of(result, counters))
+        to.add_scan(scan, self._run.origin or result.source, frame, result.baseline, result.baseline_age_s)
+        to.add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
+        for name, values in maps_of(result).items():
+            to.add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
+        force = wrench(result, self._run.geometry, on_bus_unix_ns)
+        if force is not None:
+            to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
+        self._add_events(result.events)
+
+    def _add_events(self, events: Sequence[Event]) -> None:
+        for event in events:
+            unix_ns = event.time_ns + self._to.offset_ns
+            self._to.add("", "/events", LOG, unix_ns, log_message(event, unix_ns))
+        self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
+
+    def _try_if_room(self, act: Callable[..., None], *given: object) -> None:
+        """Do something if there is room for one more record; else count it as left out."""
         try:
-            full = self._file.full()
-            if full and self._lossless:
+            if self._file.full():
+                if not self._run.lossless:
+                    self.unwritten += 1
+                    return
                 self._file.drain()
-                return True
+            act(*given)
         except OSError as error:
             raise self._failure(error) from error
-        self.unwritten += full
-        return not full
 
-    def _log(self, event: Event) -> None:
-        unix_ns = event.time_ns + self._to.offset_ns
-        self._to.add("", EVENTS_TOPIC, LOG, unix_ns, log_message(event, unix_ns))
+    def _try(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except OSError as error:
+            raise self._failure(error) from error
 
     def _failure(self, error: OSError) -> SinkError:
         self._failed = True

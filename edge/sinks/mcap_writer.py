@@ -25,6 +25,8 @@ MOST_WAITING_BYTES: Final = 1 << 24
 class McapFile:
     """Writer of schemas, channels, messages and metadata into one new file.
 
+    Every method but `abandon` raises an OSError where it, or an earlier record, cannot be written.
+
     Attributes:
         messages: number of messages added so far.
         written: number of messages on the disk, by channel.
@@ -39,9 +41,6 @@ class McapFile:
             profile: of MCAP, such as "ros2".
             library: name of the library that writes the file.
             clock_s: monotonic, in [s].
-
-        Raises:
-            OSError: the file cannot be written; FileExistsError if it exists.
         """
         self._file = path.open("xb", buffering=0)
         self._clock_s = clock_s
@@ -87,20 +86,12 @@ class McapFile:
         return self._channels
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add facts that hold for the whole file, and pass them to the writing thread at once.
-
-        Raises:
-            OSError: an earlier record cannot be written.
-        """
+        """Add facts that hold for the whole file, and pass them to the writing thread at once."""
         self._jobs.append(partial(self._writer.add_metadata, name, dict(values)))
         self._hand_over()
 
     def add_message(self, channel: int, unix_ns: int, data: bytes) -> None:
-        """Add one message; it is passed to the writing thread within CHUNK_S, if `look` is called by then.
-
-        Raises:
-            OSError: an earlier record cannot be written.
-        """
+        """Add one message; it is passed to the writing thread within CHUNK_S, if `look` is called by then."""
         if self._due_s is None:
             self._due_s = self._clock_s() + CHUNK_S
         sequence = self._sequences.get(channel, 0)
@@ -111,30 +102,18 @@ class McapFile:
             self._hand_over()
 
     def full(self) -> bool:
-        """Return True if so much waits for the disk that nothing should be added.
-
-        Raises:
-            OSError: an earlier record cannot be written.
-        """
+        """Return True if so much waits for the disk that nothing should be added."""
         self._look_back()
         return self._waiting_bytes + self._open_bytes >= MOST_WAITING_BYTES
 
     def look(self) -> None:
-        """Close the chunk if it is due.
-
-        Raises:
-            OSError: an earlier record cannot be written.
-        """
+        """Close the chunk if it is due."""
         self._look_back()
         if self._due_s is not None and self._clock_s() >= self._due_s:
             self._hand_over()
 
     def close(self) -> None:
-        """Write the rest, and the summary that lets a reader seek in the file.
-
-        Raises:
-            OSError: the rest cannot be written. The file is closed, and its content can be read.
-        """
+        """Write the rest, and the summary that lets a reader seek in the file; closed, and readable, if that fails."""
         try:
             self._hand_over()
             self._jobs.append(self._writer.finish)
@@ -149,11 +128,7 @@ class McapFile:
         self._file.close()
 
     def drain(self) -> None:
-        """Wait until only the open chunk is not on the disk yet.
-
-        Raises:
-            OSError: a record cannot be written.
-        """
+        """Wait until only the open chunk is not on the disk yet."""
         while self._handed_over:
             self._handed_over[0][0].exception()
             self._look_back()

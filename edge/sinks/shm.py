@@ -53,13 +53,7 @@ class SharedMemorySink(Sink):
         folder: Path = Path(FOLDER),
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Make the segment; one that a crash left over is replaced.
-
-        Args:
-            name: of the file in `folder`.
-            contract: gives the shapes.
-            folder: of shared memory.
-            clock_ns: monotonic, the scans' own, in [ns].
+        """Make the segment in a folder of shared memory; one that a crash left over is replaced.
 
         Raises:
             SinkError: the segment cannot be made, or another program writes it.
@@ -74,9 +68,9 @@ class SharedMemorySink(Sink):
         self._layout = Layout(contract.rows, contract.cols, height, width, contract.traction_shape)
         try:
             self._file, self._memory = self._create(contract.output_unit)
+        except SinkError:
+            raise
         except OSError as error:
-            if isinstance(error, SinkError):
-                raise
             raise SinkError(f"cannot make shared memory {self._path}: {error.strerror}") from error
         # This view stores eight bytes in one piece, where struct stores byte by byte.
         self._words = memoryview(self._memory).cast("Q")
@@ -91,28 +85,27 @@ class SharedMemorySink(Sink):
         )
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Replace the sensor's values.
-
-        Raises:
-            SinkError: there are too many sensors.
-        """
-        slot_at = self._slots.get(result.scan.sensor)
+        """Replace the sensor's values."""
+        sensor = result.scan.sensor
+        slot_at = self._slots.get(sensor)
         if slot_at is None:
-            slot_at = self._add(result.scan.sensor)
+            if len(self._slots) == SLOTS:
+                raise SinkError(f"shared memory {self._path} has room for {SLOTS} sensors, and {sensor} is one more")
+            slot_at = self._slots[sensor] = HEADER_BYTES + len(self._slots) * self._layout.slot_bytes
         sequence = self._words[slot_at // _WORD] + 1
         self._fill(result, sequence)
         half_at = slot_at + LINE_BYTES + (sequence & 1) * self._layout.half_bytes
         self._memory[half_at : half_at + len(self._draft)] = self._draft
         self._words[slot_at // _WORD] = sequence
-        self._beat()
+        self.wait()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Store the heartbeat only: events have no place here, and the age of the values shows an outage."""
-        self._beat()
+        self.wait()
 
     def wait(self) -> None:
         """Store the heartbeat, which shows that the writer lives while no scan comes."""
-        self._beat()
+        self._words[HEARTBEAT_AT // _WORD] = self._clock_ns()
 
     def close(self) -> None:
         """Free the name; readers that still see the memory see that the run ended."""
@@ -124,15 +117,6 @@ class SharedMemorySink(Sink):
         self._memory.close()
         os.close(self._file)
         self._file = -1
-
-    def _beat(self) -> None:
-        self._words[HEARTBEAT_AT // _WORD] = self._clock_ns()
-
-    def _add(self, sensor: str) -> int:
-        if len(self._slots) == SLOTS:
-            raise SinkError(f"shared memory {self._path} has room for {SLOTS} sensors, and {sensor} is one more")
-        slot_at = self._slots[sensor] = HEADER_BYTES + len(self._slots) * self._layout.slot_bytes
-        return slot_at
 
     def _fill(self, result: Result, sequence: int) -> None:
         _HEAD.pack_into(self._draft, 0, 0, 0, sequence, *_COLUMNS.flat(result))
@@ -154,8 +138,12 @@ class SharedMemorySink(Sink):
             header = self._layout.header(os.getpid(), pattern_unit)
             memory[: len(header)] = header
             memory[HEARTBEAT_AT : HEARTBEAT_AT + _WORD] = self._clock_ns().to_bytes(_WORD, "little")
-            while not self._named(draft):
-                self._take_over()
+            while True:
+                try:
+                    self._path.hardlink_to(draft)
+                    break
+                except FileExistsError:
+                    self._take_over()
         except OSError:
             os.close(descriptor)
             raise
@@ -163,19 +151,8 @@ class SharedMemorySink(Sink):
             draft.unlink(missing_ok=True)
         return descriptor, memory
 
-    def _named(self, draft: Path) -> bool:
-        try:
-            self._path.hardlink_to(draft)
-        except FileExistsError:
-            return False
-        return True
-
     def _take_over(self) -> None:
-        """Remove the segment of a writer that has died.
-
-        Raises:
-            SinkError: the writer lives, or the file is no segment of ours.
-        """
+        """Remove the segment of a writer that has died; a SinkError where it lives, or the file is none of ours."""
         try:
             descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW)
         except FileNotFoundError:

@@ -24,27 +24,13 @@ LINE_BYTES: Final = 64
 HEADER_BYTES: Final = 192
 HEARTBEAT_AT: Final = 128
 
+_SIZES: Final = ("version", "header_bytes", "slots", "slot_bytes", "half_bytes", "first_half_at")
+_SHAPES: Final = ("rows", "cols", "height", "width", "zeroed_at", "counts_at", "pattern_at", "deviation_at")
 HEADER: Final = (
     ("magic", "8s"),
-    ("version", "I"),
-    ("header_bytes", "I"),
-    ("slots", "I"),
-    ("slot_bytes", "I"),
-    ("half_bytes", "I"),
-    ("first_half_at", "I"),
-    ("rows", "I"),
-    ("cols", "I"),
-    ("height", "I"),
-    ("width", "I"),
-    ("zeroed_at", "I"),
-    ("counts_at", "I"),
-    ("pattern_at", "I"),
-    ("deviation_at", "I"),
-    ("writer_pid", "Q"),
-    ("pattern_unit", "16s"),
-    ("traction_at", "I"),
-    ("traction_height", "I"),
-    ("traction_width", "I"),
+    *((name, "I") for name in (*_SIZES, *_SHAPES)),
+    *(("writer_pid", "Q"), ("pattern_unit", "16s")),
+    *((name, "I") for name in ("traction_at", "traction_height", "traction_width")),
 )
 """Name and struct's character of each field from byte 0 on; then, at HEARTBEAT_AT, `heartbeat_ns`, a q.
 
@@ -89,13 +75,8 @@ class Layout:
     @property
     def maps(self) -> dict[str, tuple[np.dtype, tuple[int, ...], int]]:
         """Type, shape and place in a half of each map, by name."""
-        pattern = (self.height, self.width)
-        shapes = {
-            "scan": (3, self.rows, self.cols),
-            "pattern": pattern,
-            "deviation": pattern,
-            "traction": self.traction_shape,
-        }
+        shapes: dict[str, tuple[int, ...] | None] = dict.fromkeys(("pattern", "deviation"), (self.height, self.width))
+        shapes |= {"scan": (3, self.rows, self.cols), "traction": self.traction_shape}
         at, maps = struct_of(MEMBERS).size, {}
         for field in MAPS_IN_MEMORY:
             if (shape := shapes[field.kind.shape]) is not None:

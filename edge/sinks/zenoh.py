@@ -7,8 +7,8 @@ time; readers notice the gaps in `scan`.
 import json
 import os
 import threading
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
@@ -22,6 +22,7 @@ from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import Sink
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import CountersInTurn, event_record, record
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ CLOSED: Final = {
 CLOSE_S: Final = 0.5
 _JSON: Final = "application/json"
 _PACKED: Final = "application/octet-stream"
+LIVE: Final = RunFacts(lossless=False)
 _REMEDY: Final = "expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or zenoh:KEY?config=FILE.json5"
 
 
@@ -50,37 +52,20 @@ class ZenohSink(Sink):
         zid: the session's id, which the time stamp of every message holds, too.
     """
 
-    def __init__(self, target: str, *, lossless: bool = False, source: str | None = None) -> None:
-        """Open a session; it does not matter whether a subscriber is there, now or later.
+    def __init__(self, target: str, run: RunFacts = LIVE) -> None:
+        """Open a session; it does not matter whether a subscriber is there, now or later."""
+        self._target, self._source = target, run.source
+        self._key, self._session = open_session(target)
+        import zenoh
 
-        Args:
-            target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
-            lossless: wait for a slow network, rather than leave messages out.
-            source: kind of the source, published with every event.
-
-        Raises:
-            UsageError: the target has another form.
-            SinkError: zenoh is not installed, or the session cannot be opened.
-        """
-        key, configuration = understood(target)
-        self._target = target
-        try:
-            import zenoh
-        except ImportError as error:
-            raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
-        self._zenoh = zenoh
-        self._key = key
-        self._source = source
+        self._failure = zenoh.ZError
         self._turns = CountersInTurn()
-        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
-        try:
-            self._session = zenoh.open(configured(configuration))
+        self._congestion = zenoh.CongestionControl.BLOCK if run.lossless else zenoh.CongestionControl.DROP
+        with opening():
             self.zid = str(self._session.zid())
-            self._events = self._publisher(f"{key}/event", _JSON)
+            self._events = self._publisher(f"{self._key}/event", _JSON)
             self._read = True  # until a result shows that there is no subscriber
-            self._alive = self._session.liveliness().declare_token(f"{key}/alive/{self.zid}")
-        except zenoh.ZError as error:
-            raise SinkError(f"zenoh cannot be opened: {reason_of(error)}") from error
+            self._alive = self._session.liveliness().declare_token(f"{self._key}/alive/{self.zid}")
         self._publishers: dict[str, tuple[zenoh.Publisher, zenoh.Publisher]] = {}
 
     @property
@@ -89,11 +74,7 @@ class ZenohSink(Sink):
         return None if self._read else f"nobody subscribes to zenoh:{self._target}: check its reader, or the router"
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Put the scan, and its pattern where that is new.
-
-        Raises:
-            SinkError: the session is broken.
-        """
+        """Put the scan, and its pattern where that is new."""
         publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
         text = record(result, self._turns.of(result, counters))
         self._read = any(map(_matched, (*publishers, self._events)))
@@ -102,25 +83,12 @@ class ZenohSink(Sink):
             self._put(publishers[1], pack(text, maps_of(result)))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Put an event.
-
-        Raises:
-            SinkError: the session is broken.
-        """
+        """Put an event."""
         self._put(self._events, orjson.dumps(event_record(event, counters, self._source)))
 
     def close(self) -> None:
-        """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh.
-
-        A subscriber that stands still would delay zenoh for ten seconds, so `close` waits for CLOSE_S at most.
-        """
-        closing = threading.Thread(target=self._close, name="zenoh-close", daemon=True)
-        closing.start()
-        closing.join(CLOSE_S)
-
-    def _close(self) -> None:
-        with suppress(self._zenoh.ZError):  # it took too long, after everything was put without an error
-            self._session.close()
+        """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh."""
+        close_session(self._session)
 
     def _declare(self, sensor: str) -> "tuple[zenoh.Publisher, zenoh.Publisher]":
         base = f"{self._key}/{chunks(sensor)}"
@@ -134,8 +102,8 @@ class ZenohSink(Sink):
     def _put(self, publisher: "zenoh.Publisher", message: bytes) -> None:
         try:
             publisher.put(message, timestamp=self._session.new_timestamp())
-        except self._zenoh.ZError as error:
-            raise SinkError(f"zenoh cannot send: {reason_of(error)}") from error
+        except self._failure as error:
+            raise SinkError(f"zenoh cannot send: {_reason(error)}") from error
 
 
 def chunks(sensor: str) -> str:
@@ -144,11 +112,7 @@ def chunks(sensor: str) -> str:
 
 
 def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
-    """Return key and configuration of a target.
-
-    Raises:
-        UsageError: the target has another form.
-    """
+    """Return key and configuration of a target; a UsageError where it has another form."""
     key, asked, option = target.partition("?")
     if not all(key.split("/")) or set(key) & set("*$#") or key.startswith("@") or "/@" in key:
         raise UsageError(
@@ -164,7 +128,50 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
     raise UsageError(f"zenoh:{target} has {option!r} after its key: {_REMEDY}")
 
 
-def configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":
+def open_session(target: str) -> "tuple[str, zenoh.Session]":
+    """Return the key of a target, and an open session.
+
+    Args:
+        target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
+
+    Raises:
+        UsageError: the target has another form.
+        SinkError: zenoh is not installed, or the session cannot be opened.
+    """
+    key, configuration = understood(target)
+    try:
+        import zenoh
+    except ImportError as error:
+        raise SinkError(f"zenoh: needs eclipse-zenoh: {how_to_install('zenoh')}") from error
+    with opening():
+        return key, zenoh.open(_configured(configuration))
+
+
+@contextmanager
+def opening() -> Iterator[None]:
+    """Turn zenoh's error while something is opened into a SinkError."""
+    import zenoh
+
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise SinkError(f"zenoh cannot be opened: {_reason(error)}") from error
+
+
+def close_session(session: "zenoh.Session") -> None:
+    """End a session within CLOSE_S: a peer that stands still would delay zenoh for ten seconds."""
+    import zenoh
+
+    def close() -> None:
+        with suppress(zenoh.ZError):  # it took too long, after everything was put without an error
+            session.close()
+
+    closing = threading.Thread(target=close, name="zenoh-close", daemon=True)
+    closing.start()
+    closing.join(CLOSE_S)
+
+
+def _configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":
     """Return zenoh's configuration, with everything off in CLOSED that the user does not turn on."""
     import zenoh
 
@@ -174,7 +181,7 @@ def configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":
         try:
             config = zenoh.Config.from_file(configuration)
         except zenoh.ZError as error:
-            raise SinkError(f"{configuration} is not a zenoh configuration: {reason_of(error)}") from error
+            raise SinkError(f"{configuration} is not a zenoh configuration: {_reason(error)}") from error
         configuration = {name: CLOSED[name] for name, text in untouched.items() if config.get_json(name) == text}
     for name, value in configuration.items():
         config.insert_json5(name, json.dumps(value))
@@ -186,7 +193,7 @@ def _matched(publisher: "zenoh.Publisher") -> bool:
     return publisher.matching_status.matching  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def reason_of(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Return zenoh's reason without the place in its source, which follows " at "."""
     text = str(error).strip().partition(f" at {os.sep}")[0]
     return text.strip().splitlines()[-1].lstrip(" =")

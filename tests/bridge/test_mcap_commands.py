@@ -26,6 +26,7 @@ from edge.doctor.watch import Watch
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -107,7 +108,7 @@ class TestOffline:
         """The recording begins in contact: zeroed again, the press would be gone."""
         path = tmp_path / "press.mcap"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
-        sink = open_sink(f"mcap:{path}", SURE, unix_offset_ns=1_012_400_000_000)
+        sink = open_sink(f"mcap:{path}", SURE, RunFacts(unix_offset_ns=1_012_400_000_000))
         for result in make_results(scans, unix_time_s=lambda: 1012.4):
             sink.write(result, {})
         sink.close()

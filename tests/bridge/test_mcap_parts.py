@@ -13,6 +13,7 @@ from edge.api import open_recording, open_runtime
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.sinks.mcap import McapSink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.formats import load_recording
@@ -88,7 +89,7 @@ def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
 def test_another_pad_is_known_without_metadata(tmp_path, rows, cols):
     geometry, grid = SensorGeometry("mine", rows, cols, 5.0, 30.0, 30.0), (rows, cols)
     baseline = replace(BASELINE, counts=np.full((3, *grid), 30_000.0, np.float32))
-    sink = McapSink(tmp_path / "a.mcap", SURE, unix_offset_ns=OFFSET_NS, geometry=geometry)
+    sink = McapSink(tmp_path / "a.mcap", SURE, RunFacts(unix_offset_ns=OFFSET_NS, geometry=geometry))
     result = make_results([make_scan()])[0]
     everything = np.ones(grid, bool)
     scan = replace(result.scan, counts=np.full((3, *grid), 30_000, np.int32), fresh=everything, renewed=everything)

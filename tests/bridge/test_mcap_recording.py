@@ -32,6 +32,7 @@ from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -139,7 +140,7 @@ class TestSink:
         path = HangingDisk(tmp_path / "out.mcap")
         path.hangs_s = 0.05 if lossless else None
         results = make_results([make_scan(number) for number in range(50)])
-        sink = McapSink(path, SURE, lossless=lossless, clock_s=itertools.count(0.0, 0.1).__next__)
+        sink = McapSink(path, SURE, RunFacts(lossless=lossless), clock_s=itertools.count(0.0, 0.1).__next__)
         for result in results:
             sink.write(result, {})
         left_out = sink.unwritten
@@ -206,7 +207,7 @@ class TestReplay:
 
     def test_a_recording_of_an_emulated_sensor_says_so(self, tmp_path):
         path, results = tmp_path / "out.mcap", make_results([make_scan()], source="emulated")
-        sink = McapSink(path, SURE, unix_offset_ns=OFFSET_NS)
+        sink = McapSink(path, SURE, RunFacts(unix_offset_ns=OFFSET_NS))
         sink.tell(Event(5, "silent", None, "nothing comes"), {})
         sink.write(results[0], {})
         sink.close()

@@ -14,6 +14,7 @@ from mcap_samples import OFFSET_NS, make_results, odd_scans
 from edge.perception.event import Event
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 
@@ -21,7 +22,9 @@ def test_public_readers_find_units_frames_and_marks_in_the_file_of_an_emulated_s
     """By the definitions in the file alone, as Foxglove and Rerun read it."""
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     path = tmp_path / "press.mcap"
-    sink = McapSink(path, make_contract(), unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    sink = McapSink(
+        path, make_contract(), RunFacts(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    )
     for result in results:
         scan = replace(result.scan, device_ns=result.scan.time_ns - 2_000_000)
         sink.write(replace(result, scan=scan), {})
@@ -59,7 +62,7 @@ def field_is_in(path, text):
 
 def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
     layout = json.loads((ROOT / "examples/viewers/foxglove.json").read_text())
-    sink = McapSink(tmp_path / "press.mcap", make_contract(), frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    sink = McapSink(tmp_path / "press.mcap", make_contract(), RunFacts(frames={"4": PadFrame("tool0", (0, 0, 50.5))}))
     result = make_wrench_result()
     sink.write(replace(result, deviation=result.pattern / 10), {})
     sink.tell(Event(time.monotonic_ns(), "note", None, "hello"), {})

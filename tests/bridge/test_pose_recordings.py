@@ -11,6 +11,7 @@ from edge import api
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.sinks.mcap import McapSink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose
@@ -54,7 +55,7 @@ def record(path, poses=POSES):
         arrays_of(record(path.with_suffix(".mcap"), poses))
         return path
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
-    sink = McapSink(path, FakeModel().contract, unix_offset_ns=OFFSET_NS)
+    sink = McapSink(path, FakeModel().contract, RunFacts(unix_offset_ns=OFFSET_NS))
     for number, scan in enumerate(make_scans()):
         mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
         if mine:
@@ -92,7 +93,7 @@ def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
     again = tmp_path / "again.mcap"
     runtime = PosedRuntime()
     with api.open_recording(first) as source:
-        sink = McapSink(again, FakeModel().contract, unix_offset_ns=OFFSET_NS)
+        sink = McapSink(again, FakeModel().contract, RunFacts(unix_offset_ns=OFFSET_NS))
         api.pump(source, runtime, [sink], api.Statistics())
         sink.close()
     assert played(again)[0] == played(first)[0] == expected_order()

@@ -16,6 +16,7 @@ from edge.cli import main as cli
 from edge.perception.result import Result
 from edge.perception.result_fields import MAPS
 from edge.sinks.registry import open_sink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -42,7 +43,7 @@ def made(tmp_path) -> tuple[Path, list[Result]]:
     """A recording of two sensors with all that scans may have, one of them mounted turned, with poses."""
     results = make_results(odd_scans(), source="emulated", mountings={"4": TURNED})
     path = tmp_path / "press.mcap"
-    sink = open_sink(f"mcap:{path}", SURE, mountings={"4": TURNED}, unix_offset_ns=10**18)
+    sink = open_sink(f"mcap:{path}", SURE, RunFacts(mountings={"4": TURNED}, unix_offset_ns=10**18))
     for number, result in enumerate(results):
         if number % 4 == 0:
             pose = PadPose(number, -number / 3, 10 * number, 0.4, 0.5)

@@ -86,11 +86,6 @@ def test_methods_come_from_a_file(tmp_path):
     assert np.allclose(methods["linear map"](newest)[1].ravel(), newest[1].ravel() @ matrix)
 
 
-def test_a_file_of_an_earlier_version_has_no_bicubic(tmp_path):
-    np.savez(tmp_path / "old.npz", bilinear_gain=np.float32(0.5), linear_map=np.zeros((48, 1600)))
-    assert set(fitted_methods(tmp_path / "old.npz", 10)) == {"bilinear", "linear map"}
-
-
 def test_a_missing_or_foreign_file_is_refused(tmp_path):
     with pytest.raises(EdgeError, match=r"train\.freeze"):
         fitted_methods(tmp_path / "none.npz", 10)

@@ -15,9 +15,9 @@ from sink_samples import RUN, make_results, make_sure_results
 
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
-from edge.sinks.json_encoding import ALWAYS, chosen_fields
-from edge.sinks.jsonl import JsonLinesSink, record_line
-from edge.sinks.pipe_capacity import has_room
+from edge.sinks.json_encoding import ALWAYS
+from edge.sinks.jsonl import JsonLinesSink, has_room, record_line
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.scans.scan import ABSENT, VendorReading
 
 
@@ -48,7 +48,7 @@ class TestJsonLines:
     )
     def test_a_record_holds_the_fields_that_are_named_and_what_a_robot_must_see(self, chosen, more, tmp_path):
         whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
-        sink = JsonLinesSink(str(path), fields=chosen_fields(chosen))
+        sink = JsonLinesSink(str(path), RunFacts(fields=chosen))
         sink.write(whole, RUN)
         sink.close()
         record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
@@ -179,7 +179,7 @@ class TestJsonLines:
         assert [json.loads(line)["scan"] for line in path.read_text().splitlines()] == [r.scan.number for r in results]
 
     def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
-        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), source="replay")
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), RunFacts(source="replay"))
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
         sink.close()
         assert json.loads((tmp_path / "out.jsonl").read_text()) == {
@@ -197,7 +197,7 @@ class TestJsonLines:
         fifo = tmp_path / "fifo"
         os.mkfifo(fifo)
         reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-        sink = JsonLinesSink(str(fifo), lossless=False)
+        sink = JsonLinesSink(str(fifo), RunFacts(lossless=False))
         result, written = make_results(3)[4], 300
         for _ in range(written):
             sink.write(result, {})  # would wait for ever

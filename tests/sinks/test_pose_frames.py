@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from edge.pipeline.pose_queue import PoseError
-from edge.pose_sources.stamp_clock import EARLY_NS, LATE_NS, StampClock
-from edge.pose_sources.tool_frame import MOST_TILT_DEG, pad_pose, placed
+from edge.pose_sources.stamped_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 
 DOWN = (1.0, 0.0, 0.0, 0.0)

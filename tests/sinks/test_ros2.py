@@ -21,6 +21,7 @@ from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.pad_frame import PadFrame
@@ -233,7 +234,7 @@ def test_subscribers_get_force_and_torque_of_a_model_with_traction(sink):
 def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back():
     frames = {"left": PadFrame("tool0", (0.0, 12.5, 50.0), (0.0, 1.0, 0.0, 0.0)), "far": PadFrame("base")}
     commands = Commands()
-    sink = Ros2Sink("skin", ENVIRONMENT, frames=frames, commands=commands)
+    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(frames=frames, commands=commands))
     for _ in range(2):
         sink.write(contact(1, sensor="left", source="emulated"), {})
     with Listener({"tf_static": FRAMES}) as listener:
@@ -277,7 +278,7 @@ def test_commands_are_taken_only_where_that_was_asked_for(sink):
         for name, value in ENVIRONMENT.items():
             patch.setenv(name, value)
         for text, listens in (("ros2:skin", False), ("ros2:skin?commands", True)):
-            made = open_sink(text, make_contract(), commands=commands)
+            made = open_sink(text, make_contract(), RunFacts(commands=commands))
             assert (made._asked is not None) == listens
             made.close()
 
@@ -320,7 +321,7 @@ def open_sink_in(environment, text):
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():
     published = []
-    sink = Ros2Sink("skin", ENVIRONMENT, source="emulated")
+    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(source="emulated"))
     keep_published(sink, published)
 
     def forces():

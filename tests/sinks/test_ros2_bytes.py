@@ -15,15 +15,14 @@ from edge_samples import make_wrench_result
 
 from edge.perception.event import Event
 from edge.sinks.ros2 import cdr_messages, ros_types
-from edge.sinks.ros2.dds_types import TYPE_HASHES, dds_type
+from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.map_messages import image, in_si, points
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 __all__ = ["sink"]
-KINDS = [one for one in vars(ros_types).values() if isinstance(one, MessageType) and one.name in TYPE_HASHES]
+KINDS = [one for one in ros_types.TYPES.values() if one.name in TYPE_HASHES]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
@@ -37,11 +36,10 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
 def test_every_type_is_ros_own():
     """Also those of recordings, which are not published."""
     assert TYPE_HASHES.keys() == {one.name for one in KINDS}
-    for kind in vars(ros_types).values():
-        if isinstance(kind, MessageType):
-            assert [(field.name, field.kind) for field in kind.fields] == [
-                (name, ros_kind.replace("/msg/", "/")) for name, ros_kind, _ in ros2_messages.fields(kind.name)
-            ]
+    for kind in ros_types.TYPES.values():
+        assert [(field.name, field.kind) for field in kind.fields] == [
+            (name, ros_kind.replace("/msg/", "/")) for name, ros_kind, _ in ros2_messages.fields(kind.name)
+        ]
 
 
 @pytest.fixture

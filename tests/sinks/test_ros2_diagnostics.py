@@ -15,6 +15,7 @@ from edge.perception.result import Result
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.base import Notice
 
 __all__ = ["sink"]
@@ -88,7 +89,7 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     with pytest.MonkeyPatch.context() as patch:
         for name, value in ENVIRONMENT.items():
             patch.setenv(name, value)
-        sink = open_sink("ros2:skin", make_contract(), unix_offset_ns=offset_ns, source="replay")
+        sink = open_sink("ros2:skin", make_contract(), RunFacts(unix_offset_ns=offset_ns, source="replay"))
     sink._clock_ns = lambda: later_ns
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)

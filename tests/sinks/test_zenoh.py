@@ -35,6 +35,7 @@ from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
 from edge.sinks.registry import open_sink
+from edge.sinks.run_facts import RunFacts
 from edge.sinks.zenoh import ZenohSink, chunks
 
 zenoh = pytest.importorskip("zenoh")
@@ -52,7 +53,7 @@ class TestMessages:
         consumer, results = consume(endpoint), make_results(40)
         assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
         event = Event(5, "lost", None, "the cable is out")
-        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, source="emulated")
+        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, RunFacts(source="emulated"))
         expected = []
         for number, result in enumerate(results):
             counters = {"scans": number}

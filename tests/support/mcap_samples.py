@@ -12,6 +12,7 @@ from mcap.writer import Writer
 from edge.cli import main as cli
 from edge.perception.runtime import Runtime
 from edge.sinks.mcap import McapSink
+from edge.sinks.run_facts import RunFacts
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 
@@ -42,7 +43,9 @@ def make_results(scans: list[Scan], **settings):
 
 
 def record_into(path: Path, results, contract=None, **settings) -> Path:
-    sink = McapSink(path, contract or make_contract(interval_factor=1.6), unix_offset_ns=OFFSET_NS, **settings)
+    sink = McapSink(
+        path, contract or make_contract(interval_factor=1.6), RunFacts(unix_offset_ns=OFFSET_NS, **settings)
+    )
     for result in results:
         sink.write(result, {"dropped": 2})
     sink.close()

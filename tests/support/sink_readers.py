@@ -19,6 +19,7 @@ from edge.sinks.registry import open_sink
 from edge.sinks.ros2.cdr_messages import RESULT
 from edge.sinks.ros2.map_messages import image_map
 from edge.sinks.ros2.ros_types import LOG
+from edge.sinks.run_facts import RunFacts
 
 CONTRACT = make_contract(interval_factor=1.6)
 PERIOD_NS = 10_000_000
@@ -98,7 +99,7 @@ class Jsonl(Opened):
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "out.jsonl"
-        self.sink = open_sink(f"jsonl:{self.path}", CONTRACT, source="emulated")
+        self.sink = open_sink(f"jsonl:{self.path}", CONTRACT, RunFacts(source="emulated"))
 
     def lines(self) -> list[dict[str, Any]]:
         return [json.loads(line) for line in self.path.read_text().splitlines()]
@@ -115,7 +116,7 @@ class Mcap(Opened):
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "out.mcap"
-        self.sink = open_sink(f"mcap:{self.path}", CONTRACT, unix_offset_ns=0)
+        self.sink = open_sink(f"mcap:{self.path}", CONTRACT, RunFacts(unix_offset_ns=0))
 
     def results(self) -> list[Back]:
         by_topic = messages_of(self.path)
@@ -178,7 +179,7 @@ class Zenoh(Opened):
 
         endpoint = free_endpoint()
         self._consumer = Consumer(endpoint)
-        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, source="emulated")
+        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, RunFacts(source="emulated"))
         self._heard: list[Any] = []
 
     def end(self) -> None:

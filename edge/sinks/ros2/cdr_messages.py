@@ -4,7 +4,7 @@ Lengths are in metres, as ROS has them. A value that is not available is NaN, or
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, Final
 
@@ -16,18 +16,7 @@ from edge.perception.event import Event, EventKind
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
-from edge.sinks.ros2.diagnostics import Diagnosis
-from edge.sinks.ros2.ros_types import (
-    DIAGNOSTIC_ARRAY,
-    FLOAT64,
-    INT8,
-    LOG,
-    POINT_STAMPED,
-    STRING,
-    TF_MESSAGE,
-    WRENCH_STAMPED,
-    header,
-)
+from edge.sinks.ros2.ros_types import LOG, TF_MESSAGE, WRENCH_STAMPED, header
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.sensor_file.pad_frame import PadFrame
@@ -50,10 +39,8 @@ Vector = tuple[float, float, float]
 _WARN, _ERROR, _INFO = 30, 40, 20
 _LEVELS: Final[Mapping[EventKind, int]] = {
     **dict.fromkeys(("lost", "sink"), _ERROR),
-    **dict.fromkeys(
-        ("silent", "trouble", "refused", "in_contact", "given_up", "rest_level", "baseline_doubted"), _WARN
-    ),
-    **dict.fromkeys(("poses_silent", "poses_trouble"), _WARN),
+    **dict.fromkeys(("silent", "trouble", "refused", "in_contact", "given_up", "rest_level"), _WARN),
+    **dict.fromkeys(("baseline_doubted", "poses_silent", "poses_trouble"), _WARN),
 }
 
 
@@ -76,43 +63,21 @@ def force_and_torque(result: Result, geometry: SensorGeometry) -> tuple[Vector, 
     if not known or vendor is None or vendor.newtons is None or math.isnan(geometry.pitch_mm):
         return None
     newtons = vendor.newtons.reshape(3, -1).T.astype(np.float64)
-    force, torque = newtons.sum(axis=0), np.cross(_taxel_places_m(geometry), newtons).sum(axis=0)
-    return _vector(force), _vector(torque)
+    moments = np.cross(_taxel_places_m(geometry), newtons)
+    (fx, fy, fz), (tx, ty, tz) = newtons.sum(axis=0).tolist(), moments.sum(axis=0).tolist()
+    return (fx, fy, fz), (tx, ty, tz)
 
 
 def wrench(result: Result, geometry: SensorGeometry, unix_ns: int) -> bytes | None:
     """Return force on the pad and torque as a message; None where a part of them is not available."""
     known = force_and_torque(result, geometry)
-    if known is None:
-        return None
-    return wrench_message(*known, frame_of(result), unix_ns)
+    return None if known is None else wrench_message(*known, frame_of(result), unix_ns)
 
 
 def wrench_message(force_n: Vector, torque_n_m: Vector, frame: str, unix_ns: int) -> bytes:
     """Return a force in [N] and a torque in [N m] as a message."""
     force, torque = (dict(zip("xyz", vector, strict=True)) for vector in (force_n, torque_n_m))
     return WRENCH_STAMPED.encode({"header": header(frame, unix_ns), "wrench": {"force": force, "torque": torque}})
-
-
-def number(value: float | None) -> bytes:
-    """Return a number as a message; NaN for None."""
-    return FLOAT64.encode({"data": math.nan if value is None else value})
-
-
-def yes_or_no(value: bool | None) -> bytes:
-    """Return 1, 0, or -1 for None as a message."""
-    return INT8.encode({"data": -1 if value is None else int(value)})
-
-
-def text(value: str) -> bytes:
-    """Return a text as a message."""
-    return STRING.encode({"data": value})
-
-
-def point(place_mm: tuple[float, float], frame: str, unix_ns: int) -> bytes:
-    """Return a place on the pad's face as a message in [m]."""
-    x, y = (one / 1e3 for one in place_mm)
-    return POINT_STAMPED.encode({"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}})
 
 
 def transforms(frames: Mapping[str, PadFrame], unix_ns: int) -> bytes:
@@ -139,21 +104,6 @@ def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> b
     return RESULT.encode(values)
 
 
-def diagnostics_message(statuses: Iterable[tuple[str, str, Diagnosis]], unix_ns: int) -> bytes:
-    """Return the states of sensors, each with its name and its sensor, as a message."""
-    status = [
-        {
-            "level": said.level,
-            "name": name,
-            "message": said.text,
-            "hardware_id": sensor,
-            "values": [{"key": key, "value": value} for key, value in said.values.items()],
-        }
-        for name, sensor, said in statuses
-    ]
-    return DIAGNOSTIC_ARRAY.encode({"header": header("", unix_ns), "status": status})
-
-
 def log_message(event: Event, unix_ns: int) -> bytes:
     """Return an event as a line of ROS's log: `function` is its kind, `name` its sensor or "edge-sr"."""
     return LOG.encode(
@@ -167,11 +117,6 @@ def log_message(event: Event, unix_ns: int) -> bytes:
             "line": 0,
         }
     )
-
-
-def _vector(values: NDArray[np.float64]) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 @lru_cache(maxsize=8)

@@ -1,11 +1,12 @@
 """State of a sensor in the terms of ROS's diagnostics: a level, a line of text, and values."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
 from edge.perception.result import Result
 from edge.sinks.json_encoding import record
+from edge.sinks.ros2.ros_types import DIAGNOSTIC_ARRAY, header
 from firmware_bridge.silence import SHOWN_SILENT_S
 
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
@@ -20,14 +21,11 @@ class Level(IntEnum):
     STALE = 3
 
 
-class Diagnosis(NamedTuple):
-    """State of a sensor.
+_STATES: Final = {"incomplete": Level.ERROR, "zeroing": Level.WARN, "baseline_in_doubt": Level.ERROR}
 
-    Attributes:
-        level: the worst of all findings.
-        text: every finding, or the state of the result where there is no finding.
-        values: by name, with their units in the names.
-    """
+
+class Diagnosis(NamedTuple):
+    """State of a sensor: the worst level of all findings, their text, else the result's state, and values by name."""
 
     level: Level
     text: str
@@ -37,7 +35,7 @@ class Diagnosis(NamedTuple):
 def diagnose(
     result: Result, counters: Mapping[str, int], before: Mapping[str, int], silence_s: float | None, trouble: str | None
 ) -> Diagnosis:
-    """Return the state of a sensor.
+    """Return the state of a sensor by its newest result.
 
     Args:
         result: newest result of the sensor.
@@ -46,36 +44,31 @@ def diagnose(
         silence_s: time since its last scan, in [s]; None where scans are of another time.
         trouble: what the link has reported and not withdrawn.
     """
-    findings = list(_findings(result, silence_s, trouble))
-    lost = {name: counters.get(name, 0) - before.get(name, 0) for name in _LOSSES}
-    findings += [(Level.WARN, f"{count} {name}") for name, count in lost.items() if count > 0]
+    losses = {name: counters.get(name, 0) - before.get(name, 0) for name in _LOSSES}
+    findings = list(_findings(result, losses, silence_s, trouble))
     level = max((level for level, _ in findings), default=Level.OK)
     text = "; ".join(text for _, text in findings) or result.state
     return Diagnosis(level, text, _values(result, counters, silence_s))
 
 
-def _findings(result: Result, silence_s: float | None, trouble: str | None) -> list[tuple[Level, str]]:
-    found: list[tuple[Level, str]] = []
+def _findings(
+    result: Result, losses: Mapping[str, int], silence_s: float | None, trouble: str | None
+) -> Iterator[tuple[Level, str]]:
     if result.source != "device":
-        found.append((Level.WARN, f"{result.source.upper()}, not a sensor"))
+        yield Level.WARN, f"{result.source.upper()}, not a sensor"
     if silence_s is not None and silence_s >= SHOWN_SILENT_S:
-        found.append((Level.STALE, f"no scan for {silence_s:.0f} s"))
+        yield Level.STALE, f"no scan for {silence_s:.0f} s"
     if trouble is not None:
-        found.append((Level.ERROR, trouble))
-    if result.state == "incomplete":
-        found.append((Level.ERROR, result.note or "incomplete"))
-    if result.state == "zeroing":
-        found.append((Level.WARN, result.note or "zeroing"))
-    if result.state == "baseline_in_doubt":
-        found.append((Level.ERROR, result.note or "baseline in doubt"))
+        yield Level.ERROR, trouble
+    if result.state in _STATES:
+        yield _STATES[result.state], result.note or result.state.replace("_", " ")
     if result.dead:
-        dead = ", ".join(f"{taxel} ({reason})" for taxel, reason in result.dead.items())
-        found.append((Level.WARN, f"without taxel {dead}"))
+        yield Level.WARN, f"without taxel {', '.join(f'{taxel} ({why})' for taxel, why in result.dead.items())}"
     if result.state == "contact" and result.trusted is False:
-        found.append((Level.WARN, f"pattern not to be believed: {result.untrusted_text}"))
+        yield Level.WARN, f"pattern not to be believed: {result.untrusted_text}"
     if result.drift is not None and result.drift.step_counts:
-        found.append((Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"))
-    return found
+        yield Level.WARN, f"rest level off by {result.drift.step_counts:.0f} counts"
+    yield from ((Level.WARN, f"{count} {name}") for name, count in losses.items() if count > 0)
 
 
 def _values(result: Result, counters: Mapping[str, int], silence_s: float | None) -> dict[str, str]:
@@ -91,3 +84,18 @@ def _values(result: Result, counters: Mapping[str, int], silence_s: float | None
 
 def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def diagnostics_message(statuses: Iterable[tuple[str, str, Diagnosis]], unix_ns: int) -> bytes:
+    """Return the states of sensors, each with its name and its sensor, as a message."""
+    status = [
+        {
+            "level": said.level,
+            "name": name,
+            "message": said.text,
+            "hardware_id": sensor,
+            "values": [{"key": key, "value": value} for key, value in said.values.items()],
+        }
+        for name, sensor, said in statuses
+    ]
+    return DIAGNOSTIC_ARRAY.encode({"header": header("", unix_ns), "status": status})

@@ -1,5 +1,6 @@
 """ROS 2 messages over DDS, as a ROS node would publish them, with no ROS installed."""
 
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -11,22 +12,17 @@ import numpy as np
 import orjson
 from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy, Qos
-from cyclonedds.topic import Topic
 from numpy.typing import NDArray
 
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.commands import Commands
+from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record
-from edge.sinks.ros2 import cdr_messages as messages
-from edge.sinks.ros2.cdr_messages import diagnostics_message, frame_of
-from edge.sinks.ros2.command_topics import CommandTopics
-from edge.sinks.ros2.dds_domain import join
-from edge.sinks.ros2.dds_types import TYPE_HASHES, dds_type
-from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose
+from edge.sinks.ros2.cdr_messages import frame_of, transforms, wrench, wrench_message
+from edge.sinks.ros2.dds_domain import join, reader, taken, writer
+from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose, diagnostics_message
 from edge.sinks.ros2.map_messages import image, in_si, points, taxels
 from edge.sinks.ros2.ros_types import (
     DIAGNOSTIC_ARRAY,
@@ -38,19 +34,17 @@ from edge.sinks.ros2.ros_types import (
     STRING,
     TF_MESSAGE,
     WRENCH_STAMPED,
+    header,
 )
 from edge.sinks.ros2.topic_names import base_topic, sensor_topic
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from edge.sinks.run_facts import NOW, RunFacts
+from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
-from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 DIAGNOSTICS_S: Final = 1.0
-_DIAGNOSTICS_TOPIC: Final = "diagnostics"
-"""Topic that ROS's tools subscribe to, independent of a robot's name."""
-_FRAMES_TOPIC: Final = "tf_static"
 _EVENTS_KEPT: Final = 100
+_COMMANDS_KEPT: Final = 16
 _OUTAGES: Final = ("lost", "silent")
-_Writer = DataWriter[Any]
 NUMBERS: Final[Mapping[str, Callable[[Result], float | None]]] = {
     "force_counts": lambda result: result.force_counts,
     "force_z_n": lambda result: result.force_n if result.wrench is None else result.wrench.force_n[2],
@@ -73,29 +67,25 @@ class _Sensor:
 
     frame: str
     last: Result
-    writers: dict[str, _Writer] = field(default_factory=dict)
+    writers: dict[str, DataWriter[Any]] = field(default_factory=dict)
     shown: dict[str, tuple[int, ...]] = field(default_factory=dict)
     forced: bool = False
     trouble: dict[str, str] = field(default_factory=dict)
 
 
 class Ros2Sink(Sink):
-    """Publisher of patterns, taxels, forces, numbers, diagnostics and events.
+    """Publisher of patterns, taxels, forces, numbers, diagnostics and events; with the run's commands a subscriber too.
 
-    Writers are reliable, because the subscriptions that ROS makes by default accept nothing less, but they never wait:
-    each topic keeps only its newest message for a slow reader.
+    Commands are texts on TOPIC/zero and TOPIC/reset, as any node or `ros2 topic pub` writes them. Topics serve nodes of
+    every middleware; a service's calls are understood by those of one vendor alone.
     """
 
     def __init__(
         self,
         topic: str,
         environment: Mapping[str, str] = os.environ,
+        run: RunFacts = NOW,
         *,
-        geometry: SensorGeometry = USPA44,
-        frames: Mapping[str, PadFrame] | None = None,
-        commands: Commands | None = None,
-        unix_offset_ns: int | None = None,
-        source: str | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -104,41 +94,26 @@ class Ros2Sink(Sink):
         Args:
             topic: first part of all topics except those of the diagnostics and the frames.
             environment: ROS_DOMAIN_ID and others are read from it.
-            geometry: of the sensors.
-            frames: places of the pads on the robot, by sensor name.
-            commands: takes what others ask for on TOPIC/zero and TOPIC/reset; None for no such topics.
-            unix_offset_ns: added to the time of a scan gives [ns] since 1970; None where scans are of now.
-            source: kind of the source, published with every event.
+            run: with commands only where they are to be taken.
             clock_ns: the clock of the scans that are of now, in [ns].
             unix_ns: wall time, in [ns]; read once, because the clock may be set during the run.
-
-        Raises:
-            UsageError: the topic, or the environment, is not valid in ROS.
-            SinkError: the domain cannot be joined.
         """
-        self._base = base_topic(topic)
-        self._geometry, self._frames = geometry, frames or {}
-        self._clock_ns = clock_ns
-        self._source = source
-        self._of_now = unix_offset_ns is None
-        self._unix_offset_ns = unix_ns() - clock_ns() if unix_offset_ns is None else unix_offset_ns
+        self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
+        self._of_now = run.unix_offset_ns is None
+        self._unix_offset_ns = unix_ns() - clock_ns() if run.unix_offset_ns is None else run.unix_offset_ns
         self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
         self._counters: Mapping[str, int] = {}
         self._counters_before: Mapping[str, int] = {}
         self._diagnosed_ns = clock_ns()
         self._domain, self._participant = join(environment)
-        self._diagnostics = self._writer(_DIAGNOSTICS_TOPIC, DIAGNOSTIC_ARRAY)
-        self._events = self._writer(f"{self._base}/events", STRING, _EVENTS_KEPT)
-        self._placed = self._writer(_FRAMES_TOPIC, TF_MESSAGE, latched=True) if self._frames else None
-        self._asked = None if commands is None else CommandTopics(self._participant, self._base, commands)
+        self._diagnostics = writer(self._participant, "diagnostics", DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
+        self._events = writer(self._participant, f"{self._base}/events", STRING, _EVENTS_KEPT)
+        self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if run.frames else None
+        self._asked = None if run.commands is None else self._subscribed(run.commands)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Publish one result: taxels and numbers, its pattern if it has one, and its wrench if that is available.
-
-        Raises:
-            SinkError: the result cannot be published.
-        """
+        """Publish one result: taxels and numbers, its pattern if it has one, and its wrench if that is available."""
         scan = result.scan
         sensor = self._sensors.get(scan.sensor)
         if sensor is None:
@@ -153,15 +128,15 @@ class Ros2Sink(Sink):
             self._show(sensor, result, unix_ns)
         elif result.state != "dropped":  # a newer scan has already published a pattern
             self._withdraw(sensor, unix_ns, 0.0 if result.contact is False else np.nan)
-        wrench = messages.wrench(result, self._geometry, unix_ns)
-        if wrench is not None:
-            self._publish_to(sensor, "wrench", WRENCH_STAMPED, lambda: wrench)
+        force = wrench(result, self._run.geometry, unix_ns)
+        if force is not None:
+            self._publish_to(sensor, "wrench", WRENCH_STAMPED, lambda: force)
             sensor.forced = result.wrench is not None
         if result.state != "dropped":
             self._publish_numbers(sensor, result, result.state)
         for event in result.events:
             self._tell(event)
-        self._diagnose_if_due()
+        self.wait()
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Publish an event; values that an outage makes unknown are published as NaN."""
@@ -176,11 +151,12 @@ class Ros2Sink(Sink):
             elif event.kind == "well":
                 sensor.trouble.pop("trouble", None)
         self._tell(event)
-        self._diagnose_if_due()
+        self.wait()
 
     def wait(self) -> None:
-        """Publish the diagnostics while no scan comes."""
-        self._diagnose_if_due()
+        """Publish the diagnostics where they are due, also while no scan comes."""
+        if self._clock_ns() - self._diagnosed_ns >= DIAGNOSTICS_S * 1e9:
+            self._diagnose()
 
     def close(self) -> None:
         """Publish that the run has ended, and leave the domain."""
@@ -189,40 +165,43 @@ class Ros2Sink(Sink):
         self._diagnose(ended=True)
         self._sensors.clear()
         if self._asked is not None:
-            self._asked.close()
+            self._asked.clear()
         # Each is deleted with its last reference: writers before the participant, the participant before its domain.
         del self._diagnostics, self._events, self._placed, self._participant, self._domain
 
-    def _writer(self, topic: str, kind: MessageType, depth: int = 1, *, latched: bool = False) -> _Writer:
-        qos = Qos(
-            Policy.Reliability.Reliable(max_blocking_time=0),
-            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-            Policy.History.KeepLast(depth),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(f"typehash=RIHS01_{TYPE_HASHES[kind.name]};".encode()),
-        )
-        try:
-            return DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", dds_type(kind)), qos)
-        except DDSException as error:
-            raise SinkError(f"cannot publish on /{topic}: {error}") from error
+    def _subscribed(self, commands: Commands) -> dict[str, Any]:
+        """Return the readers of commands by name; the loop reads them before each scan, for they have no thread."""
+        topics = {name: f"{self._base}/{name}" for name in ("zero", "reset")}
+        readers = {
+            name: reader(self._participant, topic, STRING, _COMMANDS_KEPT, reliable=True)
+            for name, topic in topics.items()
+        }
 
-    def _writer_of(self, sensor: _Sensor, what: str, kind: MessageType) -> _Writer:
-        writer = sensor.writers.get(what)
-        if writer is None:
-            writer = self._writer(sensor_topic(self._base, sensor.last.scan.sensor, what), kind)
-            sensor.writers[what] = writer
-        return writer
+        def read() -> None:
+            for name, waiting in readers.items():
+                for message in taken(waiting, _COMMANDS_KEPT):
+                    command = _command(name, message)
+                    if command is None or commands.full:
+                        commands.refuse(f"a message on the topic {name} is refused: expected a sensor's name, or none")
+                    else:
+                        commands.put(command)
+
+        commands.ask(read)
+        return readers
 
     def _publish_to(self, sensor: _Sensor, what: str, kind: MessageType, make: Callable[[], bytes]) -> None:
         """Publish what `make` returns, if anybody subscribes: that costs far more than to ask."""
-        writer = self._writer_of(sensor, what, kind)
-        if self._is_read(writer):
-            self._publish(writer, make())
+        to = sensor.writers.get(what)
+        if to is None:
+            topic = sensor_topic(self._base, sensor.last.scan.sensor, what)
+            to = sensor.writers[what] = writer(self._participant, topic, kind)
+        if self._is_read(to):
+            self._publish(to, make())
 
-    def _is_read(self, writer: _Writer) -> bool:
+    def _is_read(self, writer: DataWriter[Any]) -> bool:
         return bool(writer.get_matched_subscriptions())
 
-    def _publish(self, writer: _Writer, message: bytes) -> None:
+    def _publish(self, writer: DataWriter[Any], message: bytes) -> None:
         try:
             writer.write(writer.data_type(message))
         except DDSException as error:
@@ -234,12 +213,13 @@ class Ros2Sink(Sink):
         frame = sensor.frame
         for name, values in (("pattern", result.pattern), ("deviation", result.deviation)):
             if values is not None:
-                self._publish_to(sensor, name, IMAGE, partial(_map_message, name, values, frame, unix_ns))
+                self._publish_to(sensor, name, IMAGE, partial(_map_image, name, values, frame, unix_ns))
                 sensor.shown[name] = values.shape
-        centroid_mm = result.centroid_mm
-        if centroid_mm is not None:
-            self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: messages.point(centroid_mm, frame, unix_ns))
-        self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
+        if result.centroid_mm is not None:
+            x, y = (place / 1e3 for place in result.centroid_mm)
+            message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
+            self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
+        self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._run.geometry, frame, unix_ns))
 
     def _withdraw(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
@@ -248,8 +228,8 @@ class Ros2Sink(Sink):
         """
         if sensor.forced and pattern_value == 0:
             zero = (0.0, 0.0, 0.0)
-            message = partial(messages.wrench_message, zero, zero, sensor.frame, unix_ns)
-            self._publish_to(sensor, "wrench", WRENCH_STAMPED, message)
+            none = partial(wrench_message, zero, zero, sensor.frame, unix_ns)
+            self._publish_to(sensor, "wrench", WRENCH_STAMPED, none)
         sensor.forced = False
         if not sensor.shown:
             return
@@ -257,7 +237,7 @@ class Ros2Sink(Sink):
             values = np.full(shape, pattern_value if name == "pattern" else np.nan, dtype=np.float32)
             self._publish_to(sensor, name, IMAGE, partial(image, values, sensor.frame, unix_ns))
         sensor.shown.clear()
-        empty = partial(points, replace(sensor.last, pattern=None), self._geometry, sensor.frame, unix_ns)
+        empty = partial(points, replace(sensor.last, pattern=None), self._run.geometry, sensor.frame, unix_ns)
         self._publish_to(sensor, "points", POINT_CLOUD, empty)
 
     def _withdraw_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
@@ -266,26 +246,27 @@ class Ros2Sink(Sink):
 
     def _publish_numbers(self, sensor: _Sensor, result: Result | None, state: str) -> None:
         """Publish what is known of a result; of None, that nothing is known."""
+
+        def publish(name: str, kind: MessageType, data: object) -> None:
+            self._publish_to(sensor, name, kind, lambda: kind.encode({"data": data}))
+
         for name, value_of in NUMBERS.items():
             number = None if result is None else value_of(result)
-            self._publish_to(sensor, name, FLOAT64, partial(messages.number, number))
+            publish(name, FLOAT64, math.nan if number is None else number)
         trusted = None if result is None else result.trusted
-        self._publish_to(sensor, "trusted", INT8, lambda: messages.yes_or_no(trusted))
-        self._publish_to(sensor, "state", STRING, lambda: messages.text(state))
+        publish("trusted", INT8, -1 if trusted is None else int(trusted))
+        publish("state", STRING, state)
 
     def _place_pads(self) -> None:
         """Publish where the pads are that have been seen so far; late subscribers get it as well."""
-        frames = {sensor.frame: self._frames[name] for name, sensor in self._sensors.items() if name in self._frames}
+        places = self._run.frames
+        frames = {sensor.frame: places[name] for name, sensor in self._sensors.items() if name in places}
         if self._placed is not None and frames:
-            self._publish(self._placed, messages.transforms(frames, self._now_ns() + self._unix_offset_ns))
+            self._publish(self._placed, transforms(frames, self._now_ns() + self._unix_offset_ns))
 
     def _tell(self, event: Event) -> None:
-        text = orjson.dumps(event_record(event, self._counters, self._source)).decode()
-        self._publish(self._events, messages.text(text))
-
-    def _diagnose_if_due(self) -> None:
-        if self._clock_ns() - self._diagnosed_ns >= DIAGNOSTICS_S * 1e9:
-            self._diagnose()
+        text = orjson.dumps(event_record(event, self._counters, self._run.source)).decode()
+        self._publish(self._events, STRING.encode({"data": text}))
 
     def _diagnose(self, *, ended: bool = False) -> None:
         self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
@@ -306,5 +287,14 @@ class Ros2Sink(Sink):
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
 
 
-def _map_message(name: str, values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
+def _map_image(name: str, values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
     return image(in_si(name, values), frame, unix_ns)
+
+
+def _command(name: str, message: bytes) -> Command | None:
+    """Return the command in a message: an empty text is for all sensors, else it names the sensor to zero."""
+    try:
+        sensor = STRING.decode(message)["data"]
+    except CdrError:
+        return None
+    return runtime_command({"cmd": name} | ({"sensor": sensor} if sensor else {}))

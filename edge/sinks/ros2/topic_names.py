@@ -37,11 +37,7 @@ def sensor_path(sensor: str) -> str:
 
 
 def sensor_topic(base: str, sensor: str, what: str) -> str:
-    """Return the topic of one thing that is published of a sensor.
-
-    Raises:
-        SinkError: the topic is too long for ROS.
-    """
+    """Return the topic of one thing that is published of a sensor; a SinkError where it is too long for ROS."""
     topic = "/".join((base, sensor_path(sensor), what))
     if len(topic) >= LONGEST_TOPIC:
         raise SinkError(
