@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from train.errors import TrainError
 from train.physics.contact import ContactSolver
 from train.physics.covers import BARE, Cover
-from train.physics.curved_patterns import heights_pattern
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
 from train.physics.taxel_response import Skin, on_pad
 from train.physics.touched import carrying, pressed_in, which_of
+from train.physics.tpsf import heights_pattern
 from train.surfaces.depth_image import NOTHING_MM
 
 MAX_INDENTATION_MM: Final = 0.5
