@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from train.experiments.paper.trainings import mixed
 from train.physics.sensor_noise import Nuisances
 
 COURSE = Course(20.0)
+GAINS = replace(Nuisances.none(), gain_spread=0.075)
 RAMP_N = 5.0 * COURSE.share
 
 
@@ -77,7 +79,7 @@ def test_without_nuisances_a_press_and_its_release_read_alike(sequences):
 
 def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind(sequences):
     free = z_of(pressed(sequences, 0, COURSE, Nuisances.none()))
-    lagging = z_of(pressed(sequences, 0, COURSE, Nuisances.only("hysteresis")))
+    lagging = z_of(pressed(sequences, 0, COURSE, replace(Nuisances.none(), hysteresis=0.11)))
     press, hold, release, rest = (COURSE.phase(number) for number in range(4))
     assert (lagging[press][5:] < free[press][5:]).all()
     assert np.corrcoef(lagging[hold][:40], np.arange(40))[0, 1] > 0.9  # it creeps up
@@ -91,13 +93,13 @@ def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind
 
 def test_one_sensor_reads_the_course_and_the_earlier_taps(sequences):
     clean = pressed(sequences, 0, COURSE, Nuisances.none()).windows[100]
-    read = pressed(sequences, 0, COURSE, Nuisances.only("gain_spread")).windows[100]
+    read = pressed(sequences, 0, COURSE, GAINS).windows[100]
     clear = np.abs(clean).min(axis=0) > 200
     gain = np.where(clear, read / np.where(clear, clean, 1), 1)
     assert clear.sum() > 10
     np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
     assert np.ptp(gain[0][clear]) > 0.05
-    other = pressed(sequences, 1, COURSE, Nuisances.only("gain_spread")).windows[100]
+    other = pressed(sequences, 1, COURSE, GAINS).windows[100]
     other_clean = pressed(sequences, 1, COURSE, Nuisances.none()).windows[100]
     both = clear & (np.abs(other_clean).min(axis=0) > 200)
     assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)

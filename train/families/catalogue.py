@@ -13,7 +13,7 @@ from train.families import faces, rounds, solids
 from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
 from train.physics.covers import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.depth_image import Pose, Relief, footprints
+from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import over_surface, random_targets
@@ -193,7 +193,7 @@ def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]
     Raises:
         ValueError: nothing of it lies under the pad.
     """
-    return -footprints([_relief(surface)], [pose], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm[0]
+    return -depth_image(_relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
 
 
 @lru_cache(maxsize=64)

@@ -69,7 +69,6 @@ class ContactSolver:
         size: cells along a side.
         cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
-        boxed: work on boxes; else on the whole pad, for comparison.
         compliance: surface displacement per pressure at wave numbers, in [mm/MPa], for a pad with a cover; the layer's
             alone if None.
         sides: the pad's free sides; None for an infinite layer.
@@ -81,7 +80,6 @@ class ContactSolver:
         size: int,
         cell_mm: float,
         dtype: torch.dtype = torch.float32,
-        boxed: bool = True,
         compliance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
         sides: FreeSides | None = None,
     ) -> None:
@@ -94,7 +92,7 @@ class ContactSolver:
         answers = surface_compliance(layer, q) if compliance is None else compliance(q)
         self._kernel = np.fft.irfft2(answers, s=(padded, padded))
         self._dtype = dtype
-        self._sides = [*(box_sides(size) if boxed else ()), size]
+        self._sides = [*box_sides(size), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
         self._side_give = None if sides is None else SideGive.of(sides, layer, size, cell_mm, dtype)
 
@@ -113,7 +111,6 @@ class ContactSolver:
         depth_mm: NDArray[np.floating],
         indentation_mm: float | NDArray[np.floating] = 1.0,
         tolerance: float = 1e-3,
-        start_mpa: NDArray[np.floating] | None = None,
         cover: NDArray[np.floating] | None = None,
     ) -> ContactResult:
         """Press surfaces into the pad, with depth images as input.
@@ -124,12 +121,8 @@ class ContactSolver:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
             tolerance: residual at which a pose is done.
-            start_mpa: pressures to start from, (n, size, size), or None.
             cover: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
-
-        Raises:
-            ValueError: shapes or values do not fit, or no cell of a pose is reached.
         """
         if depth_mm.shape[1:] != (self.size, self.size):
             raise ValueError(f"depth images of shape {depth_mm.shape}, expected (n, {self.size}, {self.size})")
@@ -154,10 +147,9 @@ class ContactSolver:
             place = (poses[:, None, None], rows, columns)
             press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
             depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
-            start = None if start_mpa is None else torch.as_tensor(start_mpa[place], dtype=self._dtype)
             give = None if cover is None else self._give(torch.as_tensor(cover[place], dtype=self._dtype))
             sides = None if self._side_give is None else self._side_give.boxes(top, left, (height, width))
-            found, error, taken = self._conjugate_gradients(depth, press, tolerance, start, give, sides)
+            found, error, taken = self._conjugate_gradients(depth, press, tolerance, give, sides)
             pressure_mpa[place] = found.numpy()
             residual[poses] = error.numpy()
             steps = max(steps, taken)
@@ -175,7 +167,6 @@ class ContactSolver:
         depth: torch.Tensor,
         press: torch.Tensor,
         tolerance: float,
-        start: torch.Tensor | None,
         give: torch.Tensor | None,
         sides: SideGive | None,
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
@@ -186,9 +177,6 @@ class ContactSolver:
             give = torch.zeros(())
         pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
         give = give.expand_as(pressure)
-        if start is not None:
-            known = torch.where(reachable, start.clamp_min(0.0), 0.0)
-            pressure = torch.where(known.amax(dim=(1, 2), keepdim=True) > 0, known, pressure)
         result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
         working = torch.arange(len(pressure))
         gap = torch.where(reachable, self._respond(pressure, give, sides) - wanted, 0.0)

@@ -56,25 +56,6 @@ def surface_tangential_compliance(
     return along, thickness / shear * np.tanh(a) / a
 
 
-def surface_spread(layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the surface displacement along the wave per pressure: u = i times this, in closed form, in [mm/MPa].
-
-    U = [(1-2nu)(3-4nu)(cosh 2a - 1) - 2a^2] / (2 G q [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2]), a = qh: the surface
-    value of train.physics.elastic_layer.inner_displacement. Below 0 a pressure drives the surface apart.
-
-    Args:
-        layer: the pad.
-        q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
-    """
-    nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
-    a = np.maximum(q_per_mm * thickness, 1e-8)  # proportional to a in the limit
-    decay = np.exp(-2 * a)
-    kappa = 3 - 4 * nu
-    numerator = (1 - 2 * nu) * kappa * np.expm1(-2 * a) ** 2 - 4 * a**2 * decay
-    denominator = kappa * (1 + decay**2) + 2 * decay * (2 * a**2 + 5 - 12 * nu + 8 * nu**2)
-    return thickness / (2 * shear * a) * numerator / denominator
-
-
 def inner_tangential(layer: Layer, q_per_mm: NDArray[np.float64], height_mm: float) -> TangentialResponse:
     """Return the displacement at a height inside the layer per tangential traction on its surface.
 

@@ -51,13 +51,7 @@ class Targets:
 
 
 def position_mm(index: int) -> tuple[float, float]:
-    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid.
-
-    Raises:
-        ValueError: not one of the nine.
-    """
-    if not 0 <= index < POSITIONS:
-        raise ValueError(f"position {index}: expected 0 to {POSITIONS - 1}")
+    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid."""
     return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
 
 
@@ -80,8 +74,8 @@ def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) 
     return Targets([name for name, _ in taps], [pose for _, pose in taps])
 
 
-def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES, first: int = 0) -> Targets:
-    """Draw places and angles away from the held-out positions, with surfaces in turn starting at index `first`."""
+def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES) -> Targets:
+    """Draw places and angles away from the held-out positions, with surfaces in turn."""
     held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
     poses: list[Pose] = []
     while len(poses) < count:
@@ -89,7 +83,7 @@ def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str]
         angle_deg = rng.uniform(0, 360)
         if np.hypot(*(held_out_mm - (x_mm, y_mm)).T).min() > HELD_OUT_RADIUS_MM:
             poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
-    return Targets([surfaces[(first + i) % len(surfaces)] for i in range(count)], poses)
+    return Targets([surfaces[i % len(surfaces)] for i in range(count)], poses)
 
 
 def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_DEG) -> NDArray[np.float64]:
