@@ -13,16 +13,6 @@ from train.surfaces.meshes import mesh_file
 
 SEED: Final = 20240228
 """Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
-_FIGURES_PER_SEED: Final = 1_000_000
-
-
-def random_figures(glyphs: int, polygons: int, seed: int) -> tuple[str, ...]:
-    """Return names of random figures; those of different seeds have nothing in common."""
-    first = seed * _FIGURES_PER_SEED
-    return (
-        *(f"glyph:{first + i}" for i in range(glyphs)),
-        *(f"polygon:{first + i}" for i in range(polygons)),
-    )
 
 
 def mesh_sha256(name: str) -> str:

@@ -35,8 +35,7 @@ from train.experiments.paper.course import (
     pressed,
     volume_mm3,
 )
-from train.experiments.paper.methods import Method, compact_methods
-from train.experiments.paper.trainings import mixed
+from train.experiments.paper.protocol import Method, compact_methods, mixed
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances
@@ -113,8 +112,6 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"more than {CLAIM_N:g} N, and scans that pass the runtime's contact threshold ({ON_COUNTS:g} counts of summed "
         "z), below which no pattern is made; that threshold misses loaded scans, too."
     )
-    for condition in CONDITIONS:
-        report.say(_finding(condition, [row for row in rows if row["nuisances"] == condition]))
     report.table(rows, "Force recovery, means over presses with 95 % intervals.")
     report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
     with report.figure(size=(13, 8)) as figure:
@@ -140,48 +137,27 @@ def _gauges(networks: list[Method]) -> list[Gauge]:
     ]
 
 
+_COLUMNS: Final = {
+    "error": "error %",
+    "own": "with its own factor %",
+    "gated": "above the threshold %",
+    "loop": "loop %",
+    "rest": "at no load %",
+    "false": "false contact, % of scans",
+    "false gated": "past the threshold, % of scans",
+    "missed": "loaded but missed, % of scans",
+}
+
+
 def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
-    taps = np.arange(len(presses))
-    means = {key: np.array([press[key] for press in presses]) for key in presses[0]}
-    columns = {
-        "error": "error %",
-        "own": "with its own factor %",
-        "gated": "above the threshold %",
-        "loop": "loop %",
-        "rest": "at no load %",
-        "false": "false contact, % of scans",
-        "false gated": "past the threshold, % of scans",
-        "missed": "loaded but missed, % of scans",
-    }
+    means = {label: np.array([press[key] for press in presses]) for key, label in _COLUMNS.items()}
     return {
         "nuisances": condition,
         "model": gauge.name,
-        **{label: with_interval(means[key], taps) for key, label in columns.items()},
+        **{label: with_interval(values, np.arange(len(presses))) for label, values in means.items()},
         "N per unit": gauge.newtons_per_unit,
         **gauge.cost,
     }
-
-
-def _finding(condition: str, rows: list[Row]) -> str:
-    """Name the method with the least force error, and list the remaining errors."""
-
-    def mean(row: Row, column: str) -> float:
-        return float(str(row[column]).split()[0])
-
-    real = [row for row in rows if row["model"] != "true pattern"]
-    best = min(real, key=lambda row: mean(row, "error %"))
-    listed = "; ".join(
-        f"{row['model']} {row['error %']} %, loop {mean(row, 'loop %'):.1f} %, false contact "
-        f"{mean(row, 'false contact, % of scans'):.0f} % of scans"
-        for row in real
-    )
-    true = next(row for row in rows if row["model"] == "true pattern")
-    return (
-        f"**{condition}**: least error has {best['model']}. {listed}. A true pattern would be off by "
-        f"{mean(true, 'error %'):.1f} %, as one factor does not suit all shapes. Past the runtime's threshold come "
-        f"{mean(best, 'past the threshold, % of scans'):.0f} % of the scans at no load; it misses "
-        f"{mean(best, 'loaded but missed, % of scans'):.0f} % of those under load."
-    )
 
 
 def _draw(

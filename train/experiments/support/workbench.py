@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,7 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.generation_config import SEED
+from train.data.generation_config import SEED, one_thread
 from train.data.make_presses import make_presses
 from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import PressSet
@@ -139,20 +139,19 @@ def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
 def cost_cells(net: PatternNet) -> Row:
     """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
     window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    times_ms = []
-    with torch.inference_mode():
-        while len(times_ms) < _TIMED_RUNS and sum(times_ms) < _TIMED_MS:
-            started_s = time.perf_counter()
-            net(window)
-            times_ms.append(1e3 * (time.perf_counter() - started_s))
-    torch.set_num_threads(threads)
-    return {
-        "parameters": parameters_count(net),
-        "MMAC": round(macs(net) / 1e6, 1),
-        "run time ms": round(float(np.median(times_ms[len(times_ms) // 3 :])), 3),
-    }
+    with one_thread(), torch.inference_mode():
+        run_time_ms = median_ms(lambda: net(window))
+    return {"parameters": parameters_count(net), "MMAC": round(macs(net) / 1e6, 1), "run time ms": run_time_ms}
+
+
+def median_ms(run: Callable[[], object]) -> float:
+    """Return the median time of some runs, without the first third of them, in [ms]."""
+    times_ms: list[float] = []
+    while len(times_ms) < _TIMED_RUNS and sum(times_ms) < _TIMED_MS:
+        started_s = time.perf_counter()
+        run()
+        times_ms.append(1e3 * (time.perf_counter() - started_s))
+    return round(float(np.median(times_ms[len(times_ms) // 3 :])), 3)
 
 
 def _quick(training: Training) -> Training:
