@@ -130,12 +130,6 @@ def export(
         trust: forward model and checks for the contract; None for none.
         intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
         one_tap: name of the model in `folder` by which one that takes poses infers single taps; None for its own.
-
-    Raises:
-        CheckpointError: the checkpoint cannot be used.
-        ParityError: the graph does not compute what the network computes; nothing is written.
-        ModelError: the graph does not match its contract; nothing is written.
-        ExportError: no node of the graph can be quantised, or the batch is not positive.
     """
     net, report = load_network(checkpoint)
     write_out(net)

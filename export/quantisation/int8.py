@@ -51,7 +51,6 @@ def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
     """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
     Raises:
-        DatasetError: the sequences have fewer taps than the network takes.
         ExportError: there are too few sequences for meaningful ranges.
     """
     if len(taps) < _FEWEST:

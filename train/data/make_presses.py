@@ -38,16 +38,8 @@ _AT_ONCE: Final = 16
 def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
-    Args:
-        world: configuration of the presses.
-        path: of the npz.
-        jobs: processes, -1 for one on each core.
-        compressed: a smaller file, slower to write.
-
     Raises:
         DatasetError: the file at `path` or its parts were made otherwise, or cannot be written.
-        SurfaceError: nothing of a user's mesh lies under the pad.
-        MeshError: a user's mesh cannot be used.
     """
     facts = world.facts()
     if path.exists():

@@ -29,13 +29,6 @@ _ASTRAY_DEG: Final = 8.0
 class PosedBatches:
     """Batches of windows with poses, pad inputs, and truth.
 
-    Args:
-        presses: some of them with as many taps as `given` has numbers.
-        given: share of batches with 1, 2, ... K taps.
-        batch: windows in a batch.
-        seed: of all draws.
-        nuisances: of the sensors.
-
     Raises:
         DatasetError: there are no presses of so many taps.
     """

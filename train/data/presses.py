@@ -120,11 +120,7 @@ class PressSet:
         return arrays_sha256(self.config, {name: getattr(self, name) for name in _AXES if name not in left_out})
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
-        """Write the presses as one npz, atomically.
-
-        Raises:
-            DatasetError: the file cannot be written.
-        """
+        """Write the presses as one npz, atomically."""
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = {"config": self.config, "sha256": self.sha256()}

@@ -17,9 +17,6 @@ def quiet_workers(jobs: int) -> Iterator[None]:
     ends a process that has grown by 300 MB, and another, which inherits nothing, sets for itself what it ignores. An
     interrupted call ends them. Enter from the main thread; until then, Ctrl-C does nothing. joblib's warning of a
     process that it has ended is left out, since another one does its work.
-
-    Args:
-        jobs: processes, -1 for one on each core.
     """
     with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)

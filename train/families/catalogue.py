@@ -83,10 +83,6 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
         family: a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
         pad: the pad that taps.
         poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
-
-    Raises:
-        SurfaceError: nothing of a user's mesh lies under the pad.
-        MeshError: the user's mesh cannot be used.
     """
     if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
@@ -188,11 +184,7 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
 
 
 def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
-    """Return the heights (m, m) of a surface at the places of a pad at a pose over it.
-
-    Raises:
-        ValueError: nothing of it lies under the pad.
-    """
+    """Return the heights (m, m) of a surface at the places of a pad at a pose over it."""
     return -depth_image(_relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
 
 

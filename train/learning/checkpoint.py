@@ -84,15 +84,6 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
 
     A checkpoint of the same training that already exists is left as it is.
-
-    Args:
-        training: configuration of the training.
-        data: sequences, some of which have as many taps as the network takes.
-        validation: set by which contact level and deviations are calibrated.
-        folder: of the checkpoints.
-
-    Raises:
-        CheckpointError: the checkpoint to start from cannot be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
@@ -164,13 +155,6 @@ def batches_of(
     posed: bool = False,
 ) -> Callable[[int], Batch]:
     """Return batches for a recipe; of presses, only the sequences that have all taps.
-
-    Args:
-        data: taps to draw from.
-        scale: pattern pixels per taxel pitch.
-        recipe: hyperparameters.
-        seed: of all draws.
-        posed: with the poses of the taps, for a network that takes them.
 
     Raises:
         DatasetError: no sequence has as many taps, or the scale is not that of the presses.

@@ -33,13 +33,7 @@ _UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
 def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
-    """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled.
-
-    Args:
-        presses: the newest press of each sequence is used.
-        seed: of nuisances, faults and weights.
-        steps: of the optimizer.
-    """
+    """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled."""
     rng = np.random.default_rng([seed, 3])
     right, wrong = [], []
     for number in range(_ROUNDS):

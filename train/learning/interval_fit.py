@@ -72,11 +72,7 @@ def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.f
 
 
 def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm].
-
-    Raises:
-        ValueError: shapes differ, there are no pixels, or the level is not between 0 and 1.
-    """
+    """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm]."""
     _errors(truth, pattern, deviation)
     return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
 
@@ -151,9 +147,6 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
         presses: some of them with all taps of the network.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
         seed: of all draws.
-
-    Raises:
-        DatasetError: no press has as many taps.
     """
     torch.manual_seed(seed)
     correction = net.add_intervals()
@@ -179,11 +172,6 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
 
 def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str, list[float]]:
     """Shift a network's correction, per region and number of taps, until it covers LEVEL of the readings' pixels.
-
-    Args:
-        net: with a correction.
-        run: the network, or the graph in integers made from it.
-        readings: that nothing was trained on.
 
     Returns:
         For each of LEVELS, in percent, the deviations that make half of its interval in each region.

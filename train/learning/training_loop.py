@@ -212,7 +212,6 @@ def train(
 
     Raises:
         ValueError: a batch cannot be shared evenly by the processes.
-        NotResumableError: the state at `resume_path` is of another recipe or identity.
         DivergedError: the loss is not finite; the network is as it was before that step.
     """
     rank, world = rank_and_world()

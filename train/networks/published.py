@@ -50,10 +50,6 @@ class SeedNet(PatternNet):
     All layers work at the pattern's size. Taps are interpolated, each passes its stem, and they are merged; the newest
     tap also passes a branch without batch normalisation, which would remove the force.
 
-    Args:
-        taps: K, 1 to 7.
-        scale: pattern pixels per taxel pitch.
-
     Raises:
         ValueError: taps or scale out of range.
     """
@@ -111,9 +107,6 @@ class SeedNet(PatternNet):
 
 class TactileSRCNN(PatternNet):
     """Network from a window of one tap to a pattern, with batch normalisation throughout.
-
-    Args:
-        scale: pattern pixels per taxel pitch.
 
     Raises:
         ValueError: scale is not positive.

@@ -98,9 +98,6 @@ class Taps:
 class GrippedPad:
     """One pad, and presses onto it.
 
-    Args:
-        pad: its constants.
-
     Attributes:
         places_mm: x (1, m) and y (m, 1) on the pad at which shapes are sampled, in [mm].
     """
@@ -183,9 +180,6 @@ class GrippedPad:
         Args:
             heights_mm: (n, m, m) as in `press`, of figures on a plate that the pad does not reach.
             force_n: set force, one for all or (n,), in [N].
-
-        Raises:
-            PressError: nothing lies under the pad.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)

@@ -41,7 +41,6 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
 
     Raises:
         SurfaceError: no surface of that name.
-        MeshError: the user's file cannot be used.
     """
     kind, _, detail = name.partition(":")
     if name in SURFACES:

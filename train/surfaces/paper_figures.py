@@ -46,11 +46,7 @@ SHAPES: Final = tuple(f"{form} {shape}" for shape in _CORNERS for form in ("holl
 
 
 def figure(name: str) -> BaseGeometry:
-    """Return the outline of one of LETTERS or SHAPES, centred on the origin, in [mm].
-
-    Raises:
-        KeyError: neither a letter nor a shape.
-    """
+    """Return the outline of one of LETTERS or SHAPES, centred on the origin, in [mm]."""
     return _letter(name) if name in _STROKES else _shape(*name.split())
 
 

@@ -27,9 +27,6 @@ _JOINS: Final[tuple[Literal["round", "mitre", "bevel"], ...]] = ("round", "mitre
 def glyph(seed: int) -> BaseGeometry:
     """Draw one to four random strokes of one width, like a letter of an unknown script.
 
-    Args:
-        seed: 0 or more.
-
     Returns:
         Polygon or MultiPolygon within GLYPH_REACH_MM, in [mm].
     """
@@ -42,9 +39,6 @@ def glyph(seed: int) -> BaseGeometry:
 
 def polygon(seed: int) -> BaseGeometry:
     """Draw one or two random polygons or ellipses, full or hollow.
-
-    Args:
-        seed: 0 or more.
 
     Returns:
         Polygon or MultiPolygon within POLYGON_REACH_MM, in [mm].

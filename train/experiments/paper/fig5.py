@@ -33,12 +33,7 @@ _BINS: Final = 8
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Tap, train, and write table and plot.
-
-    Args:
-        bench: if quick, fewer taps and epochs.
-        folder: where the report goes.
-    """
+    """Tap, train, and write table and plot."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, taps = _tap(poses)
     held_out = np.arange(len(names)) // len(SURFACES) % 3 == 0

@@ -29,12 +29,6 @@ _TAP_SCANS: Final = 2
 class PushedSensor:
     """Sensor whose scans go through a runtime of its own.
 
-    Args:
-        model: of the runtime.
-        pad: what its sensor file holds; None for no file.
-        seed: of the noise of a free pad.
-        options: of the runtime.
-
     Attributes:
         suspected: whether the last scan's events leave the sensor suspected.
     """

@@ -38,11 +38,7 @@ class Inferred:
 
 
 def load_shipped(folder: Path) -> ModelSession:
-    """Load the shipped model.
-
-    Raises:
-        ModelError: it does not exist, or cannot be used.
-    """
+    """Load the shipped model."""
     return ModelSession(folder / f"{DEFAULT_MODEL}.onnx")
 
 

@@ -52,13 +52,7 @@ class Guarded:
 
 
 def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> Iterator[Table]:
-    """Yield the tables of dropped taps and of PSNR.
-
-    Args:
-        single: model of one tap.
-        several: file of a model of more.
-        sensors: presses read by one sensor for each pad.
-    """
+    """Yield the tables of dropped taps and of PSNR."""
     guarding, unguarded = ModelSession(several), ModelSession(several)
     unguarded.contract = replace(unguarded.contract, trust={})
     taps, name_of = guarding.contract.taps, guarding.name
