@@ -120,7 +120,7 @@ def paper_taps(
     taps: int = MAX_TAPS,
     angle_step_deg: float = ANGLE_STEP_DEG,
 ) -> PaperTaps:
-    """Tap each flat surface at the places of a split, in four turns; poses are off by a robot's error, as is the truth."""
+    """Tap each flat surface at the places of a split, in four turns; poses and truth are off by a robot's error."""
     pad = GrippedPad(NOMINAL)
     targets = paper_targets(positions_of(split), surfaces)
     sent = as_poses(turned_back(targets, taps, angle_step_deg))

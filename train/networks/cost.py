@@ -17,7 +17,7 @@ def parameters_count(net: nn.Module) -> int:
 
 
 def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
-    """Count multiply-accumulates of one window in all convolutions and linear layers, without norms and interpolation."""
+    """Count multiply-accumulates of one window in convolutions and linear layers, without norms and interpolation."""
     counted: list[int] = []
 
     def count(layer: nn.Conv2d | nn.Linear | SymmetricConv2d, _: object, output: torch.Tensor) -> None:
