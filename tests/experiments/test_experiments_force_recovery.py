@@ -8,8 +8,18 @@ from experiment_samples import quick_bench
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from train.data.paper_taps import between_frames
 from train.experiments.paper import force_recovery
-from train.experiments.paper.course import CLAIM_N, RANGE_N, Course, Scans, contact, errors, loop_percent, pressed
-from train.experiments.paper.force_recovery import Gauge, training_presses
+from train.experiments.paper.force_recovery import (
+    CLAIM_N,
+    RANGE_N,
+    Course,
+    Gauge,
+    Scans,
+    contact,
+    errors,
+    loop_percent,
+    pressed,
+    training_presses,
+)
 from train.experiments.paper.protocol import mixed
 from train.physics.sensor_noise import Nuisances
 

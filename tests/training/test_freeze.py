@@ -19,7 +19,7 @@ from train.demo import demo_recording
 from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances
-from train.surfaces.tap_schedules import HALF_PITCH_MM
+from train.surfaces.poses import HALF_PITCH_MM
 
 
 @pytest.fixture(scope="module")

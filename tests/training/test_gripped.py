@@ -7,7 +7,7 @@ import pytest
 
 from firmware_bridge.pad_geometry import USPA44
 from train.families.shape import NOWHERE_MM
-from train.physics.covers import BARE, Cover
+from train.physics.contact import BARE, Cover
 from train.physics.elastic_layer import surface_compliance
 from train.physics.gripped import (
     FINE_SCALE,

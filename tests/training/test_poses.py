@@ -6,7 +6,7 @@ from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import (
     HELD_OUT_RADIUS_MM,
     POSITION_STEP_MM,
-    REACH_MM,
+    SURFACE_REACH_MM,
     TARGET_ANGLES_DEG,
     as_poses,
     paper_targets,
@@ -64,7 +64,7 @@ def test_random_poses_are_seeded_wide_and_away_from_the_held_out_positions():
         distance_mm = np.hypot(x_mm - held_out[0], y_mm - held_out[1])
         assert HELD_OUT_RADIUS_MM < distance_mm.min() < HELD_OUT_RADIUS_MM + 0.1
     for along in (x_mm, y_mm):
-        assert 0.97 * REACH_MM < np.abs(along).max() <= REACH_MM
+        assert 0.97 * SURFACE_REACH_MM < np.abs(along).max() <= SURFACE_REACH_MM
     assert np.allclose(np.histogram(angle_deg, 12, (0, 360))[0], 250, atol=70)
     again = random_targets(np.random.default_rng(1), 3000)
     assert again == drawn

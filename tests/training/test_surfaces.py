@@ -6,7 +6,7 @@ import trimesh
 
 from train.errors import SurfaceError
 from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, PLATE_MM, PLATES, SURFACES, surface_mesh
-from train.surfaces.paper_figures import figure
+from train.surfaces.random_figures import figure
 
 WITH_A_HOLE = {"O", "P", "hollow circle", "hollow square", "hollow triangle"}
 

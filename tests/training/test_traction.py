@@ -6,11 +6,17 @@ import torch
 
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
-from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
+from train.physics.elastic_layer import (
+    Layer,
+    inner_displacement,
+    inner_tangential,
+    surface_compliance,
+    surface_tangential_compliance,
+    surface_tensor,
+)
 from train.physics.friction import FrictionSolver
 from train.physics.magnet_response import traction_response
 from train.physics.magnets import Magnet
-from train.physics.tangential_layer import inner_tangential, surface_tangential_compliance, surface_tensor
 from train.physics.taxel_response import Skin
 from train.surfaces.depth_image import NOTHING_MM
 

@@ -9,20 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import MeshError, SurfaceError
-from train.families import faces, rounds, solids
-from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
-from train.physics.covers import BARE, Cover
+from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, log_uniform
+from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import over_surface, random_targets
 
-SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {
-    **{maker.__name__: maker for maker in (faces.flat, faces.block, faces.edge, faces.corner, faces.slot, faces.step)},
-    **{maker.__name__: maker for maker in (rounds.dome, rounds.cylinder, rounds.cone, rounds.ridge, rounds.wire)},
-    **{maker.__name__: maker for maker in (rounds.saddle, rounds.relief, rounds.grating, solids.solid)},
-}
 FIGURES: Final = ("paper", "glyph", "polygon")
 """Families of flat figures on a plate: the paper's 18, and random ones."""
 
@@ -140,7 +134,7 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
     slope = np.zeros(2)
     if rng.random() > _LEVEL:
         way = rng.uniform(0, 2 * np.pi)
-        slope = faces.SLOPE * rng.random() ** 2 * np.array([np.cos(way), np.sin(way)])
+        slope = SLOPE * rng.random() ** 2 * np.array([np.cos(way), np.sin(way)])
     if family == "two":
         slope = slope / 5
     return Lie(float(x_mm), float(y_mm), float(rng.uniform(0, 360)), float(slope[0]), float(slope[1]))

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
-from train.data.batches import Batch, network_input
-from train.data.posed_batches import PosedBatches
-from train.data.press_batches import PressBatches
+from train.data.press_batches import Batch, PosedBatches, PressBatches, network_input
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
@@ -31,9 +29,8 @@ from train.learning.training_loop import (
     train,
     wait_for_all,
 )
-from train.networks.blocks import PatternNet
+from train.networks.blocks import PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.networks.losses import RelativeError
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
 

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from edge.inference.familiarity import Check, pair_width, pose_tap_features, tap_features
 from edge.inference.small_network import SmallNetwork
 from edge.perception.pattern_check import LEAST_COUNTS
-from train.data.batches import COUNTS_PER_UNIT
-from train.data.posed_batches import stated_poses
-from train.data.press_batches import read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, read_presses, stated_poses
 from train.data.presses import PressSet
 from train.learning.contact_check import fit_classifier, limit_of, moved
 from train.physics.sensor_noise import Nuisances

@@ -29,7 +29,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.errors import TrainError
 from train.networks.blocks import PatternNet
 

@@ -20,17 +20,18 @@ from typing import Any, Final
 import torch
 from torch import Tensor, distributed, nn
 
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.networks.blocks import (
     MultiScaleResidual,
     PatternNet,
     Residual,
     initialise,
     normed_conv,
+    relative_error,
     to_pattern,
+    truth_size,
     upsample,
 )
-from train.networks.losses import relative_error, truth_size
 
 CHANNELS: Final = 64
 BLOCKS: Final = 6

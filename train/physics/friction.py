@@ -23,8 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from train.physics.contact import box_sides, boxes, period_cells
-from train.physics.elastic_layer import Layer
-from train.physics.tangential_layer import surface_tensor
+from train.physics.elastic_layer import Layer, surface_tensor
 
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import TrainError
-from train.physics.contact import ContactSolver
-from train.physics.covers import BARE, Cover
+from train.physics.contact import BARE, ContactSolver, Cover
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching

@@ -17,8 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from train.errors import SurfaceError
 from train.surfaces.meshes import load_mesh, mesh_file
-from train.surfaces.paper_figures import LETTERS, SHAPES, figure
-from train.surfaces.random_figures import glyph, polygon
+from train.surfaces.random_figures import LETTERS, SHAPES, figure, glyph, polygon
 
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0

@@ -19,7 +19,7 @@ from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
 from train.data.make_presses import make_presses
-from train.data.posed_batches import stated_poses
+from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads

@@ -14,8 +14,7 @@ from edge.perception.contact_options import ON_COUNTS
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses
-from train.experiments.sensor.contact_verdicts import share
-from train.experiments.sensor.pushed import PushedSensor
+from train.experiments.sensor.contact_verdicts import PushedSensor, share
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Row, bootstrap_interval
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
@@ -23,7 +24,7 @@ from train.data.world import World
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
-from train.networks.cost import macs, parameters_count
+from train.networks.symmetric import SymmetricConv2d
 from train.physics.gripped import FRAMES
 from train.physics.sensor_noise import Nuisances
 from train.report import Row, with_interval
@@ -160,3 +161,32 @@ def _quick(training: Training) -> Training:
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
+
+
+_TAXEL_AXES: Final = 3
+
+
+def parameters_count(net: nn.Module) -> int:
+    """Return the number of trainable parameters."""
+    return sum(parameter.numel() for parameter in net.parameters())
+
+
+def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
+    """Count multiply-accumulates of one window in convolutions and linear layers, without norms and interpolation."""
+    counted: list[int] = []
+
+    def count(layer: nn.Conv2d | nn.Linear | SymmetricConv2d, _: object, output: torch.Tensor) -> None:
+        # Every output value is the sum of as many products as one row of the weights has entries.
+        counted.append(output[0].numel() * layer.weight[0].numel())
+
+    summing = [layer for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear, SymmetricConv2d))]
+    hooks = [layer.register_forward_hook(count) for layer in summing]
+    like, training = next(net.parameters()), net.training
+    try:
+        with torch.inference_mode():
+            net.eval()(torch.zeros(1, _TAXEL_AXES * net.taps, rows, cols, device=like.device, dtype=like.dtype))
+    finally:
+        for hook in hooks:
+            hook.remove()
+        net.train(training)
+    return sum(counted)
