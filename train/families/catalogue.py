@@ -15,7 +15,7 @@ from train.physics.gripped import SAMPLES, GrippedPad
 from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
-from train.surfaces.poses import over_surface, random_targets
+from train.surfaces.poses import over_surface, random_poses
 
 FIGURES: Final = ("paper", "glyph", "polygon")
 """Families of flat figures on a plate: the paper's 18, and random ones."""
@@ -156,7 +156,7 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
         name = str(rng.choice(SURFACES))
     elif family in FIGURES:
         name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
-    newest = random_targets(rng, 1, [name]).poses[0]
+    newest = random_poses(rng, 1)[0]
 
     def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
         over = over_surface(newest, *pose.tolist())

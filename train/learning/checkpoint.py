@@ -183,23 +183,14 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
 
 def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations or None."""
-    outputs = infer_all(net, windows)
-    return outputs[0], outputs[1] if len(outputs) > 1 else None
-
-
-def infer_all(
-    net: PatternNet, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
-) -> list[NDArray[np.float32]]:
-    """Return all outputs of a network for windows (n, K, 3, rows, cols) in zeroed counts and the pads' inputs."""
     device = next(net.parameters()).device
-    parts = torch.split(network_input(windows), _INFERRED_AT_ONCE)
-    known = [()] * len(parts) if pads is None else [(pad,) for pad in torch.from_numpy(pads).split(_INFERRED_AT_ONCE)]
     rows: list[tuple[torch.Tensor, ...]] = []
     with torch.inference_mode():
-        for part, pad in zip(parts, known, strict=True):
-            given = net(part.to(device), *(one.to(device) for one in pad))
+        for part in torch.split(network_input(windows), _INFERRED_AT_ONCE):
+            given = net(part.to(device))
             rows.append(given if isinstance(given, tuple) else (given,))
-    return [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]
+    outputs = [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]
+    return outputs[0], outputs[1] if len(outputs) > 1 else None
 
 
 def best_contact_level(patterns: NDArray[np.float32], touching: NDArray[np.bool_]) -> float:

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
 from firmware_bridge.pad_geometry import AXES, USPA44
@@ -210,10 +211,10 @@ Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
     """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
-    plain = [_taught(mixture.model(), contacts) for contacts, _, _ in sensors]
+    plain = [learned(contacts, mixture.model(), 1) for contacts, _, _ in sensors]
     off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
     bias = _symmetric(np.mean(off, axis=0))
-    taught = [_taught(mixture.model(1.0, bias), contacts) for contacts, _, _ in sensors]
+    taught = [learned(contacts, mixture.model(1.0, bias), 1) for contacts, _, _ in sensors]
     gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
     constants = [
         ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
@@ -224,14 +225,6 @@ def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactMod
 
 def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
     return float(np.quantile(np.abs(np.concatenate(ratios)), 0.9)) / LEVEL_90
-
-
-def _taught(model: ContactModel, contacts: NDArray[np.floating]) -> GainLearner:
-    learner = GainLearner(model)
-    for contact in contacts:
-        learner.learn(contact)
-    learner.solve()
-    return learner
 
 
 def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = PASSES) -> GainLearner:
@@ -300,7 +293,7 @@ def _given_constants(
         _log_normal(contacts - design @ mean, covariance)
         for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
     ]
-    return _softmax(np.stack(found, axis=1) + np.log(mixture.share))
+    return softmax(np.stack(found, axis=1) + np.log(mixture.share), axis=1)
 
 
 def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -308,11 +301,6 @@ def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> N
     lower = np.linalg.cholesky(covariance)
     white = np.linalg.solve(lower, away.T)
     return -0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum()
-
-
-def _softmax(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    grown = np.exp(logs - logs.max(axis=1, keepdims=True))
-    return grown / grown.sum(axis=1, keepdims=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -2,14 +2,13 @@
 
 The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a tap
 whose pattern is reconstructed; the taps before it are made at the same place, each turned back by one more angle
-step. Targets are split by position, and every K has the same ones: 504 to train on, 72 to validate, 72 to test.
+step. Targets are split by position: one for the test and one for validation, 72 targets each, the same for every K.
 
 A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
 in [deg], as in `firmware_bridge.poses.pad_pose`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -17,11 +16,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
 from train.surfaces.depth_image import Pose
-from train.surfaces.named_surfaces import SURFACES
 
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
-POSITIONS: Final = 9
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 POSITION_STEP_MM: Final = 2.5
 TEST_POSITION: Final = 0
@@ -35,23 +32,7 @@ position to a pad turned by 90, 120 or 180 degrees. It has no visible effect, se
 SURFACE_REACH_MM: Final = 3.5
 """Largest distance of random poses from the surface's centre along x and along y, in [mm]."""
 
-Split = Literal["train", "validation", "test"]
-
-
-@dataclass(frozen=True, slots=True)
-class Targets:
-    """Taps whose patterns are reconstructed.
-
-    Attributes:
-        surfaces: n names.
-        poses: n poses.
-    """
-
-    surfaces: list[str]
-    poses: list[Pose]
-
-    def __len__(self) -> int:
-        return len(self.surfaces)
+Split = Literal["validation", "test"]
 
 
 def position_mm(index: int) -> tuple[float, float]:
@@ -59,27 +40,22 @@ def position_mm(index: int) -> tuple[float, float]:
     return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
 
 
-def positions_of(split: Split) -> tuple[int, ...]:
-    """Return the positions of a split: 0 to test, 1 to validate, the other seven to train on."""
-    held_out = {"test": TEST_POSITION, "validation": VALIDATION_POSITION}
-    if split in held_out:
-        return (held_out[split],)
-    return tuple(index for index in range(POSITIONS) if index not in held_out.values())
+def paper_taps_of(
+    split: Split, surfaces: Sequence[str], taps: int = MAX_TAPS, angle_step_deg: float = ANGLE_STEP_DEG
+) -> tuple[list[str], list[Pose]]:
+    """Return the names of a split's targets, each surface in four turns, and the poses of their taps, newest first."""
+    if not 1 <= taps <= MAX_TAPS:
+        raise ValueError(f"{taps} taps in a sequence: expected 1 to {MAX_TAPS}")
+    if not 0 <= angle_step_deg <= 180:
+        raise ValueError(f"angle step of {angle_step_deg} deg: expected 0 to 180")
+    place = position_mm(TEST_POSITION if split == "test" else VALIDATION_POSITION)
+    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    turns = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    return names, [Pose(*place, turn_deg) for _ in surfaces for turn_deg in turns]
 
 
-def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) -> Targets:
-    """Return every surface at the four target angles of each position; surfaces change slowest, angles fastest."""
-    taps = [
-        (name, Pose(*position_mm(position), angle_deg))
-        for name in surfaces
-        for position in positions
-        for angle_deg in TARGET_ANGLES_DEG
-    ]
-    return Targets([name for name, _ in taps], [pose for _, pose in taps])
-
-
-def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES) -> Targets:
-    """Draw places and angles away from the held-out positions, with surfaces in turn."""
+def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
+    """Draw places and angles away from the held-out positions."""
     held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
     poses: list[Pose] = []
     while len(poses) < count:
@@ -87,23 +63,7 @@ def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str]
         angle_deg = rng.uniform(0, 360)
         if np.hypot(*(held_out_mm - (x_mm, y_mm)).T).min() > HELD_OUT_RADIUS_MM:
             poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
-    return Targets([surfaces[i % len(surfaces)] for i in range(count)], poses)
-
-
-def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_DEG) -> NDArray[np.float64]:
-    """Return poses (n, taps, 3) of the taps that end in each target, newest first: x, y in [mm], angle in [deg].
-
-    Raises:
-        ValueError: taps or angle_step_deg out of bounds.
-    """
-    if not 1 <= taps <= MAX_TAPS:
-        raise ValueError(f"{taps} taps in a sequence: expected 1 to {MAX_TAPS}")
-    if not 0 <= angle_step_deg <= 180:
-        raise ValueError(f"angle step of {angle_step_deg} deg: expected 0 to 180")
-    newest = np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in targets.poses]).reshape(-1, 1, 3)
-    back = np.zeros((1, taps, 3))
-    back[..., 2] = angle_step_deg * np.arange(taps)[None]
-    return newest - back
+    return poses
 
 
 def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pose:
@@ -115,11 +75,6 @@ def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pos
     cosine, sine = float(np.cos(angle)), float(np.sin(angle))
     right_mm, up_mm = cosine * x_mm + sine * y_mm, sine * x_mm - cosine * y_mm
     return Pose(newest.x_mm + right_mm, newest.y_mm + up_mm, newest.angle_deg - turn_deg)
-
-
-def as_poses(array: NDArray[np.floating]) -> list[Pose]:
-    """Return the poses of an array (..., 3), in order."""
-    return [Pose(*(float(value) for value in row)) for row in array.reshape(-1, 3)]
 
 
 HALF_PITCH_MM: Final = USPA44.pitch_mm / 2

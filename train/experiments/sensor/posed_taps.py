@@ -50,7 +50,7 @@ _WINDOW: Final = 4
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses and write the report `posed-taps`."""
-    models = {name: ModelSession(bench.use(bench.models / f"{name}.onnx")) for name, _ in _WAYS}
+    models = {name: bench.model(name) for name, _ in _WAYS}
     model = models[MODEL]
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)

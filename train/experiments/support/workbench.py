@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.bundled import BUNDLE_DIR
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
 from train.data.generation_config import SEED, one_thread
@@ -73,6 +74,10 @@ class Workbench:
             )
         self.data_folder.mkdir(parents=True, exist_ok=True)
         return make_presses(world, self.data_folder / f"{name}.npz")
+
+    def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
+        """Return a shipped model, in the session of the runtime."""
+        return ModelSession(self.use(self.models / f"{name}.onnx"))
 
     def wide_test(self) -> FrozenPresses:
         """The wide frozen set."""
