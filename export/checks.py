@@ -28,7 +28,6 @@ def give_checks(source: Path, path: Path) -> None:
 
     Raises:
         ExportError: the source has no checks, or the models differ in what the checks depend on.
-        ModelError: one of the files is no model.
     """
     theirs = contract_in(onnx.load(source))
     model = onnx.load(path)

@@ -30,10 +30,10 @@ from export.graphs.parity import check_parity, extreme_windows
 from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
-from train.data.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
 from train.data.paper_taps import paper_taps
+from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import load_network
@@ -43,8 +43,7 @@ from train.learning.trust_limits import TrustFit, load_trust
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
-from train.surfaces.poses import ANGLE_STEP_DEG
-from train.surfaces.tap_schedules import REACH_MM
+from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1
@@ -130,12 +129,6 @@ def export(
         trust: forward model and checks for the contract; None for none.
         intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
         one_tap: name of the model in `folder` by which one that takes poses infers single taps; None for its own.
-
-    Raises:
-        CheckpointError: the checkpoint cannot be used.
-        ParityError: the graph does not compute what the network computes; nothing is written.
-        ModelError: the graph does not match its contract; nothing is written.
-        ExportError: no node of the graph can be quantised, or the batch is not positive.
     """
     net, report = load_network(checkpoint)
     write_out(net)

@@ -117,7 +117,6 @@ def verify(
     Raises:
         ModelError: no model, or an invalid contract.
         ExportError: its network is not available.
-        CheckpointError: its checkpoint cannot be used.
     """
     model = _load(path)
     try:
@@ -149,9 +148,6 @@ def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
     """Return windows (n, 3K, rows, cols) of real recordings, in network units: no truth is known of them.
 
     They are scans under load, with others of their trial as the taps before.
-
-    Raises:
-        DatasetError: no such folder or no recordings in it, or one cannot be read.
     """
     windows = []
     for scans in recorded_sets(folder):

@@ -2,4 +2,4 @@
 
 from firmware_bridge.extras import need
 
-need("train", "torch", "scipy", "trimesh", "shapely", "joblib", "magpylib")
+need("train", "torch", "scipy", "trimesh", "shapely", "joblib")

@@ -25,11 +25,10 @@ from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
-from train.physics.slides import FIGURE_MM, Slide, scaled, slide
 from train.surfaces.depth_image import Pose
-from train.surfaces.paper_figures import figure
-from train.surfaces.poses import ANGLE_STEP_DEG, TEST_POSITION, over_surface, position_mm
-from train.surfaces.tap_schedules import HALF_PITCH_MM
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM
+from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, TEST_POSITION, over_surface, position_mm
+from train.surfaces.random_figures import figure
 
 SURFACE: Final = "glyph:1"
 """A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""
@@ -64,7 +63,17 @@ LETTER_Y_MM: Final = 60.0
 """Place of the long letter in the object's plane, so that it does not lie under the taps."""
 LETTER_PX_PER_MM: Final = 4.0
 STILL_FRAMES: Final = 30
+SPEED_MM_S: Final = 20.0
+FIGURE_MM: Final = 50.0
+"""Longest side of the long letter."""
+HALF_LENGTH_MM: Final = 30.0
 _SLIDE_SEED: Final = 500
+_RASTER_MM: Final = 0.05
+_DRAG_MM: Final = 0.3
+"""Movement of the object against the pad's face that friction carries while it slides, in [mm]."""
+_FRICTION: Final = (0.2, 0.8)
+_INDENTATION_MM: Final = (0.15, 0.4)
+_AT_ONCE: Final = 50
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
 """The zero is a second old: no drift yet, and the pad has not moved in the earth's field."""
 
@@ -89,9 +98,9 @@ def demo_recording() -> dict[str, NDArray]:
     still = np.rint(rng.normal(0, Nuisances().noise_counts, (REST_FRAMES, *USPA44.scan_shape)))
     rest = draw_rest(rng, USPA44).round()
     magnet += rng.normal(0, Nuisances().noise_counts, magnet.shape)
-    slid, letter = _slide()
+    slid, way, letter = _slide(pad)
     after = np.rint(rng.normal(0, Nuisances().noise_counts, (STILL_FRAMES, *USPA44.scan_shape)))
-    parts = [still, *pressed, later[0], later[1], magnet.round(), slid.counts, after]
+    parts = [still, *pressed, later[0], later[1], magnet.round(), slid, after]
     counts = rest + np.concatenate(parts)
     scenes = [-1] * (1 + TAPS) + [FOREIGN_SCENE] * 2 + [MAGNET_SCENE, SLIDE_SCENE, -1]
     lengths = [len(part) for part in parts]
@@ -120,7 +129,7 @@ def demo_recording() -> dict[str, NDArray]:
         "angles_deg": np.array(angles_deg),
         "tap_pose": np.array(tapped[:TAPS]),
         "scene": scene,
-        **_poses(tapped, slid, begins),
+        **_poses(tapped, way, begins),
         **_options(pad, rest),
         "letter": letter,
         "letter_px_per_mm": np.array(LETTER_PX_PER_MM),
@@ -133,10 +142,12 @@ def _stated(x_mm: float, y_mm: float, turn_deg: float) -> tuple[float, ...]:
     return x_mm, y_mm, turn_deg, PLACE_ERROR_MM, TURN_ERROR_DEG
 
 
-def _poses(tapped: Sequence[tuple[float, ...]], slid: Slide, begins: NDArray[np.int64]) -> dict[str, NDArray]:
+def _poses(
+    tapped: Sequence[tuple[float, ...]], slid: NDArray[np.float64], begins: NDArray[np.int64]
+) -> dict[str, NDArray]:
     """Return the arrays of a recording that hold its poses: one before each tap, and one in each frame of the slide."""
     before = begins[1 : 1 + len(tapped)] - GAP_FRAMES // 2
-    way = [_stated(pose.x_mm, pose.y_mm + LETTER_Y_MM, pose.turn_deg) for pose in slid.poses]
+    way = [_stated(x_mm, y_mm + LETTER_Y_MM, turn_deg) for x_mm, y_mm, turn_deg in slid.tolist()]
     start, end = begins[-3], begins[-2]
     frame = np.concatenate([before, np.arange(start, end), [end]])
     holds = np.concatenate([np.ones(len(before), bool), np.zeros(len(way), bool), [True]])
@@ -165,17 +176,63 @@ def _options(pad: GrippedPad, rest: NDArray[np.float32]) -> dict[str, NDArray]:
     }
 
 
-def _slide() -> tuple[Slide, NDArray[np.bool_]]:
-    """Return a slide along a long letter that lies on its side, and the letter's pixels in the object's plane."""
+def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_]]:
+    """Slide along a long letter that lies on its side: counts, stated poses, and the letter's pixels in its plane.
+
+    The robot's error of pose is drawn once: that of a mounting by hand does not average out.
+    """
     lying = affinity.rotate(figure(LETTER), 90, origin=(0, 0))
     left, low, right, high = lying.bounds
     flat = LETTER_WIDTH_MM / FIGURE_MM * (right - left) / (high - low)
-    outline: BaseGeometry = scaled(affinity.scale(lying, 1, flat, origin=(0, 0)))
+    outline = affinity.scale(affinity.scale(lying, 1, flat, origin=(0, 0)), 1, -1, origin=(0, 0))
+    left, low, right, high = outline.bounds
+    x_mm, y_mm, factor = (left + right) / 2, (low + high) / 2, FIGURE_MM / max(right - left, high - low)
+    outline = affinity.translate(affinity.scale(outline, factor, factor, origin=(x_mm, y_mm)), -x_mm, -y_mm)
+
+    rng = np.random.default_rng([_SLIDE_SEED, 18])
+    length = round(2 * HALF_LENGTH_MM / SPEED_MM_S * RATE_HZ)
+    friction, turn_deg = rng.uniform(*_FRICTION), float(rng.uniform(-10, 10))
+    place = np.stack([np.linspace(-HALF_LENGTH_MM, HALF_LENGTH_MM, length)] + [np.zeros(length)] * 2, axis=1)
+    place[:, 2] = turn_deg
+    wave = np.sin(2 * np.pi * (np.arange(length) / length * rng.uniform(1, 3) + rng.random()))
+    deep_mm = np.mean(_INDENTATION_MM) + wave * np.ptp(_INDENTATION_MM) / 2
+    clean = _pressed(pad, outline, place, deep_mm, friction)
+    off_mm, off_deg = rng.normal(0, PLACE_ERROR_MM, 2), rng.normal(0, TURN_ERROR_DEG)
+    read = apply_nuisances(clean[None, None], _SENSOR, SEED, tap_s=length / RATE_HZ, angle_deg=-turn_deg)[0, 0]
+
     count = round((FIGURE_MM + USPA44.width_mm) * LETTER_PX_PER_MM)
     middle = (np.arange(count) - (count - 1) / 2) / LETTER_PX_PER_MM
-    x_mm, y_mm = np.meshgrid(middle, middle)
-    pixels = shapely.contains_xy(outline, x_mm, y_mm)
-    return slide(outline, _SLIDE_SEED, spread=0.0, lanes_mm=(0.0,), nuisances=_SENSOR, sensor=SEED), pixels
+    return read, place + np.array([*off_mm, off_deg]), shapely.contains_xy(outline, *np.meshgrid(middle, middle))
+
+
+def _pressed(
+    pad: GrippedPad, outline: BaseGeometry, place: NDArray[np.float64], deep_mm: NDArray[np.float64], friction: float
+) -> NDArray[np.float32]:
+    """Return the counts (n, 3, rows, cols) of a pad at places (n, 3) over a raised figure, dragged to the left."""
+    half = HALF_LENGTH_MM + USPA44.width_mm
+    centres = np.arange(-half, half, _RASTER_MM) + _RASTER_MM / 2
+    shapely.prepare(outline)
+    inside = np.stack([shapely.contains_xy(outline, centres, np.full(len(centres), y)) for y in centres])
+    heights_mm = np.where(inside, 0, -FIGURE_HEIGHT_MM).astype(np.float32)
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+
+    def under(x: float, y: float, turn_deg: float) -> NDArray[np.float32]:
+        turn = np.radians(turn_deg)
+        right = x + np.cos(turn) * x_mm - np.sin(turn) * y_mm
+        down = y + np.sin(turn) * x_mm + np.cos(turn) * y_mm
+        col, row = (np.clip(((at + half) / _RASTER_MM).astype(int), 0, len(centres) - 1) for at in (right, down))
+        return heights_mm[row, col]
+
+    counts = np.zeros((len(place), *USPA44.scan_shape), dtype=np.float32)
+    for start in range(0, len(place), _AT_ONCE):
+        heights = np.stack([under(*one) for one in place[start : start + _AT_ONCE]])
+        meets = np.flatnonzero((heights > -FIGURE_HEIGHT_MM / 2).any(axis=(1, 2)))
+        if len(meets):
+            turn = np.radians(place[start + meets, 2])
+            drag = -_DRAG_MM * np.stack([np.cos(turn), -np.sin(turn)], axis=1)  # in the pad's axes
+            still, even = np.zeros(len(meets)), np.full(len(meets), friction)
+            counts[start + meets] = pad.press(heights[meets], deep_mm[start + meets], drag, still, even).counts
+    return counts
 
 
 def _unit_patterns(taps: Taps) -> NDArray[np.float16]:

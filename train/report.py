@@ -108,6 +108,12 @@ def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digit
     return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
 
 
+def signed_interval(values: NDArray[np.floating], taps: NDArray[np.integer]) -> str:
+    """Format the mean of (n,) differences with its sign and interval: +1.92 (+1.50..+2.31)."""
+    low, high = bootstrap_interval(values, taps)
+    return f"{float(np.mean(values)):+.2f} ({low:+.2f}..{high:+.2f})"
+
+
 def _columns(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(column for row in rows for column in row))
 

@@ -17,8 +17,8 @@ from firmware_bridge.in_place import write_in_place
 from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
-from train.learning.forward_operator import fit_forward_model
 from train.learning.tap_checks import fit_posed_tap_network, fit_tap_network
+from train.learning.trust_limits import fit_forward_model
 
 NAME: Final = "trust.json"
 """File in the folder of the checkpoints."""

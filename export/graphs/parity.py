@@ -77,12 +77,7 @@ class Difference:
 
 
 class GraphRun:
-    """Graph in onnxruntime at one optimisation level, for comparison without a contract and bound arrays.
-
-    Args:
-        model: the graph.
-        level: a name in LEVELS.
-    """
+    """Graph in onnxruntime at one optimisation level, for comparison without a contract and bound arrays."""
 
     def __init__(self, model: onnx.ModelProto, level: str = "all") -> None:
         options = onnxruntime.SessionOptions()
@@ -209,12 +204,6 @@ def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:
 
 def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
     """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
-
-    Args:
-        net: in evaluation mode.
-        model: its graph.
-        frozen: readings.
-        contract: of the graph.
 
     Raises:
         ParityError: it is larger than TOLERANCE or EXTREME_TOLERANCE, or a value is not finite.

@@ -29,11 +29,7 @@ ONE_TAP: Final = "one_tap"
 
 
 def contract_in(model: onnx.ModelProto) -> Contract:
-    """Return the contract of a graph.
-
-    Raises:
-        ModelError: a key is missing, unreadable or out of range; the error names it.
-    """
+    """Return the contract of a graph."""
     return Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
 
 

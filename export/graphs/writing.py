@@ -70,18 +70,7 @@ class Writer:
     def write(
         self, name: str, model: onnx.ModelProto, single: onnx.ModelProto, contract: Contract, facts: Sequence[str]
     ) -> str:
-        """Write NAME.onnx, and return the line that describes it.
-
-        Args:
-            name: of the model.
-            model: its graph.
-            single: the same graph for a batch of one or of any number.
-            contract: with empty error and confidence, which are filled in.
-            facts: further parts of the line.
-
-        Raises:
-            ExportError: the model of one tap is missing, or its patterns mean something else.
-        """
+        """Write NAME.onnx, and return the line that describes it."""
         stated = {**self.report, "training_sha256": contract.training_sha256}
         if self.one_tap is not None and contract.takes_poses:
             one = self.model_of_one_tap(contract.arithmetic)

@@ -29,7 +29,7 @@ from export.errors import ExportError
 from export.graphs.joined import branches
 from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
 from firmware_bridge.pad_geometry import AXES
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.data.presses import PressSet
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
@@ -51,7 +51,6 @@ def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
     """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
     Raises:
-        DatasetError: the sequences have fewer taps than the network takes.
         ExportError: there are too few sequences for meaningful ranges.
     """
     if len(taps) < _FEWEST:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from edge_samples import ROOT
 
-from train.experiments.__main__ import EXPERIMENTS, main, module_of
+from train.experiments.__main__ import EXPERIMENTS, function_of, main
 from train.experiments.support import workbench
 from train.experiments.support.workbench import Workbench
 
@@ -75,16 +75,14 @@ def test_networks_and_data_are_made_once(folder, capsys):
 
 
 def test_every_experiment_is_a_file_that_can_be_run():
-    import importlib
-
     for name in EXPERIMENTS:
-        assert callable(importlib.import_module(module_of(name)).run), name
+        assert callable(function_of(name)), name
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_its_own_steps_are_followed_by_a_bar(name):
     """A bar of a single page would never move; that of its training is another."""
-    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"{module_of(name).replace('.', '/')}.py")
+    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"{function_of(name).__module__.replace('.', '/')}.py")
     assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
 
 

@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,12 +8,23 @@ from experiment_samples import quick_bench
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from train.data.paper_taps import between_frames
 from train.experiments.paper import force_recovery
-from train.experiments.paper.course import CLAIM_N, RANGE_N, Course, Scans, contact, errors, loop_percent, pressed
-from train.experiments.paper.force_recovery import Gauge, training_presses
-from train.experiments.paper.trainings import mixed
+from train.experiments.paper.force_recovery import (
+    CLAIM_N,
+    RANGE_N,
+    Course,
+    Gauge,
+    Scans,
+    contact,
+    errors,
+    loop_percent,
+    pressed,
+    training_presses,
+)
+from train.experiments.paper.protocol import mixed
 from train.physics.sensor_noise import Nuisances
 
 COURSE = Course(20.0)
+GAINS = replace(Nuisances.none(), gain_spread=0.075)
 RAMP_N = 5.0 * COURSE.share
 
 
@@ -47,7 +59,6 @@ def test_the_report_has_every_gauge_under_both_conditions(bench, tmp_path):
             assert row["false contact, % of scans"].startswith("0.00")
     assert page.with_name("force-recovery-surfaces.csv").exists()
     assert page.with_suffix(".png").stat().st_size > 10_000
-    assert "**drifted**: least error has" in page.read_text()
 
 
 def test_a_course_presses_holds_releases_and_rests():
@@ -77,7 +88,7 @@ def test_without_nuisances_a_press_and_its_release_read_alike(sequences):
 
 def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind(sequences):
     free = z_of(pressed(sequences, 0, COURSE, Nuisances.none()))
-    lagging = z_of(pressed(sequences, 0, COURSE, Nuisances.only("hysteresis")))
+    lagging = z_of(pressed(sequences, 0, COURSE, replace(Nuisances.none(), hysteresis=0.11)))
     press, hold, release, rest = (COURSE.phase(number) for number in range(4))
     assert (lagging[press][5:] < free[press][5:]).all()
     assert np.corrcoef(lagging[hold][:40], np.arange(40))[0, 1] > 0.9  # it creeps up
@@ -91,13 +102,13 @@ def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind
 
 def test_one_sensor_reads_the_course_and_the_earlier_taps(sequences):
     clean = pressed(sequences, 0, COURSE, Nuisances.none()).windows[100]
-    read = pressed(sequences, 0, COURSE, Nuisances.only("gain_spread")).windows[100]
+    read = pressed(sequences, 0, COURSE, GAINS).windows[100]
     clear = np.abs(clean).min(axis=0) > 200
     gain = np.where(clear, read / np.where(clear, clean, 1), 1)
     assert clear.sum() > 10
     np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
     assert np.ptp(gain[0][clear]) > 0.05
-    other = pressed(sequences, 1, COURSE, Nuisances.only("gain_spread")).windows[100]
+    other = pressed(sequences, 1, COURSE, GAINS).windows[100]
     other_clean = pressed(sequences, 1, COURSE, Nuisances.none()).windows[100]
     both = clear & (np.abs(other_clean).min(axis=0) > 200)
     assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)

@@ -38,7 +38,7 @@ def rows_of(path):
 
 
 def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(bench, few):
-    model = shipped.load_shipped(bench.models)
+    model = bench.model()
     found = {known: shipped.infer_presses(model, few, known).patterns for known in (shipped.NOTHING, shipped.ALL)}
     known = [few.pad(index, gains=True) for index in range(5)]
     scaled = [model.contract.scale_window(window) for window in few.windows(1, gains_known=True)]
@@ -47,9 +47,9 @@ def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(b
     assert not np.allclose(found[shipped.NOTHING], found[shipped.ALL])
 
 
-def test_a_model_that_is_not_there_is_named(tmp_path):
+def test_a_model_that_is_not_there_is_named(bench, tmp_path):
     with pytest.raises(ModelError, match=r"stsr-int8\.onnx"):
-        shipped.load_shipped(tmp_path)
+        replace(bench, models=tmp_path, used=set()).model()
 
 
 def test_the_nearest_press_is_the_one_that_was_read_in_network_units():

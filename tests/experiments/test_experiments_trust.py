@@ -12,7 +12,7 @@ from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
 from train.experiments.sensor import contact_verdicts, trust_checks, wrong_taps
-from train.experiments.sensor.pushed import PushedSensor
+from train.experiments.sensor.contact_verdicts import PushedSensor
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS, steel_field
 from train.families.catalogue import SHARES
 

@@ -20,7 +20,7 @@ from export.to_onnx import export
 from export.verify import verify
 from train.networks.fusion import OneOrMoreNet
 from train.physics.pad_draws import KNOWN
-from train.surfaces.tap_schedules import REACH_MM
+from train.surfaces.poses import REACH_MM
 
 
 @pytest.fixture(scope="module")

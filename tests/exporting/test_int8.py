@@ -13,7 +13,7 @@ from export.errors import ExportError
 from export.graphs.joined import branches
 from export.quantisation.int8 import calibration_batch, convolutions, quantised, rounded_ranges
 from export.quantisation.integer_nodes import integer_nodes, newest_values
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 
 
 @pytest.fixture(scope="module")

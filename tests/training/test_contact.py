@@ -139,8 +139,10 @@ def scenes():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_box_gives_what_the_whole_pad_gives(dtype):
     depth = scenes()
-    boxed = ContactSolver(Layer(), SIZE, CELL_MM, dtype).solve(depth, 0.3)
-    whole = ContactSolver(Layer(), SIZE, CELL_MM, dtype, boxed=False).solve(depth, 0.3)
+    # Cells that are just within reach and touch nothing make the box the whole pad.
+    corners = depth.copy()
+    corners[:, [0, -1], [0, -1]] = np.minimum(corners[:, [0, -1], [0, -1]], 0.44)
+    boxed, whole = (ContactSolver(Layer(), SIZE, CELL_MM, dtype).solve(one, 0.3) for one in (depth, corners))
     peak = whole.pressure_mpa.max(axis=(1, 2), keepdims=True)
     assert (np.abs(boxed.pressure_mpa - whole.pressure_mpa) / peak).max() < 1e-3
     assert np.abs(boxed.force_n / whole.force_n - 1).max() < 1e-4
@@ -161,28 +163,6 @@ def test_each_pose_may_have_its_own_indentation():
         assert np.allclose(solver.solve(depth[:1], press, tolerance=1e-7).pressure_mpa[0], together[i], atol=1e-6)
 
 
-def test_the_start_changes_the_steps_but_not_the_end():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    depth = scenes()
-    cold = solver.solve(depth, 0.2, tolerance=1e-6)
-    peak = cold.pressure_mpa.max(axis=(1, 2), keepdims=True)
-    deeper, nothing = solver.solve(depth, 0.4).pressure_mpa, np.zeros_like(depth)
-    point = nothing.copy()
-    point[:, 0, 0] = 5.0
-    for start in (deeper, nothing, point, np.full_like(depth, 0.1)):
-        warm = solver.solve(depth, 0.2, tolerance=1e-6, start_mpa=start)
-        assert (np.abs(warm.pressure_mpa - cold.pressure_mpa) / peak).max() < 1e-4
-    assert solver.solve(depth, 0.2, 1e-5, cold.pressure_mpa).steps == 0
-
-
-def test_a_start_that_knows_one_of_two_feet_is_not_the_end():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    one, two = punch(1.5, centre_mm=(-7.0, 0.0)), punch(1.5, centre_mm=(7.0, 0.0))
-    alone = solver.solve(one, 0.2, tolerance=1e-6).pressure_mpa
-    both = solver.solve(np.minimum(one, two), 0.2, start_mpa=alone).pressure_mpa
-    assert both[0, :, SIZE // 2 :].sum() == pytest.approx(both[0, :, : SIZE // 2].sum(), rel=1e-2)
-
-
 def test_the_pad_bulges_against_what_it_has_not_been_pressed_into():
     floor_mm, press_mm = 0.24, 0.2
     depth = punch(7.0) + np.where(punch(4.5) == 0, floor_mm, 0).astype(np.float32)
@@ -200,14 +180,7 @@ def test_the_work_done_is_the_energy_stored():
     assert np.trapezoid(result.force_n, press_mm) == pytest.approx(energy[-1] - energy[0], rel=1e-3)
 
 
-def test_force_grows_with_depth():
-    press_mm = np.linspace(0.05, 0.5, 40)
-    for shape in (sphere(5.0, CELL_MM, SIZE), sphere(100.0, CELL_MM, SIZE)):
-        force = ContactSolver(Layer(), SIZE, CELL_MM).solve(np.repeat(shape, 40, axis=0), press_mm).force_n
-        assert (np.diff(force) > 0).all()
-
-
-@pytest.mark.parametrize("thickness_mm", [1e-3, 1e3])
+@pytest.mark.parametrize("thickness_mm", [1e-3, 300.0])
 def test_extreme_layers_stay_finite(thickness_mm):
     # Every third cell: the response of so thick a layer takes a grid as wide, which is worked out cell by cell.
     depth = np.ascontiguousarray(scenes()[:, ::3, ::3])

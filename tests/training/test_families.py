@@ -5,14 +5,13 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, SurfaceError
-from train.families import catalogue, solids
-from train.families.catalogue import FIGURES, SHAPES, SHARES, draw_shape
-from train.families.faces import SLOPE, flat
-from train.families.shape import NOWHERE_MM, Lie, log_uniform
-from train.physics.covers import BARE
+from train.families import catalogue, shape
+from train.families.catalogue import FIGURES, SHARES, draw_shape
+from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, flat, log_uniform
+from train.physics.contact import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.physics.pad_draws import NOMINAL
-from train.surfaces.tap_schedules import turns
+from train.surfaces.poses import turns
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +54,7 @@ def test_every_family_gives_finite_heights_that_reach_the_pad(pad, family):
     assert any(not np.array_equal(again.heights_mm, draw(pad, family, seed, taps=2).heights_mm) for seed in range(1, 9))
 
 
-@pytest.mark.parametrize("solid", solids._SOLIDS)
+@pytest.mark.parametrize("solid", shape._SOLIDS)
 def test_every_solid_is_a_shape_of_its_own(pad, solid):
     x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
     one, other = (solid(np.random.default_rng(seed))(x_mm, y_mm) for seed in (0, 1))

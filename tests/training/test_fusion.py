@@ -5,7 +5,7 @@ import pytest
 import torch
 from press_samples import make_press_set
 
-from train.data.posed_batches import PosedBatches, stated_poses
+from train.data.press_batches import PosedBatches, stated_poses
 from train.errors import DatasetError
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe

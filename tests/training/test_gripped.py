@@ -7,7 +7,7 @@ import pytest
 
 from firmware_bridge.pad_geometry import USPA44
 from train.families.shape import NOWHERE_MM
-from train.physics.covers import BARE, Cover
+from train.physics.contact import BARE, Cover
 from train.physics.elastic_layer import surface_compliance
 from train.physics.gripped import (
     FINE_SCALE,
@@ -22,7 +22,7 @@ from train.physics.gripped import (
 )
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample, resample_touching
-from train.surfaces.depth_image import Pose, Relief, footprints
+from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.named_surfaces import surface_mesh
 
 PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
@@ -37,7 +37,7 @@ def figure(pad, name="C", pose=None):
     """Heights of a figure under the pad, (1, m, m) in [mm]."""
     pose = Pose(0.5, -0.5, 20.0) if pose is None else pose
     relief = Relief(name, surface_mesh(name))
-    return -footprints([relief], [pose], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm
+    return -depth_image(relief, pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)[None]
 
 
 def face(pad, slope=0.0):

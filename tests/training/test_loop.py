@@ -10,7 +10,7 @@ import pytest
 import torch
 from edge_samples import ROOT
 
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.learning import training_loop as loop
 from train.learning.training_loop import (
     DivergedError,
@@ -20,8 +20,7 @@ from train.learning.training_loop import (
     learning_rate_share,
     train,
 )
-from train.networks.blocks import PatternNet
-from train.networks.losses import RelativeError
+from train.networks.blocks import PatternNet, RelativeError
 
 RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
 
@@ -182,7 +181,7 @@ sys.path[:0] = ["tests/training", "tests/support"]
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
 from train.learning.training_loop import leave_group, rank_and_world, train
-from train.networks.losses import RelativeError
+from train.networks.blocks import RelativeError
 net, used = new_net(), []
 def recorded(number):
     used.append(number)

@@ -5,7 +5,7 @@ from magpylib.func import cylinder_field, dipole_field
 from scipy.spatial.transform import Rotation
 
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
-from train.physics.magnets import FIELDS, Magnet, MagnetArray, cylinder_mt, dipole_mt
+from train.physics.magnets import Magnet, MagnetArray, dipole_mt
 
 MAGNET = Magnet()
 ONE = SensorGeometry("one", rows=1, cols=1, pitch_mm=4.7, width_mm=4.7, height_mm=4.7)
@@ -38,60 +38,35 @@ def test_the_dipole_is_magpylibs():
     assert np.allclose(np.stack(dipole_mt(MAGNET, tuple(away_mm.T), tuple(axis.T)), axis=1), expected_mt, rtol=1e-6)
 
 
-def test_the_cylinder_is_magpylibs_at_any_tilt_and_on_its_axis():
-    rng = np.random.default_rng(1)
-    away_mm, turn = around(rng, 200), rolls(rng, 200)
-    axis = turn.apply([0.0, 0.0, 1.0])
-    away_mm[:20] = axis[:20] * rng.uniform(0.3, 5.0, (20, 1))
-    expected_mt = 1e3 * cylinder_field("B", away_mm * 1e-3, (1e-3, 0.5e-3), (0, 0, 1.2), orientations=turn)
-    assert np.allclose(np.stack(cylinder_mt(MAGNET, tuple(away_mm.T), tuple(axis.T)), axis=1), expected_mt, atol=1e-6)
-
-
-def test_the_cylinders_axis_field_in_closed_form():
-    z = np.array([0.5, 2.0, 6.0])
-    near, far = z - 0.25, z + 0.25
-    expected_mt = 1200 / 2 * (far / np.hypot(far, 0.5) - near / np.hypot(near, 0.5))
-    zero, one = np.zeros(3), np.ones(3)
-    assert cylinder_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2] == pytest.approx(expected_mt, rel=1e-9)
-
-
 def test_the_dipoles_error_falls_with_the_square_of_the_distance():
     z, zero, one = np.array([4.0, 8.0]), np.zeros(2), np.ones(2)
-    exact = cylinder_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2]
+    places = np.column_stack([zero, zero, z]) * 1e-3
+    exact = 1e3 * cylinder_field("B", places, (1e-3, 0.5e-3), (0, 0, 1.2))[:, 2]
     error = dipole_mt(MAGNET, (zero, zero, z), (zero, zero, one))[2] / exact - 1
     assert error[0] / error[1] == pytest.approx(4.0, rel=0.05)
     assert 0 < error[0] < 0.03
 
 
-@pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_no_movement_changes_exactly_nothing(field, dtype):
-    change = MagnetArray(USPA44, MAGNET, field).change_mt(np.zeros((3, 5, 16, 5), dtype=dtype))
+def test_no_movement_changes_exactly_nothing(dtype):
+    change = MagnetArray(USPA44, MAGNET).change_mt(np.zeros((3, 5, 16, 5), dtype=dtype))
     assert change.shape == (3, 5, 16, 3)
     assert change.dtype == dtype
     assert not change.any()
 
 
-@pytest.mark.parametrize("field", FIELDS)
-def test_the_whole_array_is_magpylibs_sum_over_all_magnets(field):
+def test_the_whole_array_is_magpylibs_sum_over_all_magnets():
     rng = np.random.default_rng(2)
     movement = rng.normal(size=(16, 5)) * [0.1, 0.1, 0.15, 0.3, 0.3]
     source = magpylib.Collection()
     for (x_mm, y_mm), (right, back, down, lean_x, lean_y) in zip(USPA44.taxel_centres_mm(), movement, strict=True):
         place = np.array([x_mm + right, y_mm + back, 2.5 - down]) * 1e-3
         upright, _ = Rotation.align_vectors([[lean_x, lean_y, 1.0]], [[0.0, 0.0, 1.0]])
-        if field == "cylinder":
-            source.add(
-                magpylib.magnet.Cylinder(
-                    place, upright, dimension=(1e-3, 0.5e-3), polarization=(0, 0, MAGNET.remanence_t)
-                )
-            )
-        else:
-            moment = MAGNET.remanence_t * np.pi / 4 * 1e-3**2 * 0.5e-3 / magpylib.mu_0
-            source.add(magpylib.misc.Dipole(place, upright, moment=(0, 0, moment)))
+        moment = MAGNET.remanence_t * np.pi / 4 * 1e-3**2 * 0.5e-3 / magpylib.mu_0
+        source.add(magpylib.misc.Dipole(place, upright, moment=(0, 0, moment)))
     chips = np.column_stack([USPA44.taxel_centres_mm(), np.full(16, 0.5)]) * 1e-3
     expected_mt = 1e3 * source.getB(chips)
-    assert np.allclose(MagnetArray(USPA44, MAGNET, field).flux_mt(movement), expected_mt, atol=1e-5)
+    assert np.allclose(MagnetArray(USPA44, MAGNET).flux_mt(movement), expected_mt, atol=1e-5)
 
 
 def test_one_magnet_moves_its_chip_as_the_series_of_a_dipole_says():
@@ -144,11 +119,8 @@ def test_what_cannot_be_is_refused():
         Magnet(chip_height_mm=2.3)
     with pytest.raises(ValueError, match="must be positive"):
         Magnet(diameter_mm=0.0)
-    with pytest.raises(ValueError, match="no field 'exact', expected one of dipole, cylinder"):
-        MagnetArray(USPA44, MAGNET, "exact")
     array = MagnetArray(USPA44, MAGNET)
     assert np.isfinite(array.change_mt(moved(3, DOWN, 0.99))).all()
-    assert np.isfinite(MagnetArray(USPA44, MAGNET, "cylinder").change_mt(moved(3, DOWN, 1.74))).all()
     for near in (1.01, 1.74):
         with pytest.raises(ValueError, match=r"comes within .* mm of its chip, .* expected 0\.75 mm or more"):
             array.change_mt(moved(3, DOWN, near))

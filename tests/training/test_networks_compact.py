@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from train.data.batches import Batch
+from train.data.press_batches import Batch
+from train.networks.blocks import relative_rms_error
 from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
-from train.networks.losses import relative_rms_error
 
 
 @pytest.fixture(scope="module")

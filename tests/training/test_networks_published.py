@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from train.data.batches import Batch
-from train.networks.cost import macs, parameters_count
-from train.networks.losses import relative_error
+from train.data.press_batches import Batch
+from train.experiments.support.workbench import macs, parameters_count
+from train.networks.blocks import relative_error
 from train.networks.published import SeedNet, SrganObjective
 from train.networks.registry import build, grown
 from train.networks.symmetric import write_out

@@ -7,8 +7,6 @@ import pytest
 
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from train.physics.hysteresis import frame_weights
 from train.physics.sensor_noise import (
     LARGEST_COUNTS,
     NAMES,
@@ -16,6 +14,7 @@ from train.physics.sensor_noise import (
     Nuisances,
     apply_nuisances,
     draw_rest,
+    frame_weights,
     jitter_poses,
     read_windows,
 )
@@ -30,9 +29,7 @@ STRONG = Nuisances(
     earth_field_counts=2e4,
     noise_counts=1e4,
     saturation_counts=(1e5, 1e5, 3e5),
-    stuck_taxels=0.1,
     dead_taxels=0.1,
-    torn_scans=0.3,
 )
 """Strong enough that another draw of any one is no rounding error."""
 ACTING = tuple(name for name in NAMES if not name.startswith("pose"))
@@ -61,8 +58,7 @@ def test_each_acts_by_itself_and_in_its_turn(off):
     in_turn = presses()
     for name in ACTING:
         in_turn = apply_nuisances(in_turn, alone(nuisances, name), 7, angle_deg=ANGLES_DEG)
-    # Before the first frame a pad alone reads 0, one of all together noise and drift: torn scans may differ there.
-    assert np.abs(together - in_turn)[:, :, 1:].max() <= 4
+    assert np.abs(together - in_turn).max() <= 4
     changed = np.abs(together - apply_nuisances(presses(), STRONG, 7, angle_deg=ANGLES_DEG)).max()
     assert (changed > 100) == (off is not None)
 
@@ -183,43 +179,6 @@ def test_more_dead_taxels_are_the_same_and_more():
     assert many.mean() > 3 * few.mean()
 
 
-def test_stuck_taxels_hold_a_constant_in_their_range():
-    clean = presses(400) + 1e6
-    readings = apply_nuisances(clean, alone(STRONG, "stuck_taxels"), 0)
-    stuck = readings != np.rint(clean)
-    assert (stuck == stuck[:, :1, :1, :1]).all()
-    assert stuck.mean() == pytest.approx(0.1, abs=0.02)
-    held = np.where(stuck, readings, nan)
-    assert (np.nan_to_num(held) == np.nan_to_num(held[:, :1, :1])).all()
-    low, high = np.nanmin(held, axis=(0, 1, 2, 4, 5)), np.nanmax(held, axis=(0, 1, 2, 4, 5))
-    assert np.allclose(low, (-1400, -1400, 0), atol=150)
-    assert np.allclose(high, LARGEST_COUNTS, atol=150)
-
-
-def test_torn_scans_keep_a_run_of_ids_of_the_frame_before():
-    clean = presses(60)
-    whole = apply_nuisances(clean, NONE, 0)
-    torn = apply_nuisances(clean, alone(STRONG, "torn_scans"), 0)
-    before = np.concatenate([np.zeros_like(whole[:, :, :1]), whole[:, :, :-1]], axis=2)
-    stale = (torn != whole).any(axis=3)
-    assert np.array_equal(torn, np.where(stale[:, :, :, None], before, whole))
-    assert stale.any(axis=(-2, -1)).mean() == pytest.approx(0.3, abs=0.03)
-    sensor = min(name for name, _ in USPA44_MAP.taxels.values())
-    by_id = stale.reshape(-1, 16)[:, [taxel for _, taxel in USPA44_MAP.wire_order(sensor)]]
-    edges = (by_id != np.roll(by_id, 1, axis=1)).sum(axis=1)
-    assert set(edges) == {0, 2}
-    assert set(by_id.sum(axis=1)) == set(range(16))
-
-
-def test_a_torn_scan_leaves_what_is_not_stale_as_it_was():
-    with_torn = apply_nuisances(presses(60), STRONG, 0)
-    without = apply_nuisances(presses(60), STRONG.without("torn_scans"), 0)
-    stale = (np.abs(with_torn - without) > 1).any(axis=3)
-    assert 0.05 < stale.mean() < 0.3
-    expected = np.where(stale[:, :, 1:, None], without[:, :, :-1], without[:, :, 1:])
-    assert np.abs(with_torn[:, :, 1:] - expected).max() <= 1
-
-
 def maxwell(readings, time_s, share, relaxation_s):
     """Apply hysteresis step by step; the update is exact for readings linear in time, and q begins in equilibrium."""
     steps = np.maximum(np.diff(time_s) / relaxation_s, 1e-12)
@@ -286,7 +245,7 @@ def test_sensors_differ_in_their_hysteresis():
 
 def test_a_window_holds_the_frames_asked_for():
     clean = presses()
-    quiet = STRONG.without("noise_counts", "torn_scans")
+    quiet = STRONG.without("noise_counts")
     every = apply_nuisances(clean, quiet, 5, angle_deg=ANGLES_DEG)
     frame = np.random.default_rng(0).integers(8, size=(5, 3))
     window = read_windows(clean, (frame + 1) / 8, quiet, 5, angle_deg=ANGLES_DEG)
@@ -295,18 +254,6 @@ def test_a_window_holds_the_frames_asked_for():
     halfway = read_windows(clean, 4.5 / 8, NONE, 5)
     assert np.abs(halfway - (clean[:, :, 3] + clean[:, :, 4]) / 2).max() <= 0.51
     assert not read_windows(clean, 0.0, NONE, 5).any()
-
-
-def test_a_torn_window_keeps_taxels_of_one_frame_earlier():
-    clean = presses(200)
-    whole, before = (read_windows(clean, share, NONE, 0) for share in (0.8, 0.8 - 1 / 8))
-    torn = read_windows(clean, 0.8, alone(STRONG, "torn_scans"), 0)
-    stale = (torn != whole).any(axis=2)
-    assert np.array_equal(torn, np.where(stale[:, :, None], before, whole))
-    assert stale.any(axis=(-2, -1)).mean() == pytest.approx(0.3, abs=0.06)
-    noisy = replace(NONE, noise_counts=1e4)
-    same = read_windows(zeros(200), 0.8, replace(noisy, torn_scans=0.3), 0) == read_windows(zeros(200), 0.8, noisy, 0)
-    assert same.mean() == pytest.approx(1 - stale.mean(), abs=0.03)
 
 
 def test_poses_are_missed_by_as_much_as_it_says():
@@ -328,8 +275,7 @@ def test_nuisances_are_switched_by_name():
     assert Nuisances().without("noise_counts", "saturation_counts") == Nuisances(
         noise_counts=0.0, saturation_counts=(inf, inf, inf)
     )
-    assert Nuisances.only("noise_counts") == replace(NONE, noise_counts=2.0)
-    assert Nuisances().without(*NAMES) == NONE == Nuisances.only()
+    assert Nuisances().without(*NAMES) == NONE
     assert Nuisances(**json.loads(json.dumps(asdict(NONE)))) == NONE
 
 
@@ -337,8 +283,6 @@ def test_nuisances_are_switched_by_name():
     ("mistake", "words"),
     [
         (lambda: Nuisances().without("nose"), "'nose'.*noise_counts"),
-        (lambda: Nuisances.only("drift"), "'drift'.*thermal_drift_counts"),
-        (lambda: Nuisances.only("torn_scans"), "torn_scans is off by default"),
         (lambda: Nuisances(noise_counts=-1.0), "noise_counts is -1"),
         (lambda: Nuisances(noise_counts=nan), "noise_counts is nan"),
         (lambda: Nuisances(dead_taxels=1.5), "dead_taxels is 1.5.*to 1"),

@@ -7,9 +7,8 @@ import pytest
 import torch
 from press_samples import make_press_set
 
-from train.data.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
-from train.data.press_batches import PressBatches, read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, PressBatches, read_presses
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 

@@ -23,12 +23,10 @@ def blob(x_mm, y_mm, pressure_mpa=0.05):
     return ((radius_mm(x_mm, y_mm) <= 2.0) * pressure_mpa).astype(np.float32)[None, None]
 
 
-@pytest.mark.parametrize("field", ["dipole", "cylinder"])
-def test_an_even_load_reads_as_its_force(field):
-    skin = Skin(USPA44, Layer(), SIZE, CELL_MM, field=field)
+def test_an_even_load_reads_as_its_force():
     for force_n, within in ((1.0, 1e-3), (7.35, 0.05)):  # the field is steeper near the chip
         pressure = np.full((1, 1, SIZE, SIZE), force_n / (SIZE * CELL_MM) ** 2)
-        assert skin.frames(pressure)[0, 0, 2].sum() * NEWTONS_PER_COUNT_Z == pytest.approx(force_n, rel=within)
+        assert SKIN.frames(pressure)[0, 0, 2].sum() * NEWTONS_PER_COUNT_Z == pytest.approx(force_n, rel=within)
 
 
 def test_a_full_face_press_presses_every_taxel():
@@ -82,14 +80,6 @@ def test_flat_taps_are_their_frames_and_nothing_reads_nothing():
     assert np.allclose(counts, SKIN.frames(unit[:, None] * indentation_mm[:, :, None, None]), atol=0.05)
     assert not counts[:, 0].any()
     assert not counts[2].any()
-
-
-def test_the_dipole_reads_as_the_cylinder_to_two_percent():
-    exact = Skin(USPA44, Layer(), SIZE, CELL_MM, field="cylinder")
-    for place in ((0.0, 0.0), (2.35, 2.35), (-6.0, 3.0)):
-        expected = exact.frames(blob(*place))
-        # Measured 1.0 %, once both are calibrated by the same load.
-        assert np.abs(SKIN.frames(blob(*place)) - expected).max() < 0.02 * np.abs(expected).max()
 
 
 class TestLean:

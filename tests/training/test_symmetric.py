@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import nn
 
+from train.experiments.support.workbench import macs, parameters_count
 from train.networks.compact import CompactNet
-from train.networks.cost import macs, parameters_count
 from train.networks.symmetric import (
     Channels,
     SymmetricConv2d,

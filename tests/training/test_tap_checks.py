@@ -8,7 +8,7 @@ from press_samples import make_press_set
 
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
-from train.data.posed_batches import stated_poses
+from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.learning import tap_checks
 from train.learning.tap_checks import fit_posed_tap_network, posed_pair_features, posed_tap_check, relative

@@ -6,8 +6,7 @@ import pytest
 from train.data.presses import PressSet, load_presses
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.surfaces.poses import MAX_TAPS
-from train.surfaces.tap_schedules import HALF_PITCH_MM, NEAR_DEG, NEAR_MM, REACH_MM, SCHEDULES
+from train.surfaces.poses import HALF_PITCH_MM, MAX_TAPS, NEAR_DEG, NEAR_MM, REACH_MM, SCHEDULES
 
 
 @pytest.mark.parametrize("name", SCHEDULES)

@@ -14,16 +14,23 @@ from edge.inference.familiarity import contact_features
 from edge.inference.small_network import small_network
 from edge.inference.trust import trust_of
 from train import trust
-from train.data.batches import network_input
+from train.data.press_batches import network_input
 from train.errors import CheckpointError, DatasetError
 from train.learning import contact_check, tap_checks
-from train.learning.contact_check import drawn_readings, features_of, fit_classifier, in_contact, moved
-from train.learning.forward_operator import fit_forward_model
-from train.learning.trust_limits import TrustFit, load_trust
-from train.learning.wrong_readings import SPOILINGS, magnet_field, spoiled
+from train.learning.contact_check import (
+    SPOILINGS,
+    drawn_readings,
+    features_of,
+    fit_classifier,
+    in_contact,
+    magnet_field,
+    moved,
+    spoiled,
+)
+from train.learning.trust_limits import TrustFit, fit_forward_model, load_trust
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
-from train.physics.covers import BARE
+from train.physics.contact import BARE
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import INPUTS, Pad, input_scale
 

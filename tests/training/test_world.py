@@ -22,7 +22,7 @@ from train.errors import DatasetError
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MOST_FORCE_N
 from train.physics.pad_draws import INPUTS, Pad, constants
-from train.surfaces.tap_schedules import REACH_MM
+from train.surfaces.poses import REACH_MM
 
 SMALL = World(count=14, taps=2, per_pad=5, seed=5)
 
@@ -174,7 +174,7 @@ def test_workers_ignore_an_interruption_those_that_replace_others_too():
     script = """
 import os, signal, time, joblib
 from joblib.externals.loky import process_executor
-from train.data.workers import quiet_workers
+from train.data.generation_config import quiet_workers
 
 def ignored(number):
     time.sleep(0.02)

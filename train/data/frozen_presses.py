@@ -106,11 +106,7 @@ def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = N
 
 
 def load_frozen_presses(path: Path = WIDE_TEST) -> FrozenPresses:
-    """Load a set that `FrozenPresses.presses.save` has written.
-
-    Raises:
-        DatasetError: absent, of another format, or damaged.
-    """
+    """Load a set that `FrozenPresses.presses.save` has written."""
     presses = load_presses(path)
     return FrozenPresses(presses, _gains(presses.config["read with seed"], presses, presses.config["gain spread"]))
 

@@ -22,14 +22,14 @@ import joblib
 
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.pad_geometry import PADS, USPA44
+from train.data.generation_config import quiet_workers
 from train.data.presses import PressSet, join_presses, load_presses
-from train.data.workers import quiet_workers
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
-from train.surfaces.tap_schedules import SCHEDULES
+from train.surfaces.poses import SCHEDULES
 
 _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
@@ -38,16 +38,8 @@ _AT_ONCE: Final = 16
 def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
-    Args:
-        world: configuration of the presses.
-        path: of the npz.
-        jobs: processes, -1 for one on each core.
-        compressed: a smaller file, slower to write.
-
     Raises:
         DatasetError: the file at `path` or its parts were made otherwise, or cannot be written.
-        SurfaceError: nothing of a user's mesh lies under the pad.
-        MeshError: a user's mesh cannot be used.
     """
     facts = world.facts()
     if path.exists():

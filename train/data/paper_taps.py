@@ -29,7 +29,7 @@ from train.physics.resample import resample, resample_touching
 from train.physics.sensor_noise import Nuisances, Seed, jitter_poses, read_windows
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, Split, as_poses, paper_targets, positions_of, turned_back
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, Split, paper_taps_of
 
 FORCE_N: Final = 9.2
 """Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
@@ -120,22 +120,17 @@ def paper_taps(
     taps: int = MAX_TAPS,
     angle_step_deg: float = ANGLE_STEP_DEG,
 ) -> PaperTaps:
-    """Tap each flat surface at the places of a split, in four turns; poses are off by a robot's error, as is the truth.
-
-    Raises:
-        ValueError: taps or angle_step_deg out of bounds.
-    """
+    """Tap each flat surface at the places of a split, in four turns; poses and truth are off by a robot's error."""
     pad = GrippedPad(NOMINAL)
-    targets = paper_targets(positions_of(split), surfaces)
-    sent = as_poses(turned_back(targets, taps, angle_step_deg))
+    names, sent = paper_taps_of(split, surfaces, taps, angle_step_deg)
     poses: list[Pose] = []
     while part := sent[len(poses) :][: _AT_ONCE * taps]:
         rng = np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)])
         poses += jitter_poses(rng, part, Nuisances())
-    numbers = tracked(range(len(targets)), "tapping", "sequence")
-    solved = [tap(pad, targets.surfaces[at], poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
+    numbers = tracked(range(len(names)), "tapping", "sequence")
+    solved = [tap(pad, names[at], poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
     return PaperTaps(
-        surfaces=np.array(targets.surfaces),
+        surfaces=np.array(names),
         poses=np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in poses]).reshape(-1, taps, 3),
         counts=np.stack([one.counts for one in solved]),
         force_n=np.stack([one.force_n for one in solved]),

@@ -76,9 +76,6 @@ def recorded_grips(folder: Path) -> list[Grip]:
 
     The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
 
-    Args:
-        folder: see `recording_paths`.
-
     Raises:
         DatasetError: the folder or recordings in it do not exist, or one cannot be read.
     """
@@ -99,14 +96,7 @@ def recorded_grips(folder: Path) -> list[Grip]:
 
 
 def recorded_sets(folder: Path) -> list[ScanSet]:
-    """Return real scans under load, one set for each trial and sensor; repeated scans are left out.
-
-    Args:
-        folder: see `recording_paths`.
-
-    Raises:
-        DatasetError: the folder or recordings in it do not exist, or one cannot be read.
-    """
+    """Return real scans under load, one set for each trial and sensor; repeated scans are left out."""
     sets: list[ScanSet] = []
     for grip in recorded_grips(folder):
         renewed = np.append(True, (np.diff(grip.counts, axis=0) != 0).any(axis=(1, 2, 3)))

@@ -17,8 +17,7 @@ from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
-from train.surfaces.poses import MAX_TAPS
-from train.surfaces.tap_schedules import schedule_of
+from train.surfaces.poses import MAX_TAPS, schedule_of
 
 INDENTATION_MM: Final = (0.03, 0.5)
 """Bounds of the indentation, drawn uniformly, in [mm]; the layer is linear up to the upper one."""
@@ -44,7 +43,7 @@ class World:
         count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out, or drawn again
             where they are of a user's mesh.
         taps: presses in each sequence.
-        schedule: of the taps' poses, see train.surfaces.tap_schedules.schedule_of.
+        schedule: of the taps' poses, see train.surfaces.poses.schedule_of.
         begun: share of sequences whose newest tap has only begun, while the earlier ones are as at their ends.
         per_pad: sequences of one pad.
         families: relative frequency of each family, or figure of the paper.

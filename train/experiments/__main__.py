@@ -6,6 +6,7 @@ python -m train.experiments table3 angle --reports reports
 import argparse
 import importlib
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -17,28 +18,34 @@ from train.errors import TrainError
 from train.experiments.support.workbench import Workbench
 
 EXPERIMENTS: Final = {
-    "families": "the shipped model and its intervals on every family, next to baselines",
-    "pads": "the shipped model on pads that are off the nominal one",
-    "trust-checks": "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
-    "posed-taps": "taps from known poses: one to seven, by schedule, the paper's too, and with wrong poses",
-    "table3": "all methods at x10 on the same targets",
-    "table4": "STSR at five scales",
-    "angle": "MTSR-2 by angle between its taps",
-    "taps": "one to seven taps",
-    "force": "error by contact force",
-    "force-recovery": "force through press, hold and release",
-    "unseen": "surfaces that were not trained on",
-    "real": "real grips: shape of faces, patterns against readings",
-    "fig5": "alpha and beta against force",
-    "fig7": "tPSF, PSF and depth against FEM",
+    "families": ("sensor.families", "the shipped model and its intervals on every family, next to baselines"),
+    "pads": ("sensor.pads", "the shipped model on pads that are off the nominal one"),
+    "trust-checks": (
+        "sensor.trust_checks",
+        "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
+    ),
+    "posed-taps": (
+        "sensor.posed_taps",
+        "taps from known poses: one to seven, by schedule, the paper's too, and with wrong poses",
+    ),
+    "table3": ("paper.tables:run_table3", "all methods at x10 on the same targets"),
+    "table4": ("paper.tables:run_table4", "STSR at five scales"),
+    "angle": ("paper.more_taps:run_angle", "MTSR-2 by angle between its taps"),
+    "taps": ("paper.more_taps:run_taps", "one to seven taps"),
+    "force": ("paper.force", "error by contact force"),
+    "force-recovery": ("paper.force_recovery", "force through press, hold and release"),
+    "unseen": ("paper.unseen", "surfaces that were not trained on"),
+    "real": ("sensor.real", "real grips: shape of faces, patterns against readings"),
+    "fig5": ("paper.fig5", "alpha and beta against force"),
+    "fig7": ("paper.fig7", "tPSF, PSF and depth against FEM"),
 }
-_PAPER: Final = {"table3", "table4", "fig5", "fig7", "angle", "taps", "force", "force-recovery", "unseen"}
-"""Experiments of train.experiments.paper; the others are in train.experiments.sensor."""
+"""Module below train.experiments, its function unless that is `run`, and a line, of each experiment."""
 
 
-def module_of(name: str) -> str:
-    """Return the module of an experiment."""
-    return f"train.experiments.{'paper' if name in _PAPER else 'sensor'}.{name.replace('-', '_')}"
+def function_of(name: str) -> Callable[[Workbench, Path], Path]:
+    """Return the function that runs an experiment."""
+    module, _, function = EXPERIMENTS[name][0].partition(":")
+    return getattr(importlib.import_module(f"train.experiments.{module}"), function or "run")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -47,7 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m train.experiments",
         description=(__doc__ or "").splitlines()[0],
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="\n".join(f"  {name:19} {what}" for name, what in EXPERIMENTS.items()),
+        epilog="\n".join(f"  {name:19} {what}" for name, (_, what) in EXPERIMENTS.items()),
     )
     parser.add_argument(
         "names", nargs="+", choices=[*EXPERIMENTS, "all"], metavar="NAME", help="experiments, run in this order"
@@ -66,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         names = list(EXPERIMENTS) if "all" in options.names else options.names
         for name in tracked(names, "experiments", "page"):
-            page = importlib.import_module(module_of(name)).run(replace(bench, used=set()), options.reports)
+            page = function_of(name)(replace(bench, used=set()), options.reports)
             sys.stdout.write(f"{page}\n")
     except (TrainError, EdgeError) as error:
         sys.exit(f"experiments: {error}")

@@ -9,20 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import MeshError, SurfaceError
-from train.families import faces, rounds, solids
-from train.families.shape import NOWHERE_MM, Height, Lie, log_uniform
-from train.physics.covers import BARE, Cover
+from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, log_uniform
+from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.depth_image import Pose, Relief, footprints
+from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
-from train.surfaces.poses import over_surface, random_targets
+from train.surfaces.poses import over_surface, random_poses
 
-SHAPES: Final[Mapping[str, Callable[[np.random.Generator], Height]]] = {
-    **{maker.__name__: maker for maker in (faces.flat, faces.block, faces.edge, faces.corner, faces.slot, faces.step)},
-    **{maker.__name__: maker for maker in (rounds.dome, rounds.cylinder, rounds.cone, rounds.ridge, rounds.wire)},
-    **{maker.__name__: maker for maker in (rounds.saddle, rounds.relief, rounds.grating, solids.solid)},
-}
 FIGURES: Final = ("paper", "glyph", "polygon")
 """Families of flat figures on a plate: the paper's 18, and random ones."""
 
@@ -83,10 +77,6 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
         family: a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
         pad: the pad that taps.
         poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
-
-    Raises:
-        SurfaceError: nothing of a user's mesh lies under the pad.
-        MeshError: the user's mesh cannot be used.
     """
     if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
@@ -144,7 +134,7 @@ def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
     slope = np.zeros(2)
     if rng.random() > _LEVEL:
         way = rng.uniform(0, 2 * np.pi)
-        slope = faces.SLOPE * rng.random() ** 2 * np.array([np.cos(way), np.sin(way)])
+        slope = SLOPE * rng.random() ** 2 * np.array([np.cos(way), np.sin(way)])
     if family == "two":
         slope = slope / 5
     return Lie(float(x_mm), float(y_mm), float(rng.uniform(0, 360)), float(slope[0]), float(slope[1]))
@@ -166,7 +156,7 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
         name = str(rng.choice(SURFACES))
     elif family in FIGURES:
         name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
-    newest = random_targets(rng, 1, [name]).poses[0]
+    newest = random_poses(rng, 1)[0]
 
     def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
         over = over_surface(newest, *pose.tolist())
@@ -188,12 +178,8 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
 
 
 def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
-    """Return the heights (m, m) of a surface at the places of a pad at a pose over it.
-
-    Raises:
-        ValueError: nothing of it lies under the pad.
-    """
-    return -footprints([_relief(surface)], [pose], pad.size * SAMPLES, pad.cell_mm / SAMPLES).depth_mm[0]
+    """Return the heights (m, m) of a surface at the places of a pad at a pose over it."""
+    return -depth_image(_relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
 
 
 @lru_cache(maxsize=64)

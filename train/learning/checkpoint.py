@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.in_place import write_in_place
-from train.data.batches import Batch, network_input
-from train.data.posed_batches import PosedBatches
-from train.data.press_batches import PressBatches
+from train.data.press_batches import Batch, PosedBatches, PressBatches, network_input
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
@@ -31,9 +29,8 @@ from train.learning.training_loop import (
     train,
     wait_for_all,
 )
-from train.networks.blocks import PatternNet
+from train.networks.blocks import PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.networks.losses import RelativeError
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
 
@@ -84,15 +81,6 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
 
     A checkpoint of the same training that already exists is left as it is.
-
-    Args:
-        training: configuration of the training.
-        data: sequences, some of which have as many taps as the network takes.
-        validation: set by which contact level and deviations are calibrated.
-        folder: of the checkpoints.
-
-    Raises:
-        CheckpointError: the checkpoint to start from cannot be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
@@ -165,13 +153,6 @@ def batches_of(
 ) -> Callable[[int], Batch]:
     """Return batches for a recipe; of presses, only the sequences that have all taps.
 
-    Args:
-        data: taps to draw from.
-        scale: pattern pixels per taxel pitch.
-        recipe: hyperparameters.
-        seed: of all draws.
-        posed: with the poses of the taps, for a network that takes them.
-
     Raises:
         DatasetError: no sequence has as many taps, or the scale is not that of the presses.
     """
@@ -202,23 +183,14 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
 
 def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols) in zeroed counts, and deviations or None."""
-    outputs = infer_all(net, windows)
-    return outputs[0], outputs[1] if len(outputs) > 1 else None
-
-
-def infer_all(
-    net: PatternNet, windows: NDArray[np.float32], pads: NDArray[np.float32] | None = None
-) -> list[NDArray[np.float32]]:
-    """Return all outputs of a network for windows (n, K, 3, rows, cols) in zeroed counts and the pads' inputs."""
     device = next(net.parameters()).device
-    parts = torch.split(network_input(windows), _INFERRED_AT_ONCE)
-    known = [()] * len(parts) if pads is None else [(pad,) for pad in torch.from_numpy(pads).split(_INFERRED_AT_ONCE)]
     rows: list[tuple[torch.Tensor, ...]] = []
     with torch.inference_mode():
-        for part, pad in zip(parts, known, strict=True):
-            given = net(part.to(device), *(one.to(device) for one in pad))
+        for part in torch.split(network_input(windows), _INFERRED_AT_ONCE):
+            given = net(part.to(device))
             rows.append(given if isinstance(given, tuple) else (given,))
-    return [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]
+    outputs = [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]
+    return outputs[0], outputs[1] if len(outputs) > 1 else None
 
 
 def best_contact_level(patterns: NDArray[np.float32], touching: NDArray[np.bool_]) -> float:

@@ -10,22 +10,59 @@ moments and leans of the magnets do to them is taken out, since a learner estima
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses
 from train.data.presses import PressSet, load_presses
-from train.data.simulated_sensors import CALIBRATION, contacts_of, sensor_of, true_log_gains
+from train.data.world import World
 from train.errors import DatasetError, TrainError
+from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES, Pad, draw_pad
 from train.physics.sensor_noise import Nuisances, neighbours, read_windows
+
+CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)
+"""Sensors by which bias and intervals of learned gains are set."""
+
+
+def sensor_of(world: World, number: int) -> tuple[Pad, NDArray[np.float64]]:
+    """Return a sensor's pad and the gains (3, rows, cols) of its chips."""
+    spread = Nuisances().gain_spread
+    chips = spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
+    return draw_pad(np.random.default_rng([world.seed, number])), 1 + chips.clip(-2 * spread, 2 * spread)
+
+
+def true_log_gains(pad: Pad, chips: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return log-gains (channels,): of chips and of what seats and moments do under an even load; z's mean is 0."""
+    seats = even_gains(GrippedPad(pad), GrippedPad(replace(pad, seed=None)))
+    true = np.log(chips) + np.log(seats)
+    return (true - true[AXES.index("z")].mean()).ravel()
+
+
+def contacts_of(presses: PressSet, world: World, number: int) -> NDArray[np.float32]:
+    """Return the contacts (n, 3, rows, cols) of a sensor of a world, as it reads them.
+
+    Sets number their pads with gaps, in the order in which they were drawn.
+    """
+    mine = presses.pick(presses.pad == np.unique(presses.pad)[number])
+    clean = mine.counts[:, 0] * sensor_of(world, number)[1].astype(np.float32)
+    return read_windows(clean[None, :, None], 1.0, Nuisances().without("gain_spread"), [world.seed, number])[0]
+
+
+def even_gains(gripped: GrippedPad, perfect: GrippedPad) -> NDArray[np.float64]:
+    """Return what the seats and moments of a pad's magnets do to z under an even load, (rows, cols)."""
+    even = np.full((1, 1, gripped.size, gripped.size), 0.02, dtype=np.float32)
+    z = AXES.index("z")
+    return gripped.skin.frames(even)[0, 0, z].astype(np.float64) / perfect.skin.frames(even)[0, 0, z]
+
 
 TAXELS: Final = USPA44.taxel_count
 CHANNELS: Final = len(AXES) * TAXELS
@@ -174,10 +211,10 @@ Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
     """Return the model with its mean error on sensors taken out, and with intervals that hold nine in ten values."""
-    plain = [_taught(mixture.model(), contacts) for contacts, _, _ in sensors]
+    plain = [learned(contacts, mixture.model(), 1) for contacts, _, _ in sensors]
     off = [np.log(one.gains) - true for one, (_, true, _) in zip(plain, sensors, strict=True)]
     bias = _symmetric(np.mean(off, axis=0))
-    taught = [_taught(mixture.model(1.0, bias), contacts) for contacts, _, _ in sensors]
+    taught = [learned(contacts, mixture.model(1.0, bias), 1) for contacts, _, _ in sensors]
     gains = [(np.log(one.gains) - true) / one.deviations for one, (_, true, _) in zip(taught, sensors, strict=True)]
     constants = [
         ((one.constants - true) / one.constant_deviations)[:-1][one.determined[:-1]]
@@ -188,14 +225,6 @@ def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactMod
 
 def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
     return float(np.quantile(np.abs(np.concatenate(ratios)), 0.9)) / LEVEL_90
-
-
-def _taught(model: ContactModel, contacts: NDArray[np.floating]) -> GainLearner:
-    learner = GainLearner(model)
-    for contact in contacts:
-        learner.learn(contact)
-    learner.solve()
-    return learner
 
 
 def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = PASSES) -> GainLearner:
@@ -264,7 +293,7 @@ def _given_constants(
         _log_normal(contacts - design @ mean, covariance)
         for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
     ]
-    return _softmax(np.stack(found, axis=1) + np.log(mixture.share))
+    return softmax(np.stack(found, axis=1) + np.log(mixture.share), axis=1)
 
 
 def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -272,11 +301,6 @@ def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> N
     lower = np.linalg.cholesky(covariance)
     white = np.linalg.solve(lower, away.T)
     return -0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum()
-
-
-def _softmax(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    grown = np.exp(logs - logs.max(axis=1, keepdims=True))
-    return grown / grown.sum(axis=1, keepdims=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

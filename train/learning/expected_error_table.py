@@ -30,9 +30,6 @@ def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[
     """Fit the table of edge.inference.expected_error for a model with deviations.
 
     Frames are sorted by their uncertainty into bins of equally many; a bin's gain is that of its frames together.
-
-    Raises:
-        ValueError: the model gives no deviation.
     """
     taps = model.contract.taps
     parts = [

@@ -27,11 +27,9 @@ from torch import Tensor
 from edge.evaluation import metrics
 from edge.inference.intervals import REGIONS, regions
 from edge.terminal.progress_bar import tracked
-from train.data.batches import network_input
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
-from train.data.posed_batches import PosedBatches, stated_poses
-from train.data.press_batches import PressBatches
+from train.data.press_batches import PosedBatches, PressBatches, network_input, stated_poses
 from train.data.presses import PressSet
 from train.networks.compact import CompactNet
 from train.networks.interval_correction import IntervalCorrection
@@ -72,11 +70,7 @@ def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.f
 
 
 def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm].
-
-    Raises:
-        ValueError: shapes differ, there are no pixels, or the level is not between 0 and 1.
-    """
+    """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm]."""
     _errors(truth, pattern, deviation)
     return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
 
@@ -151,9 +145,6 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
         presses: some of them with all taps of the network.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
         seed: of all draws.
-
-    Raises:
-        DatasetError: no press has as many taps.
     """
     torch.manual_seed(seed)
     correction = net.add_intervals()
@@ -179,11 +170,6 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
 
 def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str, list[float]]:
     """Shift a network's correction, per region and number of taps, until it covers LEVEL of the readings' pixels.
-
-    Args:
-        net: with a correction.
-        run: the network, or the graph in integers made from it.
-        readings: that nothing was trained on.
 
     Returns:
         For each of LEVELS, in percent, the deviations that make half of its interval in each region.

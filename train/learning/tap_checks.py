@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from edge.inference.familiarity import Check, pair_width, pose_tap_features, tap_features
 from edge.inference.small_network import SmallNetwork
 from edge.perception.pattern_check import LEAST_COUNTS
-from train.data.batches import COUNTS_PER_UNIT
-from train.data.posed_batches import stated_poses
-from train.data.press_batches import read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, read_presses, stated_poses
 from train.data.presses import PressSet
 from train.learning.contact_check import fit_classifier, limit_of, moved
 from train.physics.sensor_noise import Nuisances
@@ -40,13 +38,7 @@ _FLIPPED: Final = np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
 
 
 def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
-    """Fit the network to taps turned as the schedule states, and to others.
-
-    Args:
-        presses: sequences of several taps.
-        seed: of nuisances, draws and weights.
-        steps: of the optimizer.
-    """
+    """Fit the network to taps turned as the schedule states, and to others."""
     rng = np.random.default_rng([seed, 5])
     both = presses, seen_in_a_mirror(presses)
     right, wrong = [], []
@@ -100,13 +92,7 @@ def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, see
 
 
 def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
-    """Fit the network to pairs of taps at poses as stated, and to others.
-
-    Args:
-        presses: sequences of several taps, from poses of many kinds.
-        seed: of nuisances, draws and weights.
-        steps: of the optimizer.
-    """
+    """Fit the network to pairs of taps at poses as stated, and to others."""
     rng = np.random.default_rng([seed, 7])
     right, wrong = [], []
     for number in range(_POSED_ROUNDS):

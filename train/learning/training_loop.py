@@ -29,7 +29,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.errors import TrainError
 from train.networks.blocks import PatternNet
 
@@ -212,7 +212,6 @@ def train(
 
     Raises:
         ValueError: a batch cannot be shared evenly by the processes.
-        NotResumableError: the state at `resume_path` is of another recipe or identity.
         DivergedError: the loss is not finite; the network is as it was before that step.
     """
     rank, world = rank_and_world()

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from train.data.batches import Batch
-from train.networks.blocks import PatternNet
+from train.data.press_batches import Batch
+from train.networks.blocks import PatternNet, relative_rms_error, truth_size
 from train.networks.interval_correction import IntervalCorrection
-from train.networks.losses import relative_rms_error, truth_size
 from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
 
 QUIET_UNITS: Final = 0.02

@@ -47,15 +47,6 @@ _TURN_ERROR_DEG: Final = 5.0
 class FusionNet(CompactNet):
     """Network from a window of 1 to K taps and their poses to pattern, deviation and traction.
 
-    Args:
-        taps: K, the most taps.
-        scale: pattern pixels per taxel pitch, even.
-        channels: of the trunk, a multiple of the symmetries.
-        blocks: residual blocks of the trunk.
-        known: numbers that say constants of the pad.
-        group: symmetries.
-        intervals: correct the deviations by region.
-
     Raises:
         ValueError: fewer than two taps, an odd scale, or channels that do not divide.
     """
@@ -291,12 +282,7 @@ def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 class OneOrMoreNet(PatternNet):
-    """Network that gives windows of one tap to one network and all others to another, which takes poses.
-
-    Args:
-        one: of one tap.
-        more: of 2 to K taps.
-    """
+    """Network that gives windows of one tap to one network and all others to another, which takes poses."""
 
     takes_poses = True
 

@@ -20,17 +20,18 @@ from typing import Any, Final
 import torch
 from torch import Tensor, distributed, nn
 
-from train.data.batches import Batch
+from train.data.press_batches import Batch
 from train.networks.blocks import (
     MultiScaleResidual,
     PatternNet,
     Residual,
     initialise,
     normed_conv,
+    relative_error,
     to_pattern,
+    truth_size,
     upsample,
 )
-from train.networks.losses import relative_error, truth_size
 
 CHANNELS: Final = 64
 BLOCKS: Final = 6
@@ -49,10 +50,6 @@ class SeedNet(PatternNet):
 
     All layers work at the pattern's size. Taps are interpolated, each passes its stem, and they are merged; the newest
     tap also passes a branch without batch normalisation, which would remove the force.
-
-    Args:
-        taps: K, 1 to 7.
-        scale: pattern pixels per taxel pitch.
 
     Raises:
         ValueError: taps or scale out of range.
@@ -111,9 +108,6 @@ class SeedNet(PatternNet):
 
 class TactileSRCNN(PatternNet):
     """Network from a window of one tap to a pattern, with batch normalisation throughout.
-
-    Args:
-        scale: pattern pixels per taxel pitch.
 
     Raises:
         ValueError: scale is not positive.

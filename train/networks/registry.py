@@ -27,11 +27,6 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
 def build(name: str, scale: int, **options: Any) -> PatternNet:
     """Build a new network.
 
-    Args:
-        name: one of NETWORKS.
-        scale: pattern pixels per taxel pitch.
-        options: further arguments of its class.
-
     Raises:
         ValueError: no network of that name; or scale or an option is out of range.
     """
@@ -46,12 +41,6 @@ def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNe
 
     An MTSR-K can start from an STSR, a compact network from one of any taps, and any from its own kind. At
     another scale a compact network keeps its trunk, and its output layers are initialised again.
-
-    Args:
-        start: network whose weights are copied.
-        name: one of NETWORKS.
-        scale: pattern pixels per taxel pitch.
-        options: further arguments of its class.
 
     Raises:
         ValueError: as `build`, or the weights do not fit.

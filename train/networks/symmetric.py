@@ -105,13 +105,7 @@ def fields(group: Group, channels: int) -> Channels:
 
 
 class SymmetricConv2d(nn.Module):
-    """Convolution that keeps the size and commutes with the symmetries; `kernel` is odd.
-
-    Args:
-        enter: input channels.
-        leave: output channels.
-        kernel: side of the kernel.
-    """
+    """Convolution that keeps the size and commutes with the symmetries; `kernel` is odd."""
 
     def __init__(self, enter: Channels, leave: Channels, kernel: int) -> None:
         super().__init__()

@@ -18,8 +18,57 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer, surface_compliance
 from train.physics.side_correction import FreeSides, SideGive
+
+
+@dataclass(frozen=True, slots=True)
+class Cover:
+    """Compliance of the object, and a cloth between it and the pad.
+
+    Attributes:
+        soft_mpa: shear modulus of a soft object, thick and incompressible; 0 for a rigid one.
+        cloth_mm: thickness of a cloth or glove over the pad; 0 for no cloth.
+        cloth_mpa: its modulus under even pressure.
+    """
+
+    soft_mpa: float = 0.0
+    cloth_mm: float = 0.0
+    cloth_mpa: float = 1.0
+
+    def compliance(self, layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the joint compliance of pad and cover at wave numbers, in [mm/MPa]."""
+        compliance = surface_compliance(layer, q_per_mm)
+        if self.cloth_mm:
+            compliance = compliance * self._spread(q_per_mm) ** 2 + self.cloth_mm / self.cloth_mpa
+        if self.soft_mpa:  # as thick as the pad is wide, incompressible
+            compliance = compliance + 0.5 / (self.soft_mpa * np.hypot(q_per_mm, 2 / USPA44.width_mm))
+        return compliance
+
+    def passed_on(self, pressure: NDArray[np.float32], cell_mm: float) -> NDArray[np.float32]:
+        """Return the pressure on the pad (size, size) under a cloth that spreads the pressure on its upper side."""
+        if not self.cloth_mm:
+            return pressure
+        size = len(pressure)
+        padded = 2 * size
+        q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
+        q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
+        spectrum = np.fft.rfft2(pressure, s=(padded, padded))
+        spread = np.fft.irfft2(spectrum * self._spread(np.hypot(q_x[None], q_y[:, None])), s=(padded, padded))
+        return np.maximum(spread[:size, :size], 0).astype(np.float32)
+
+    def _spread(self, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the share of a pressure wave that a cloth transmits: (1 + q t) exp(-q t).
+
+        Source: Johnson 1985, Eq. 2.23, the pressure at a depth in a half-space.
+        """
+        depth = q_per_mm * self.cloth_mm
+        return (1 + depth) * np.exp(-depth)
+
+
+BARE: Final = Cover()
+
 
 _MAX_STEPS: Final = 200
 _DIES_WITHIN: Final = 8
@@ -69,7 +118,6 @@ class ContactSolver:
         size: cells along a side.
         cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
-        boxed: work on boxes; else on the whole pad, for comparison.
         compliance: surface displacement per pressure at wave numbers, in [mm/MPa], for a pad with a cover; the layer's
             alone if None.
         sides: the pad's free sides; None for an infinite layer.
@@ -81,7 +129,6 @@ class ContactSolver:
         size: int,
         cell_mm: float,
         dtype: torch.dtype = torch.float32,
-        boxed: bool = True,
         compliance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
         sides: FreeSides | None = None,
     ) -> None:
@@ -94,7 +141,7 @@ class ContactSolver:
         answers = surface_compliance(layer, q) if compliance is None else compliance(q)
         self._kernel = np.fft.irfft2(answers, s=(padded, padded))
         self._dtype = dtype
-        self._sides = [*(box_sides(size) if boxed else ()), size]
+        self._sides = [*box_sides(size), size]
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
         self._side_give = None if sides is None else SideGive.of(sides, layer, size, cell_mm, dtype)
 
@@ -113,7 +160,6 @@ class ContactSolver:
         depth_mm: NDArray[np.floating],
         indentation_mm: float | NDArray[np.floating] = 1.0,
         tolerance: float = 1e-3,
-        start_mpa: NDArray[np.floating] | None = None,
         cover: NDArray[np.floating] | None = None,
     ) -> ContactResult:
         """Press surfaces into the pad, with depth images as input.
@@ -124,12 +170,8 @@ class ContactSolver:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
             tolerance: residual at which a pose is done.
-            start_mpa: pressures to start from, (n, size, size), or None.
             cover: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
-
-        Raises:
-            ValueError: shapes or values do not fit, or no cell of a pose is reached.
         """
         if depth_mm.shape[1:] != (self.size, self.size):
             raise ValueError(f"depth images of shape {depth_mm.shape}, expected (n, {self.size}, {self.size})")
@@ -154,10 +196,9 @@ class ContactSolver:
             place = (poses[:, None, None], rows, columns)
             press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
             depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
-            start = None if start_mpa is None else torch.as_tensor(start_mpa[place], dtype=self._dtype)
             give = None if cover is None else self._give(torch.as_tensor(cover[place], dtype=self._dtype))
             sides = None if self._side_give is None else self._side_give.boxes(top, left, (height, width))
-            found, error, taken = self._conjugate_gradients(depth, press, tolerance, start, give, sides)
+            found, error, taken = self._conjugate_gradients(depth, press, tolerance, give, sides)
             pressure_mpa[place] = found.numpy()
             residual[poses] = error.numpy()
             steps = max(steps, taken)
@@ -175,7 +216,6 @@ class ContactSolver:
         depth: torch.Tensor,
         press: torch.Tensor,
         tolerance: float,
-        start: torch.Tensor | None,
         give: torch.Tensor | None,
         sides: SideGive | None,
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
@@ -186,9 +226,6 @@ class ContactSolver:
             give = torch.zeros(())
         pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
         give = give.expand_as(pressure)
-        if start is not None:
-            known = torch.where(reachable, start.clamp_min(0.0), 0.0)
-            pressure = torch.where(known.amax(dim=(1, 2), keepdim=True) > 0, known, pressure)
         result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
         working = torch.arange(len(pressure))
         gap = torch.where(reachable, self._respond(pressure, give, sides) - wanted, 0.0)

@@ -84,11 +84,7 @@ class Verdict:
 
 
 def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path) -> Verdict:
-    """Press a named surface into the middle of the pad at rising indentations (s,), or load the kept result.
-
-    Raises:
-        NoEquilibriumError: a step did not converge.
-    """
+    """Press a named surface into the middle of the pad at rising indentations (s,), or load the kept result."""
     question = {
         "edition": _EDITION,
         "surface": surface,
@@ -175,7 +171,6 @@ class FemPad:
 
         Raises:
             ValueError: shapes do not fit, indentations do not rise, or nothing lies within reach.
-            NoEquilibriumError: a step did not converge.
         """
         steps_mm = np.asarray(indentation_mm, dtype=np.float64)
         if depth_mm.shape != (self.size, self.size) or not (np.diff(steps_mm, prepend=0.0) > 0).all():

@@ -8,8 +8,8 @@ That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
 2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.physics.contact.
 
-Pressure alone spreads the surface too; optionally friction resists that as well, as if every cell had been in contact
-from the start, which is exact for flat surfaces. The effect of traction on pressure is left out (Goodman 1962). That is
+Pressure alone spreads the surface too, which friction does not resist here. The effect of traction on pressure is left
+out (Goodman 1962). That is
 exact in the limit of a thick layer of nu = .5; a bonded layer's surface rises ahead of a slide and sinks at its back,
 by a quarter of the slide at most at nu = .45, and the pressure under a wide contact would lean by some tens of per
 cent. Slopes of the surface are taken as small.
@@ -23,14 +23,11 @@ import torch
 from numpy.typing import NDArray
 
 from train.physics.contact import box_sides, boxes, period_cells
-from train.physics.elastic_layer import Layer
-from train.physics.tangential_layer import surface_spread, surface_tensor
+from train.physics.elastic_layer import Layer, surface_tensor
 
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
 """Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
-_STICKS: Final = 1 - 1e-4
-"""Share of mu p below which a cell sticks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,20 +36,12 @@ class FrictionResult:
 
     Attributes:
         traction_mpa: on the pad, to the right and back, (n, 2, size, size), in [MPa].
-        stick: (n, size, size), the cells in contact that do not slip.
         residual: (n,) root mean square error over the contact of the movement, which should vanish where cells
             stick, and oppose the traction where they slip, as a share of the surface's movement.
-        force_n: (n, 2), to the right and back, in [N].
-        moment_nmm: (n,), about the pad's centre, from right to back, in [N mm].
-        steps: of the slowest pose.
     """
 
     traction_mpa: NDArray[np.float32]
-    stick: NDArray[np.bool_]
     residual: NDArray[np.float32]
-    force_n: NDArray[np.float64]
-    moment_nmm: NDArray[np.float64]
-    steps: int
 
 
 class FrictionSolver:
@@ -63,31 +52,15 @@ class FrictionSolver:
         size: cells along a side.
         cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
-        boxed: work on boxes; else on the whole pad, for comparison.
     """
 
-    def __init__(
-        self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32, boxed: bool = True
-    ) -> None:
+    def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
         self.size = size
         self.cell_mm = cell_mm
         self._dtype = dtype
-        self._sides = [*(box_sides(size) if boxed else ()), size]
+        self._sides = [*box_sides(size), size]
         self._kernels = _kernels(layer, period_cells(layer, size, cell_mm), cell_mm)
         self._spectra: dict[tuple[int, int], torch.Tensor] = {}
-        self._layer = layer
-
-    def spread_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the movement (n, 2, size, size), to the right and back, under pressures (n, size, size), in [mm]."""
-        period = period_cells(self._layer, self.size, self.cell_mm)
-        q_x, q_y = _waves(period, self.cell_mm)
-        q = np.hypot(q_x, q_y)
-        along = np.divide(1j * surface_spread(self._layer, q), q, out=np.zeros(q.shape, dtype=complex), where=q > 0)
-        # The highest wave is its own mirror image, so an odd transfer is zero there.
-        right, back = along * q_x, along * q_y
-        right[:, -1] = back[period // 2] = 0.0
-        wave = np.fft.rfft2(pressure_mpa, s=(period, period))[:, None] * np.stack([right, back])
-        return np.fft.irfft2(wave, s=(period, period))[..., : self.size, : self.size]
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement (n, 2, size, size) under tractions of that shape, in [mm]."""
@@ -100,7 +73,6 @@ class FrictionSolver:
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
         tolerance: float = 1e-3,
-        holds_spread: bool = False,
     ) -> FrictionResult:
         """Slide and turn surfaces that touch with these pressures.
 
@@ -110,54 +82,7 @@ class FrictionSolver:
             twist_rad: (n,), of the surface about the pad's centre, from right to back.
             friction: (n,), coefficients mu, >= 0.
             tolerance: residual at which a pose is done.
-            holds_spread: friction also resists the spread by pressure. Then the magnets' in-plane movement under
-                pressure counts in full (train.physics.taxel_response.Skin, in_plane_share 1), because these tractions
-                oppose it.
-
-        Raises:
-            ValueError: shapes or values do not fit.
         """
-        self._check(pressure_mpa, slide_mm, twist_rad, friction)
-        count = len(pressure_mpa)
-        along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
-        moved_mm = np.empty((count, 2, self.size, self.size))
-        moved_mm[:, 0] = slide_mm[:, 0, None, None] - twist_rad[:, None, None] * along_mm[:, None]
-        moved_mm[:, 1] = slide_mm[:, 1, None, None] + twist_rad[:, None, None] * along_mm
-        if holds_spread:
-            moved_mm -= self.spread_mm(pressure_mpa)
-        limit_mpa = np.maximum(pressure_mpa, 0) * friction[:, None, None]
-        traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
-        residual = np.zeros(count, dtype=np.float32)
-        steps = 0
-        bears = (limit_mpa > 0).any(axis=(1, 2))  # else there is nothing to solve
-        working = np.flatnonzero(bears)
-        for (height, width), rows, top, left in boxes(limit_mpa[working] > 0, self._sides) if len(working) else ():
-            poses = working[rows]
-            down = (top[:, None] + np.arange(height))[:, :, None]
-            across = (left[:, None] + np.arange(width))[:, None, :]
-            in_box = (poses[:, None, None, None], np.arange(2)[:, None, None], down[:, None], across[:, None])
-            found, error, taken = self._projected_gradients(
-                torch.as_tensor(limit_mpa[poses[:, None, None], down, across], dtype=self._dtype)[:, None],
-                torch.as_tensor(moved_mm[in_box], dtype=self._dtype),
-                tolerance,
-            )
-            traction_mpa[in_box] = found.numpy()
-            residual[poses] = error.numpy()
-            steps = max(steps, taken)
-        size = np.hypot(traction_mpa[:, 0], traction_mpa[:, 1])
-        stick = (limit_mpa > 0) & (size < _STICKS * limit_mpa)
-        area = self.cell_mm**2
-        force_n = traction_mpa.sum(axis=(2, 3), dtype=np.float64) * area
-        turning = along_mm * traction_mpa[:, 1] - along_mm[:, None] * traction_mpa[:, 0]
-        return FrictionResult(traction_mpa, stick, residual, force_n, turning.sum(axis=(1, 2)) * area, steps)
-
-    def _check(
-        self,
-        pressure_mpa: NDArray[np.floating],
-        slide_mm: NDArray[np.floating],
-        twist_rad: NDArray[np.floating],
-        friction: NDArray[np.floating],
-    ) -> None:
         count = len(pressure_mpa)
         found = (pressure_mpa.shape, np.shape(slide_mm), np.shape(twist_rad), np.shape(friction))
         expected = ((count, self.size, self.size), (count, 2), (count,), (count,))
@@ -168,11 +93,33 @@ class FrictionSolver:
         for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):
             if not np.isfinite(given).all():
                 raise ValueError(f"a {name} is not finite, expected numbers")
+        along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
+        moved_mm = np.empty((count, 2, self.size, self.size))
+        moved_mm[:, 0] = slide_mm[:, 0, None, None] - twist_rad[:, None, None] * along_mm[:, None]
+        moved_mm[:, 1] = slide_mm[:, 1, None, None] + twist_rad[:, None, None] * along_mm
+        limit_mpa = np.maximum(pressure_mpa, 0) * friction[:, None, None]
+        traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
+        residual = np.zeros(count, dtype=np.float32)
+        bears = (limit_mpa > 0).any(axis=(1, 2))  # else there is nothing to solve
+        working = np.flatnonzero(bears)
+        for (height, width), rows, top, left in boxes(limit_mpa[working] > 0, self._sides) if len(working) else ():
+            poses = working[rows]
+            down = (top[:, None] + np.arange(height))[:, :, None]
+            across = (left[:, None] + np.arange(width))[:, None, :]
+            in_box = (poses[:, None, None, None], np.arange(2)[:, None, None], down[:, None], across[:, None])
+            found, error = self._projected_gradients(
+                torch.as_tensor(limit_mpa[poses[:, None, None], down, across], dtype=self._dtype)[:, None],
+                torch.as_tensor(moved_mm[in_box], dtype=self._dtype),
+                tolerance,
+            )
+            traction_mpa[in_box] = found.numpy()
+            residual[poses] = error.numpy()
+        return FrictionResult(traction_mpa, residual)
 
     def _projected_gradients(
         self, limit: torch.Tensor, moved: torch.Tensor, tolerance: float
-    ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """Return tractions (n, 2, height, width), residuals and steps; limits are (n, 1, height, width)."""
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return tractions (n, 2, height, width) and residuals; limits are (n, 1, height, width)."""
         touching = limit > 0
         wanted = torch.where(touching, moved, 0.0)
         cells = touching.sum(dim=(1, 2, 3)).clamp_min(1)
@@ -214,7 +161,7 @@ class FrictionSolver:
             slip = slip + share * response
             energies[:, steps % _REMEMBERED] = (before + share * descent + share**2 * curve / 2)[:, 0]
             length = _dot(direction, direction) / curve
-        return result, residual, steps
+        return result, residual
 
     def _displace(self, traction: torch.Tensor) -> torch.Tensor:
         """Return the displacement within boxes (n, 2, height, width) under tractions in them."""

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import TrainError
-from train.physics.contact import ContactSolver
-from train.physics.covers import BARE, Cover
-from train.physics.curved_patterns import heights_pattern
+from train.physics.contact import BARE, ContactSolver, Cover
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
 from train.physics.taxel_response import Skin, on_pad
 from train.physics.touched import carrying, pressed_in, which_of
+from train.physics.tpsf import heights_pattern
 from train.surfaces.depth_image import NOTHING_MM
 
 MAX_INDENTATION_MM: Final = 0.5
@@ -97,9 +96,6 @@ class Taps:
 
 class GrippedPad:
     """One pad, and presses onto it.
-
-    Args:
-        pad: its constants.
 
     Attributes:
         places_mm: x (1, m) and y (m, 1) on the pad at which shapes are sampled, in [mm].
@@ -183,9 +179,6 @@ class GrippedPad:
         Args:
             heights_mm: (n, m, m) as in `press`, of figures on a plate that the pad does not reach.
             force_n: set force, one for all or (n,), in [N].
-
-        Raises:
-            PressError: nothing lies under the pad.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import SensorGeometry
-from train.physics.elastic_layer import Layer, inner_displacement
+from train.physics.elastic_layer import Layer, inner_displacement, inner_tangential
 from train.physics.magnets import MOVEMENT, Magnet
-from train.physics.tangential_layer import inner_tangential
 
 _PADS_WIDE: Final = 4
 _SLOPE_STEP_MM: Final = 1e-3

@@ -2,10 +2,9 @@
 
 Every chip senses every magnet, so cross-talk between taxels is in the sum and needs no model of its own.
 Magnets are axial, north up: pressed down, z rises; moved to +x, x rises. A dipole is fast and, at the distances of
-this pad, accurate enough; the exact cylinder shows its error. x to the right, y down the rows, z up.
+this pad, accurate enough (tests compare it with the exact cylinder). x to the right, y down the rows, z up.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -90,41 +89,6 @@ def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
     return pull * x - fall * m_x, pull * y - fall * m_y, pull * z - fall * m_z
 
 
-def cylinder_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
-    """Return the flux density of cylinders magnetised along their axis, exact inside and out, in [mT].
-
-    Args:
-        magnet: its size and material.
-        away_mm: vector from the magnet's centre to the evaluation point, in [mm].
-        axis: unit vectors from south to north.
-
-    Source: Derby and Olbert 2010, as implemented in magpylib.core.
-    """
-    # Imported here, because only the reference needs it, and loading it takes longer than reading a tap.
-    from magpylib.core import magnet_cylinder_axial_Bfield
-
-    (x, y, z), (m_x, m_y, m_z) = away_mm, axis
-    along = x * m_x + y * m_y + z * m_z
-    off = (x - along * m_x, y - along * m_y, z - along * m_z)
-    aside = np.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2)
-    radius_mm = magnet.diameter_mm / 2
-    ratio = np.full(along.size, magnet.thickness_mm / magnet.diameter_mm)
-    outward, _, forward = magnet_cylinder_axial_Bfield(
-        ratio, (aside / radius_mm).ravel().astype(float), (along / radius_mm).ravel().astype(float)
-    )
-    forward = 1e3 * magnet.remanence_t * forward.reshape(along.shape)
-    # The field has no outward part on the axis, where the direction outward is undefined.
-    outward = 1e3 * magnet.remanence_t * outward.reshape(along.shape) / np.maximum(aside, 1e-12)
-    b_x, b_y, b_z = (outward * o + forward * m for o, m in zip(off, axis, strict=True))
-    return b_x, b_y, b_z
-
-
-FIELDS: Final[dict[str, Callable[[Magnet, Vectors, Vectors], Vectors]]] = {
-    "dipole": dipole_mt,
-    "cylinder": cylinder_mt,
-}
-
-
 _DIPOLE_CLEARANCE: Final = 0.75
 """Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %.
 
@@ -138,27 +102,19 @@ class MagnetArray:
     Args:
         geometry: the taxels.
         magnet: the same in every taxel.
-        field: a name in FIELDS.
         rest: place and lean of each magnet at rest, as a movement, (taxels, 5); None for no deviation.
         moments: of each magnet as a share of the nominal one, (taxels,); None for nominal moments.
-
-    Raises:
-        ValueError: no field of that name, or a magnet is too near to its chip for a dipole.
     """
 
     def __init__(
         self,
         geometry: SensorGeometry,
         magnet: Magnet,
-        field: str = "dipole",
         rest: NDArray[np.floating] | None = None,
         moments: NDArray[np.floating] | None = None,
     ) -> None:
-        if field not in FIELDS:
-            raise ValueError(f"no field {field!r}, expected one of {', '.join(FIELDS)}")
         self.magnet = magnet
-        self._field = FIELDS[field]
-        self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm if field == "dipole" else 0.0
+        self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm
         nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)))
         self._rest = (nowhere if rest is None else rest).astype(np.float32)
         self._moments = None if moments is None else moments.astype(np.float32)
@@ -175,9 +131,6 @@ class MagnetArray:
 
         Returns:
             (..., taxels, 3), x, y, z in [mT].
-
-        Raises:
-            ValueError: a magnet would be pressed through its chip, or too near to it for a dipole.
         """
         rest = self._rest.astype(movement.dtype)
         placed = movement + rest
@@ -193,7 +146,7 @@ class MagnetArray:
         if clear_mm < self._least_clear_mm:
             raise ValueError(
                 f"a magnet comes within {clear_mm:.3g} mm of its chip, where a dipole is off by more than 30 %: "
-                f"expected {self._least_clear_mm:.3g} mm or more; press less hard, or take field='cylinder'"
+                f"expected {self._least_clear_mm:.3g} mm or more; press less hard"
             )
 
     def flux_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -202,7 +155,7 @@ class MagnetArray:
         upright = 1 / np.sqrt(1 + lean_x**2 + lean_y**2)
         gap_mm = down.dtype.type(self.magnet.gap_mm)
         away_mm = (self._apart_mm[0] - right, self._apart_mm[1] - back, down - gap_mm)
-        flux = self._field(self.magnet, away_mm, (lean_x * upright, lean_y * upright, upright))
+        flux = dipole_mt(self.magnet, away_mm, (lean_x * upright, lean_y * upright, upright))
         if self._moments is not None:
             flux = tuple(part * self._moments for part in flux)
         return np.stack([part.sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)

@@ -1,7 +1,7 @@
 """Pads: constants of a simulated sensor, drawn for each, and their form as inputs of a network."""
 
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,10 +109,6 @@ class Pad:
         for wave, angle, shift in zip(q, turn, phase, strict=True):
             down += (size * np.sin(wave * (np.cos(angle) * x_mm + np.sin(angle) * y_mm) + shift)).astype(np.float32)
         return down
-
-    def facts(self) -> dict[str, Any]:
-        """Return the constants as a dict for JSON."""
-        return asdict(self)
 
 
 NOMINAL: Final = Pad()

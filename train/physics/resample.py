@@ -35,11 +35,7 @@ def resample(
 
 
 def resample_touching(touching: NDArray[np.bool_], from_scale: float, to_scale: float) -> NDArray[np.bool_]:
-    """Resample masks (n, H, W): a pixel touches if at least half of its area does.
-
-    Raises:
-        ValueError: shapes or scales do not fit.
-    """
+    """Resample masks (n, H, W): a pixel touches if at least half of its area does."""
     # Shares are sums of rounded fractions: half an area may come out slightly below 0.5.
     return resample(touching, from_scale, to_scale) >= 0.5 - 1e-5
 

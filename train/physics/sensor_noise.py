@@ -1,9 +1,11 @@
 """Nuisances that real sensors add to the physics: named, seeded with independent streams, each can be switched off.
 
 The order is that of the signal's path. The pad lags (hysteresis), neighbours are visible (cross-talk), the chip has its
-gain; a warming pad and the earth's field add to it; then noise, the end of the range, taxels that stick or are dead,
-scans torn on the bus, and rounding to whole counts. Cross-talk comes before gain, because it is a field, which the chip
-amplifies with the rest.
+gain; a warming pad and the earth's field add to it; then noise, the end of the range, dead taxels, and rounding to
+whole counts. Cross-talk comes before gain, because it is a field, which the chip amplifies with the rest.
+
+Of the lag: with c the elastic reading, a reading is (1 - share) c + share q with dq/dt = (c - q) / relaxation_s: the
+standard linear solid, a spring parallel to one Maxwell element.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
-from train.physics.hysteresis import NuisanceError, draw_lag, frame_weights
+from train.errors import TrainError
 from train.surfaces.depth_image import Pose
 
 Seed = int | Sequence[int] | np.random.SeedSequence
@@ -27,11 +29,17 @@ LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
 TAP_S: Final = (0.2, 2.5)
 """Bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15."""
 
+_LEAST_SHARE: Final = 0.01
+_RELAXATION_S: Final = (0.2, 5.0)
 _OFF: Final = {"saturation_counts": (inf, inf, inf)}
 _DRIFT_OF_AXIS: Final = np.array([1 / 8, 1 / 8, 1.0])
 _DRIFT_OF_TAXEL: Final = 0.25
 _REST_COUNTS: Final = (32700.0, 32800.0, 37400.0)
 _REST_SPREAD_COUNTS: Final = 300.0
+
+
+class NuisanceError(TrainError, ValueError):
+    """Invalid nuisances, or readings that they cannot act on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,10 +65,7 @@ class Nuisances:
             another attitude. The rests of one sensor differed by 25 counts in two attitudes, sqrt(2) times the field.
         noise_counts: standard deviation of a reading at rest: 1.7 to 2.6 measured.
         saturation_counts: largest |reading| of x, y, z.
-        stuck_taxels: probability that a taxel holds a constant from its range, per sensor.
         dead_taxels: probability that a taxel always reads its rest level, per sensor: about 5 %.
-        torn_scans: probability that a scan is torn: a run of taxels, in order of their CAN ids, keeps the reading of
-            the frame before. A third of the rows of real recordings.
     """
 
     pose_error_mm: float = 0.2
@@ -72,9 +77,7 @@ class Nuisances:
     earth_field_counts: float = 18.0
     noise_counts: float = 2.0
     saturation_counts: tuple[float, float, float] = LARGEST_COUNTS
-    stuck_taxels: float = 0.0
     dead_taxels: float = 0.0
-    torn_scans: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "saturation_counts", tuple(self.saturation_counts))  # a list, if it comes from JSON
@@ -93,26 +96,12 @@ class Nuisances:
         """Return the nuisances with all switched off: readings are only rounded."""
         return cls().without(*NAMES)
 
-    @classmethod
-    def only(cls, *names: str) -> Self:
-        """Return the nuisances with the named ones at their defaults, all others off.
-
-        Raises:
-            NuisanceError: a name is unknown, or off by default and so needs a strength.
-        """
-        default = cls()
-        for name in _known(names):
-            if not getattr(default, name):
-                raise NuisanceError(f"{name} is off by default: set it, replace(Nuisances.none(), {name}=...)")
-        return default.without(*(name for name in NAMES if name not in names))
-
     def without(self, *names: str) -> Self:
-        """Return these nuisances with the named ones off.
-
-        Raises:
-            NuisanceError: a name is unknown.
-        """
-        return replace(self, **{name: _OFF.get(name, 0.0) for name in _known(names)})
+        """Return these nuisances with the named ones off."""
+        for name in names:
+            if name not in NAMES:
+                raise NuisanceError(f"no nuisance is called {name!r}: expected one of {', '.join(NAMES)}")
+        return replace(self, **{name: _OFF.get(name, 0.0) for name in names})
 
 
 NAMES: Final = tuple(field.name for field in fields(Nuisances))
@@ -122,17 +111,8 @@ _LARGEST: Final = {
     "hysteresis": 1.0,
     "cross_talk": 1.0,
     "gain_spread": 0.5,  # more, and a gain could be negative
-    "stuck_taxels": 1.0,
     "dead_taxels": 1.0,
-    "torn_scans": 1.0,
 }
-
-
-def _known(names: tuple[str, ...]) -> tuple[str, ...]:
-    for name in names:
-        if name not in NAMES:
-            raise NuisanceError(f"no nuisance is called {name!r}: expected one of {', '.join(NAMES)}")
-    return names
 
 
 def apply_nuisances(
@@ -154,9 +134,6 @@ def apply_nuisances(
 
     Returns:
         Whole zeroed counts, shape of `clean`.
-
-    Raises:
-        NuisanceError: shapes do not fit, or a duration is not positive.
     """
     _check_clean(clean)
     frame = np.broadcast_to(np.arange(1.0, clean.shape[2] + 1), clean.shape[:3])
@@ -176,16 +153,13 @@ def read_windows(
     Args:
         clean: as in `apply_nuisances`; readings are interpolated linearly between frames.
         share: completed share of each press, 0 to 1, broadcast to (n, K).
-        nuisances: as in `apply_nuisances`.
-        seed: as in `apply_nuisances`.
-        tap_s: as in `apply_nuisances`, of the whole press.
-        angle_deg: as in `apply_nuisances`.
+        nuisances: of these sensors; these and the other arguments are those of `apply_nuisances`.
+        seed: of the draws.
+        tap_s: of the whole press.
+        angle_deg: of the pad.
 
     Returns:
         (n, K, 3, rows, cols) whole zeroed counts.
-
-    Raises:
-        NuisanceError: as `apply_nuisances`, or a share is outside 0 to 1.
     """
     _check_clean(clean)
     shares = _per_tap("share", share, clean)
@@ -226,9 +200,6 @@ def _read(
         key = (*root.spawn_key, crc32(name.encode()))
         return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
 
-    torn = nuisances.torn_scans > 0
-    if torn:  # torn scans may keep readings of the frame before the first one
-        frame = np.concatenate([np.maximum(frame[..., :1] - 1, 0), frame], axis=-1)
     lag = np.zeros((2, n))
     if nuisances.hysteresis:
         lag = draw_lag(stream("hysteresis"), nuisances.hysteresis, n)
@@ -250,23 +221,13 @@ def _read(
         earth = nuisances.earth_field_counts * _draw_earth(stream("earth_field_counts"), turn)
         counts += earth[:, :, None, :, None, None]
     if nuisances.noise_counts:
-        shape = (n, taps, frame.shape[2] - torn, *scan)
-        noise = stream("noise_counts").standard_normal(shape, dtype=np.float32)
-        if torn:  # drawn separately, so that torn scans leave the noise of the other frames unchanged
-            before = stream("noise_before").standard_normal((n, taps, 1, *scan), dtype=np.float32)
-            noise = np.concatenate([before, noise], axis=2)
+        noise = stream("noise_counts").standard_normal((*frame.shape, *scan), dtype=np.float32)
         counts += np.float32(nuisances.noise_counts) * noise
     limit = np.array(nuisances.saturation_counts, dtype=np.float32)[:, None, None]
     np.clip(counts, -limit, limit, out=counts)
-    if nuisances.stuck_taxels:
-        stuck, held = _draw_stuck(stream("stuck_taxels"), nuisances.stuck_taxels, n, scan)
-        counts = np.where(stuck[:, None, None], held[:, None, None], counts)
     if nuisances.dead_taxels:
         dead = stream("dead_taxels").random((n, 1, 1, 1, *scan[1:])) < nuisances.dead_taxels
         counts = np.where(dead, np.float32(0), counts)
-    if torn:
-        stale = _draw_torn(stream("torn_scans"), nuisances.torn_scans, counts[:, :, 1:].shape)
-        counts = np.where(stale, counts[:, :, :-1], counts[:, :, 1:])
     return np.rint(counts)
 
 
@@ -292,26 +253,40 @@ def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[
     return (np.stack([x, y, z], axis=-1) - zeroed[:, None]).astype(np.float32)
 
 
-def _draw_stuck(
-    rng: np.random.Generator, chance: float, n: int, scan: Sequence[int]
-) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Draw the stuck taxels, (n, 1, rows, cols), and the constants they hold, (n, 3, rows, cols)."""
-    stuck = rng.random((n, 1, *scan[1:])) < chance
-    high = np.array(LARGEST_COUNTS)[:, None, None]
-    low = high * np.array([-1.0, -1.0, 0.0])[:, None, None]  # under pressure, z only rises
-    return stuck, rng.uniform(low, high, (n, *scan)).astype(np.float32)
+def frame_weights(
+    frame: NDArray[np.float64],
+    frames: int,
+    step_s: NDArray[np.float64],
+    share: NDArray[np.float64],
+    relaxation_s: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return the weight of each frame of a press in a reading at any moment of it, in closed form.
+
+    Readings are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second
+    difference of the responses to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
+
+    Args:
+        frame: moments of n sensors' K taps, (n, K, m), in frames since the pad was free.
+        frames: of a press; the first one is a step after the pad was free.
+        step_s: time from frame to frame, (n, K), in [s].
+        share: lagging share, (n,).
+        relaxation_s: (n,), above 0 where a share lags, in [s].
+
+    Returns:
+        (n, K, m, frames).
+    """
+    ramp = np.maximum(frame[..., None] - np.arange(frames + 2), 0)
+    if share.any():
+        rate = (step_s / relaxation_s[:, None])[..., None, None]
+        ramp += share[:, None, None, None] * np.expm1(-rate * ramp) / rate
+    return np.diff(ramp, n=2).astype(np.float32)
 
 
-def _draw_torn(rng: np.random.Generator, chance: float, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Draw the stale readings of torn scans, (n, K, m, 1, rows, cols): a cyclic run of ids."""
-    *scans, _, rows, cols = shape
-    torn = rng.random(scans) < chance
-    first = rng.integers(rows * cols, size=scans)
-    length = rng.integers(1, rows * cols, size=scans)
-    # Ids grow with the rows, and against the columns (layout C).
-    place = np.arange(rows * cols).reshape(rows, cols)[:, ::-1]
-    after_first = (place - first[..., None, None]) % (rows * cols)
-    return (torn[..., None, None] & (after_first < length[..., None, None]))[..., None, :, :]
+def draw_lag(rng: np.random.Generator, largest: float, n: int) -> NDArray[np.float64]:
+    """Return the lagging share, up to `largest`, and the relaxation time in [s] of n sensors, (2, n)."""
+    share = rng.uniform(min(_LEAST_SHARE, largest), largest, n)
+    low, high = np.log(_RELAXATION_S)
+    return np.stack([share, np.exp(rng.uniform(low, high, n))])
 
 
 def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:

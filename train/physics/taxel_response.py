@@ -46,7 +46,6 @@ class Skin:
         size: cells along a side of the pressure grid.
         cell_mm: their size, in [mm].
         magnet: of every taxel.
-        field: model of the magnets' field, a name in train.physics.magnets.FIELDS.
         in_plane_share: factor on the magnets' in-plane movement under pressure; movement under traction is not scaled.
         rest: place and lean of each magnet, see train.physics.magnets.MagnetArray.
         moments: of each magnet, see train.physics.magnets.MagnetArray.
@@ -55,9 +54,6 @@ class Skin:
 
     Attributes:
         counts_per_mt: of every chip and axis.
-
-    Raises:
-        ValueError: the magnets do not fit into the layer, or no field of that name.
     """
 
     def __init__(
@@ -67,7 +63,6 @@ class Skin:
         size: int,
         cell_mm: float,
         magnet: Magnet | None = None,
-        field: str = "dipole",
         in_plane_share: float = IN_PLANE_SHARE,
         rest: NDArray[np.floating] | None = None,
         moments: NDArray[np.floating] | None = None,
@@ -83,7 +78,7 @@ class Skin:
         self.geometry = geometry
         self.size = size
         self._pad = (geometry, layer, size, cell_mm, magnet)
-        self._magnets = MagnetArray(geometry, magnet, field, rest, moments)
+        self._magnets = MagnetArray(geometry, magnet, rest, moments)
         response = pressure_response(geometry, layer, size, cell_mm, magnet)
         if sides is not None:
             cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
@@ -110,9 +105,6 @@ class Skin:
         Args:
             pressure_mpa: (..., size, size), in [MPa].
             traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
-
-        Raises:
-            ValueError: the pressures are on another grid, or the tractions' shape does not match the pressures'.
         """
         if pressure_mpa.shape[-2:] != (self.size, self.size):
             raise ValueError(f"pressures of shape {pressure_mpa.shape}, expected (..., {self.size}, {self.size})")
@@ -135,9 +127,6 @@ class Skin:
         Args:
             pressure_mpa: (n, F, size, size), in [MPa].
             traction_mpa: on the pad's surface, to the right and back, (n, F, 2, size, size), in [MPa]; none if None.
-
-        Raises:
-            ValueError: loads are on another grid, or press a magnet through its chip.
         """
         return self._counts(self.movement(pressure_mpa, traction_mpa))
 
@@ -152,9 +141,6 @@ class Skin:
 
         Returns:
             (n, F, 3, rows, cols) in counts, zeroed and clean.
-
-        Raises:
-            ValueError: the pressures are on another grid, or press a magnet through its chip.
         """
         unit = self.movement(unit_pressure_mpa)
         return self._counts(unit[:, None] * indentation_mm[:, :, None, None].astype(unit.dtype))

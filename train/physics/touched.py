@@ -6,8 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.physics.contact import REACH, ContactSolver
-from train.physics.covers import BARE, Cover
+from train.physics.contact import BARE, REACH, ContactSolver, Cover
 
 _WALL_MM: Final = 0.1
 """Depth below a cell's highest part from which a part of it carries no load, in [mm]."""

@@ -5,9 +5,7 @@ pixel's depth is that of the surface at the pixel's centre, on flats, slopes and
 bounding box meets the footprint are drawn.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import cos, radians, sin
 from typing import Final
 
@@ -19,9 +17,6 @@ NOTHING_MM: Final = 1e3
 """Depth where there is no surface at all: out of any press's reach."""
 _UNFELT_MM: Final = 0.05
 """Height above the cells' centres from which a point between them counts as finer than a cell, in [mm]."""
-SAMPLES: Final = 4
-"""Samples along a cell's side from which its covered share is computed."""
-_TRIANGLES_AT_ONCE: Final = 2**17
 _ROUNDING_PX: Final = 1e-9
 """Tolerance in [px], so that no pixel on the common edge of two triangles is missed."""
 
@@ -62,73 +57,27 @@ class Relief:
         return self.triangles_mm[first:last][meets]
 
 
-@dataclass(frozen=True, slots=True)
-class Footprints:
-    """Part of the surface under the pad at each of n poses.
-
-    The sensor's y points down its rows, the surface's y up: the pad faces the surface.
-
-    Attributes:
-        triangles_mm: for each pose (t, 3, 3): x to the right, y down the rows, from the pad's centre; z as it is.
-        top_mm: (n,) height of what the pad touches first, in [mm].
-        depth_mm: (n, size, size) below `top_mm` on the pad's cells, in [mm], row-major from the top left; NOTHING_MM
-            off the surface.
-    """
-
-    triangles_mm: list[NDArray[np.float64]]
-    top_mm: NDArray[np.float64]
-    depth_mm: NDArray[np.float32]
-
-    def depth_on(self, size: int, pixel_mm: float, poses: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Return the depth at the given poses on another grid, `size` x `size` pixels centred on the pad, in [mm]."""
-        height_mm = _draw([self.triangles_mm[i] for i in poses], size, pixel_mm)
-        return _below(self.top_mm[poses], height_mm)
-
-    def cover_on(self, size: int, cell_mm: float, poses: NDArray[np.integer], level_mm: float) -> NDArray[np.float32]:
-        """Return the share of each cell within `level_mm` of the top at these poses, (k, size, size), 0 to 1."""
-        # Deeper triangles are left out: they hide nothing of the top.
-        tops = [
-            self.triangles_mm[i][self.triangles_mm[i][:, :, 2].min(axis=1) >= self.top_mm[i] - level_mm] for i in poses
-        ]
-        drawn = np.isfinite(_draw(tops, size * SAMPLES, cell_mm / SAMPLES))
-        return drawn.reshape(len(tops), size, SAMPLES, size, SAMPLES).mean(axis=(2, 4), dtype=np.float32)
-
-
-def footprints(reliefs: Sequence[Relief], poses: Sequence[Pose], size: int, cell_mm: float) -> Footprints:
-    """Draw the part of each surface that lies under a pad of `size` x `size` cells, one pose per surface.
-
-    Depth counts from the highest point under the footprint, not under the mesh: indentation is measured from first
-    contact. Between the cells' centres that point is searched on the triangles' edges; a point there that stands out by
-    more than _UNFELT_MM is finer than a cell and is left out.
-
-    Raises:
-        ValueError: nothing lies under the pad at a pose.
-    """
-    width_mm = size * cell_mm
-    seen = [_under(relief, pose, width_mm) for relief, pose in zip(reliefs, poses, strict=True)]
-    height_mm = _draw(seen, size, cell_mm)
-    felt_mm = height_mm.max(axis=(1, 2))
-    if not np.isfinite(felt_mm).all():
-        first = int(np.argmin(np.isfinite(felt_mm)))
-        raise ValueError(
-            f"nothing of surface {reliefs[first].name!r} lies under the pad at {poses[first]}; expected a pose over it"
-        )
-    peak_mm = np.array([_highest(triangles, width_mm) for triangles in seen])
-    top_mm = np.where(peak_mm - felt_mm <= _UNFELT_MM, np.maximum(peak_mm, felt_mm), felt_mm)
-    return Footprints(seen, top_mm, _below(top_mm, height_mm))
-
-
 def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:
-    """Return the depth under one footprint of `size` x `size` cells, (size, size) in [mm]; see Footprints.
+    """Return the depth (size, size) in [mm] of the part of a surface under a pad of `size` x `size` cells.
+
+    Rows go down the pad from the top left; the sensor's y points down its rows, the surface's y up: the pad faces the
+    surface. Off the surface the depth is NOTHING_MM. Depth counts from the highest point under the footprint, not under
+    the mesh: indentation is measured from first contact. Between the cells' centres that point is searched on the
+    triangles' edges; a point there that stands out by more than _UNFELT_MM is finer than a cell and is left out.
 
     Raises:
         ValueError: nothing lies under the pad.
     """
-    return footprints([relief], [pose], size, cell_mm).depth_mm[0]
-
-
-def _below(top_mm: NDArray[np.float64], height_mm: NDArray[np.float64]) -> NDArray[np.float32]:
-    depth_mm = top_mm[:, None, None] - height_mm
+    width_mm = size * cell_mm
+    triangles = _under(relief, pose, width_mm)
+    height_mm = _draw(triangles, size, cell_mm)
+    top_mm = height_mm.max()
+    if not np.isfinite(top_mm):
+        raise ValueError(f"nothing of surface {relief.name!r} lies under the pad at {pose}; expected a pose over it")
+    peak_mm = _highest(triangles, width_mm)
+    if peak_mm - top_mm <= _UNFELT_MM:
+        top_mm = max(peak_mm, top_mm)
+    depth_mm = top_mm - height_mm
     return np.where(np.isfinite(depth_mm), depth_mm, NOTHING_MM).astype(np.float32)
 
 
@@ -158,26 +107,15 @@ def _highest(triangles_mm: NDArray[np.float64], width_mm: float) -> float:
     return float(np.max(ends, initial=-np.inf))
 
 
-def _draw(seen: list[NDArray[np.float64]], size: int, cell_mm: float) -> NDArray[np.float64]:
-    """Return the topmost triangle's height at each pixel's centre, (n, size, size) in [mm]; -inf without one."""
-    height_mm = np.full((len(seen), size, size), -np.inf)
-    counts = np.array([len(triangles) for triangles in seen], dtype=np.int64)
-    block = (np.cumsum(counts) - counts) // _TRIANGLES_AT_ONCE
-    for start, stop in pairwise([*np.unique(block, return_index=True)[1], len(seen)]):
-        corners = np.concatenate(seen[start:stop])
-        image = np.repeat(np.arange(stop - start), counts[start:stop])
-        corners[:, :, :2] = corners[:, :, :2] / cell_mm + (size - 1) / 2
-        _raise_to(height_mm[start:stop], corners, image)
-    return height_mm
-
-
-def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], image: NDArray[np.integer]) -> None:
-    """Z-buffer triangles into images, row by row: corners (t, 3, 3) with x and y in pixels, image (t,)."""
-    size = height_mm.shape[1]
+def _draw(triangles_mm: NDArray[np.float64], size: int, cell_mm: float) -> NDArray[np.float64]:
+    """Return the topmost triangle's height at each pixel's centre, (size, size) in [mm]; -inf without one."""
+    height_mm = np.full((size, size), -np.inf)
+    corners = triangles_mm.copy()
+    corners[:, :, :2] = corners[:, :, :2] / cell_mm + (size - 1) / 2  # in pixels
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = edge1[:, 0] * edge2[:, 1] - edge2[:, 0] * edge1[:, 1]
     facing = np.abs(area) > 1e-12  # the others are seen edge-on
-    corners, image, edge1, edge2, area = corners[facing], image[facing], edge1[facing], edge2[facing], area[facing]
+    corners, edge1, edge2, area = corners[facing], edge1[facing], edge2[facing], area[facing]
     slope_x = (edge1[:, 2] * edge2[:, 1] - edge2[:, 2] * edge1[:, 1]) / area
     slope_y = (edge2[:, 2] * edge1[:, 0] - edge1[:, 2] * edge2[:, 0]) / area
     bottom_mm, top_mm = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)
@@ -198,7 +136,8 @@ def _raise_to(height_mm: NDArray[np.float64], corners: NDArray[np.float64], imag
     z_mm = (z0 - slope_x[triangle] * x0 + slope_y[triangle] * (row - y0))[strip] + slope_x[triangle][strip] * column
     # The slope of a nearly vertical wall is too steep to be extrapolated beyond its corners.
     z_mm = np.clip(z_mm, bottom_mm[triangle][strip], top_mm[triangle][strip])
-    np.maximum.at(height_mm.reshape(-1), ((image[triangle] * size + row) * size)[strip] + column, z_mm)
+    np.maximum.at(height_mm.reshape(-1), (row * size)[strip] + column, z_mm)
+    return height_mm
 
 
 def _spans(

@@ -1,23 +1,24 @@
-"""Poses of the taps on a surface: the paper's schedule, and poses drawn at random.
+"""Poses of the taps on a surface: the paper's schedule, poses drawn at random, and schedules of further taps.
 
 The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a tap
 whose pattern is reconstructed; the taps before it are made at the same place, each turned back by one more angle
-step. Targets are split by position, and every K has the same ones: 504 to train on, 72 to validate, 72 to test.
+step. Targets are split by position: one for the test and one for validation, 72 targets each, the same for every K.
+
+A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
+in [deg], as in `firmware_bridge.poses.pad_pose`.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.pad_geometry import USPA44
 from train.surfaces.depth_image import Pose
-from train.surfaces.named_surfaces import SURFACES
 
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
-POSITIONS: Final = 9
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 POSITION_STEP_MM: Final = 2.5
 TEST_POSITION: Final = 0
@@ -28,84 +29,41 @@ HELD_OUT_RADIUS_MM: Final = 1.0
 Only C, F, L, P, T and U are new there in every sense: the other surfaces are symmetric, and look as they do at another
 position to a pad turned by 90, 120 or 180 degrees. It has no visible effect, see docs/decisions.md.
 """
-REACH_MM: Final = 3.5
+SURFACE_REACH_MM: Final = 3.5
 """Largest distance of random poses from the surface's centre along x and along y, in [mm]."""
 
-Split = Literal["train", "validation", "test"]
-
-
-@dataclass(frozen=True, slots=True)
-class Targets:
-    """Taps whose patterns are reconstructed.
-
-    Attributes:
-        surfaces: n names.
-        poses: n poses.
-    """
-
-    surfaces: list[str]
-    poses: list[Pose]
-
-    def __len__(self) -> int:
-        return len(self.surfaces)
+Split = Literal["validation", "test"]
 
 
 def position_mm(index: int) -> tuple[float, float]:
-    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid.
-
-    Raises:
-        ValueError: not one of the nine.
-    """
-    if not 0 <= index < POSITIONS:
-        raise ValueError(f"position {index}: expected 0 to {POSITIONS - 1}")
+    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid."""
     return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
 
 
-def positions_of(split: Split) -> tuple[int, ...]:
-    """Return the positions of a split: 0 to test, 1 to validate, the other seven to train on."""
-    held_out = {"test": TEST_POSITION, "validation": VALIDATION_POSITION}
-    if split in held_out:
-        return (held_out[split],)
-    return tuple(index for index in range(POSITIONS) if index not in held_out.values())
-
-
-def paper_targets(positions: Sequence[int], surfaces: Sequence[str] = SURFACES) -> Targets:
-    """Return every surface at the four target angles of each position; surfaces change slowest, angles fastest."""
-    taps = [
-        (name, Pose(*position_mm(position), angle_deg))
-        for name in surfaces
-        for position in positions
-        for angle_deg in TARGET_ANGLES_DEG
-    ]
-    return Targets([name for name, _ in taps], [pose for _, pose in taps])
-
-
-def random_targets(rng: np.random.Generator, count: int, surfaces: Sequence[str] = SURFACES, first: int = 0) -> Targets:
-    """Draw places and angles away from the held-out positions, with surfaces in turn starting at index `first`."""
-    held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
-    poses: list[Pose] = []
-    while len(poses) < count:
-        x_mm, y_mm = rng.uniform(-REACH_MM, REACH_MM, 2)
-        angle_deg = rng.uniform(0, 360)
-        if np.hypot(*(held_out_mm - (x_mm, y_mm)).T).min() > HELD_OUT_RADIUS_MM:
-            poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
-    return Targets([surfaces[(first + i) % len(surfaces)] for i in range(count)], poses)
-
-
-def turned_back(targets: Targets, taps: int, angle_step_deg: float = ANGLE_STEP_DEG) -> NDArray[np.float64]:
-    """Return poses (n, taps, 3) of the taps that end in each target, newest first: x, y in [mm], angle in [deg].
-
-    Raises:
-        ValueError: taps or angle_step_deg out of bounds.
-    """
+def paper_taps_of(
+    split: Split, surfaces: Sequence[str], taps: int = MAX_TAPS, angle_step_deg: float = ANGLE_STEP_DEG
+) -> tuple[list[str], list[Pose]]:
+    """Return the names of a split's targets, each surface in four turns, and the poses of their taps, newest first."""
     if not 1 <= taps <= MAX_TAPS:
         raise ValueError(f"{taps} taps in a sequence: expected 1 to {MAX_TAPS}")
     if not 0 <= angle_step_deg <= 180:
         raise ValueError(f"angle step of {angle_step_deg} deg: expected 0 to 180")
-    newest = np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in targets.poses]).reshape(-1, 1, 3)
-    back = np.zeros((1, taps, 3))
-    back[..., 2] = angle_step_deg * np.arange(taps)[None]
-    return newest - back
+    place = position_mm(TEST_POSITION if split == "test" else VALIDATION_POSITION)
+    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    turns = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    return names, [Pose(*place, turn_deg) for _ in surfaces for turn_deg in turns]
+
+
+def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
+    """Draw places and angles away from the held-out positions."""
+    held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
+    poses: list[Pose] = []
+    while len(poses) < count:
+        x_mm, y_mm = rng.uniform(-SURFACE_REACH_MM, SURFACE_REACH_MM, 2)
+        angle_deg = rng.uniform(0, 360)
+        if np.hypot(*(held_out_mm - (x_mm, y_mm)).T).min() > HELD_OUT_RADIUS_MM:
+            poses.append(Pose(float(x_mm), float(y_mm), float(angle_deg)))
+    return poses
 
 
 def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pose:
@@ -119,6 +77,94 @@ def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pos
     return Pose(newest.x_mm + right_mm, newest.y_mm + up_mm, newest.angle_deg - turn_deg)
 
 
-def as_poses(array: NDArray[np.floating]) -> list[Pose]:
-    """Return the poses of an array (..., 3), in order."""
-    return [Pose(*(float(value) for value in row)) for row in array.reshape(-1, 3)]
+HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
+REACH_MM: Final = 6.0
+"""Largest distance of an earlier tap: two thirds of both pads overlap at least, side by side."""
+NEAR_MM: Final = 3.0
+NEAR_DEG: Final = 45.0
+"""Bounds of most random poses."""
+_STEP_MM: Final = (0.3, 3.0)
+"""Bounds of the step of a slide from tap to tap."""
+_DRIFT_DEG: Final = 3.0
+_QUARTER: Final = ((1, 0), (0, 1), (1, 1))
+
+Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
+"""Function from draws and a number of taps, K, to their poses (K, 3)."""
+
+
+def turns(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return the paper's schedule: the pad turns by a step from tap to tap, at one place."""
+    poses = np.zeros((taps, 3))
+    poses[:, 2] = ANGLE_STEP_DEG * np.arange(taps)
+    return poses
+
+
+def half_pitch(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return taps shifted by half a pitch: three make the grid twice as fine, the next ones lie on the other sides."""
+    signs = rng.choice([-1, 1], 2)
+    first = np.array(_QUARTER) * signs
+    others = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) != (0, 0)])
+    rest = np.array([one for one in others if not (one == first).all(axis=1).any()])
+    poses = np.zeros((taps, 3))
+    poses[1:, :2] = np.concatenate([rng.permutation(first), rng.permutation(rest)])[: taps - 1] * HALF_PITCH_MM
+    return poses
+
+
+def near(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return poses drawn evenly within NEAR_MM and NEAR_DEG of the newest tap."""
+    return _within(rng, taps, NEAR_MM, NEAR_DEG)
+
+
+def far(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return poses drawn evenly within the reach, turned by any angle."""
+    return _within(rng, taps, REACH_MM, 180.0)
+
+
+def slide(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return moments of a slide: even steps in one direction, with a slow turn."""
+    low, high = np.log(_STEP_MM)
+    step_mm = min(float(np.exp(rng.uniform(low, high))), REACH_MM / max(taps - 1, 1))
+    way, turn_deg = rng.uniform(0, 2 * np.pi), rng.uniform(-_DRIFT_DEG, _DRIFT_DEG)
+    return np.arange(taps, dtype=np.float64)[:, None] * np.array(
+        [step_mm * np.cos(way), step_mm * np.sin(way), turn_deg]
+    )
+
+
+def mixed(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
+    """Return a schedule of any kind, as in training."""
+    kinds = (turns, half_pitch, near, far, slide)
+    return kinds[int(rng.choice(len(kinds), p=(0.2, 0.25, 0.3, 0.1, 0.15)))](rng, taps)
+
+
+def schedule_of(name: str) -> Schedule:
+    """Return a schedule by its name; `turns:30` turns by 30 degrees from tap to tap.
+
+    Raises:
+        ValueError: there is no schedule of that name.
+    """
+    if name.startswith("turns:"):
+        step = float(name.partition(":")[2]) / ANGLE_STEP_DEG
+        if not 0 <= step * ANGLE_STEP_DEG <= 180:
+            raise ValueError(f"{name}: expected a turn of 0 to 180 degrees")
+        return lambda rng, taps: turns(rng, taps) * step
+    if name not in SCHEDULES:
+        raise ValueError(f"no schedule {name!r}: expected one of {', '.join(SCHEDULES)}, or turns:DEGREES")
+    return SCHEDULES[name]
+
+
+SCHEDULES: Final[Mapping[str, Schedule]] = {
+    "turns": turns,
+    "half-pitch": half_pitch,
+    "near": near,
+    "far": far,
+    "slide": slide,
+    "mixed": mixed,
+}
+"""Schedules by name."""
+
+
+def _within(rng: np.random.Generator, taps: int, reach_mm: float, turn_deg: float) -> NDArray[np.float64]:
+    away_mm, way = reach_mm * np.sqrt(rng.random(taps)), rng.uniform(0, 2 * np.pi, taps)
+    poses = np.stack([away_mm * np.cos(way), away_mm * np.sin(way), rng.uniform(-turn_deg, turn_deg, taps)], axis=1)
+    poses[0] = 0
+    return poses

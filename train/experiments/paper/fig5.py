@@ -23,7 +23,7 @@ from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.report import Report, Row
-from train.surfaces.poses import random_targets
+from train.surfaces.poses import random_poses
 
 SURFACES: Final = ("large circle", "small circle")
 """Surfaces of the experiment; the first has four times the area of the second."""
@@ -33,12 +33,7 @@ _BINS: Final = 8
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Tap, train, and write table and plot.
-
-    Args:
-        bench: if quick, fewer taps and epochs.
-        folder: where the report goes.
-    """
+    """Tap, train, and write table and plot."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, taps = _tap(poses)
     held_out = np.arange(len(names)) // len(SURFACES) % 3 == 0
@@ -98,10 +93,10 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 def _tap(poses: int) -> tuple[list[str], Taps]:
     """Tap both surfaces at random poses, alternating."""
-    targets = random_targets(np.random.default_rng(5), poses * len(SURFACES), SURFACES)
-    pad = GrippedPad(NOMINAL)
-    heights = [heights_of(name, pose, pad) for name, pose in zip(targets.surfaces, targets.poses, strict=True)]
-    return targets.surfaces, pad.tap(np.stack(heights), _FORCE_N)
+    names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
+    places = random_poses(np.random.default_rng(5), len(names))
+    heights = [heights_of(name, pose, pad) for name, pose in zip(names, places, strict=True)]
+    return names, pad.tap(np.stack(heights), _FORCE_N)
 
 
 def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -102,9 +102,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         "surfaces and steps, in brackets the best and the worst surface. What heaps up around the contact counts as 0, "
         "as no PSF pulls, except in the column that is named so.",
     )
-    report.say(_verdict(methods, truth, indentation_mm))
     report.table(_by_step(methods, truth, indentation_mm, force_n), "RMS error by step, in [um].", "steps")
-    report.table(_by_surface(methods, truth, indentation_mm, surfaces), "RMS error by surface, in %.", "surfaces")
     report.table(_convergence(verdicts), "The finite elements.", "fem")
     with report.figure(size=(11, 4.5)) as figure:
         left, right = figure.subplots(1, 2)
@@ -226,16 +224,6 @@ def _by_step(
     ]
 
 
-def _by_surface(
-    methods: list[Method], truth: Maps, indentation_mm: NDArray[np.floating], surfaces: tuple[str, ...]
-) -> list[Row]:
-    errors = {method.name: _percent(method, truth, indentation_mm).mean(axis=1) for method in methods}
-    return [
-        {"surface": surface, **{name: float(error[i]) for name, error in errors.items() if error.any()}}
-        for i, surface in enumerate(surfaces)
-    ]
-
-
 def _convergence(verdicts: dict[Mesh, list[Verdict]]) -> list[Row]:
     finest = next(iter(verdicts.values()))
     force_n = np.stack([verdict.force_n for verdict in finest])
@@ -262,29 +250,3 @@ def _how(surfaces: int, steps: int, psf: str) -> str:
         "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
         "was worked out."
     )
-
-
-def _verdict(methods: list[Method], truth: Maps, indentation_mm: NDArray[np.floating]) -> str:
-    """Compare Fig. 7's claims with the figures."""
-    lines = []
-    for heaps in (False, True):
-        errors = {method.name: _percent(method, truth, indentation_mm, heaps) for method in methods}
-        first, second = errors["tPSF"], errors["PSF"]
-        for depth in ("Depth x indentation", "Depth x force"):
-            third = errors[depth]
-            shown = first.mean() < second.mean() < third.mean()
-            ordered = (first < second) & (second < third)
-            lines.append(
-                f"{'What heaps up counted as well: ' if heaps else ''}Fig. 7's order tPSF, PSF, {depth} is "
-                f"{'shown' if shown else 'contradicted'} on the mean ({first.mean():.2f}, {second.mean():.2f}, "
-                f"{third.mean():.2f} %), and holds in {ordered.sum()} of {ordered.size} maps; tPSF is nearest of the "
-                f"three in {((first < second) & (first < third)).sum()}."
-            )
-    for name in ("PSF", "tPSF"):
-        method = next(method for method in methods if method.name == name)
-        um, percent = 1e3 * _rms_mm(method, truth).mean(axis=0), _percent(method, truth, indentation_mm).mean(axis=0)
-        lines.append(
-            f"From the first step to the last {name}'s deviation goes from {um[0]:.1f} to {um[-1]:.1f} um, "
-            f"{percent[0]:.2f} to {percent[-1]:.2f} % of the indentation."
-        )
-    return "\n".join(f"- {line}" for line in lines)

@@ -21,8 +21,7 @@ from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
 from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, windows
-from train.experiments.paper.methods import Method, classical_methods, compact_methods
-from train.experiments.paper.trainings import mixed
+from train.experiments.paper.protocol import Method, classical_methods, compact_methods, mixed
 from train.experiments.support.workbench import Figures, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM
@@ -31,7 +30,6 @@ from train.report import Report, Row, bootstrap_interval, with_interval
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
 _DRAWS: Final = 4
-_QUICK_DRAWS: Final = 1
 _NETWORKS: Final = ("stsr", "mtsr2", "mtsr4")
 _CLASSICAL: Final = ("linear map", "bilinear")
 _REACHED: Final = 0.99
@@ -62,7 +60,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     data = mixed(bench)
     methods = [*compact_methods(bench, data, _NETWORKS), *classical_methods(bench, data, _CLASSICAL)]
     sequences = bench.held_out("test").at_scale(SCALE)
-    draws = _QUICK_DRAWS if bench.quick else _DRAWS
+    draws = 1 if bench.quick else _DRAWS
     bins = [
         scans
         for number, bounds in enumerate(pairwise(EDGES_N))
@@ -80,7 +78,6 @@ def run(bench: Workbench, folder: Path) -> Path:
         "against the declared full scale: the less there is, the better they look. Relative error is RMS error over "
         "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they measure errors of shape."
     )
-    report.say(_finding(bins, figures))
     report.table(
         [_row(method, scans, figures[method.name][i]) for i, scans in enumerate(bins) for method in methods],
         "Errors by contact force, with 95 % intervals by tap.",
@@ -108,21 +105,15 @@ def scans_between(sequences: PaperTaps, force_n: tuple[float, float], draws: int
 
 def errors(method: Method, scans: Bin) -> Figures:
     """Return every metric of every scan, (n,) each."""
-    patterns, truth = method.patterns(scans.windows), scans.patterns
+    patterns, truth = method.patterns(scans.windows).astype(np.float64), scans.patterns.astype(np.float64)
     peak = truth.max(axis=(1, 2), keepdims=True)
     return {
         "psnr_db": psnr_db(patterns, truth, MAX_INDENTATION_MM),
         "ssim": ssim(patterns, truth, MAX_INDENTATION_MM),
         "ssim_own": ssim(patterns / peak, truth / peak, 1.0),
-        "relative_percent": relative_error_percent(patterns, truth),
+        "relative_percent": 100 * np.sqrt(np.mean((patterns - truth) ** 2, (1, 2)) / np.mean(truth**2, (1, 2))),
         "contact_iou": contact_iou(patterns, scans.touching, method.contact_level),
     }
-
-
-def relative_error_percent(patterns: NDArray[np.floating], truth: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the RMS error in [% of the truth's RMS], (n,) of maps (n, H, W)."""
-    error = np.mean((np.asarray(patterns, dtype=np.float64) - truth) ** 2, axis=(-2, -1))
-    return 100 * np.sqrt(error / np.mean(truth.astype(np.float64) ** 2, axis=(-2, -1)))
 
 
 def _row(method: Method, scans: Bin, found: Figures) -> Row:
@@ -138,24 +129,6 @@ def _row(method: Method, scans: Bin, found: Figures) -> Row:
         "IoU": round(float(found["contact_iou"].mean()), 4),
         **method.cost,
     }
-
-
-def _finding(bins: list[Bin], figures: dict[str, list[Figures]]) -> str:
-    """Compare the gain from more taps at small and large forces; in the paper it is larger at small ones."""
-    lines: list[str] = []
-    for place, scans in ((0, bins[0]), (-1, bins[-1])):
-        relative = {name: found[place]["relative_percent"] for name, found in figures.items()}
-        means = ", ".join(f"{name} {values.mean():.0f} %" for name, values in relative.items())
-        saved = relative["stsr"] - relative["mtsr4"]
-        low, high = bootstrap_interval(saved, scans.tap)
-        lines.append(
-            f"At {_label(scans)} N relative errors are {means}; of stsr's {relative['stsr'].mean():.1f} points mtsr4 "
-            f"saves {saved.mean():.1f} ({low:.1f}..{high:.1f})."
-        )
-    gains = [float(np.mean(figures["stsr"][i]["ssim_own"] - figures["mtsr4"][i]["ssim_own"])) for i in range(len(bins))]
-    best = int(np.argmin(gains))
-    lines.append(f"SSIM at own scale gains most from four taps at {_label(bins[best])} N: {-gains[best]:+.3f}.")
-    return " ".join(lines)
 
 
 def _draw(figure: Figure, bins: list[Bin], figures: dict[str, list[Figures]]) -> None:

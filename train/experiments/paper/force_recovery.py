@@ -7,7 +7,7 @@ Source: Wu and Liu 2024, Fig. 15.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -15,33 +15,137 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from edge.evaluation import metrics
 from edge.evaluation.classical_methods import fit_gain
 from edge.perception.contact_options import ON_COUNTS
+from edge.perception.tap_tracker import TapTracker
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import USPA44
 from train.data.generation_config import SEED
+from train.data.paper_taps import PaperTaps, between_frames
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.experiments.paper.course import (
-    CLAIM_N,
-    HOLD_S,
-    PRESS_S,
-    RANGE_N,
-    RELEASE_S,
-    REST_S,
-    Course,
-    Scans,
-    contact,
-    errors,
-    pressed,
-    volume_mm3,
-)
-from train.experiments.paper.methods import Method, compact_methods
-from train.experiments.paper.trainings import mixed
+from train.experiments.paper.protocol import Method, compact_methods, mixed
 from train.experiments.support.workbench import Workbench
 from train.freeze import SCALE, TEST_FORCE_N
-from train.physics.sensor_noise import Nuisances
+from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import TARGET_ANGLES_DEG
+
+PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0
+_ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])
+RANGE_N: Final = TEST_FORCE_N
+CLAIM_N: Final = 0.02 * RANGE_N
+"""Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Course of one press; the pad is free at 0 s.
+
+    Attributes:
+        rate_hz: scan rate, in [Hz].
+        time_s: time of each scan, (t,), in [s]; the first is one step after 0.
+        share: share of the press at each scan, (t,); 1 at its set force.
+    """
+
+    rate_hz: float
+    time_s: NDArray[np.float64] = field(init=False)
+    share: NDArray[np.float64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        time_s = np.arange(1, round(_ENDS_S[-1] * self.rate_hz) + 1) / self.rate_hz
+        object.__setattr__(self, "time_s", time_s)
+        object.__setattr__(self, "share", np.interp(time_s, [0, *_ENDS_S], [0, 1, 1, 0, 0]))
+
+    def phase(self, number: int) -> NDArray[np.bool_]:
+        """Return the scans of the press (0), hold (1), release (2) or rest (3), each with its end but not its start."""
+        return np.searchsorted(_ENDS_S, self.time_s - 0.5 / self.rate_hz) == number
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """Scans with their true force and volume.
+
+    Attributes:
+        windows: (n, K, 3, rows, cols) in zeroed counts.
+        force_n: (n,) in [N].
+        volume_mm3: (n,) sum of the true pattern over its area, in [mm3].
+    """
+
+    windows: NDArray[np.float32]
+    force_n: NDArray[np.floating]
+    volume_mm3: NDArray[np.floating]
+
+
+def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisances) -> Scans:
+    """Return the scans of a sequence's newest tap along a course.
+
+    One sensor reads all taps of the sequence; the earlier taps are read at their ends.
+    """
+    index, seed = np.array([number]), [SEED, 3, number]
+    angle_deg = sequences.poses[index, :, 2]
+    end = sequences.share_at_force(index, TEST_FORCE_N)
+    share = end[:, :1] * course.share
+    clean = between_frames(sequences.counts[index, 0], share)[:, None]
+    newest = apply_nuisances(clean, nuisances, seed, tap_s=course.time_s[-1], angle_deg=angle_deg[:, :1])[0, 0]
+    earlier = read_windows(sequences.counts[index], end, nuisances, seed, PRESS_S / end, angle_deg)[0, 1:]
+    whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), sequences.scale)
+    return Scans(
+        windows=np.concatenate([newest[:, None], np.broadcast_to(earlier, (len(newest), *earlier.shape))], axis=1),
+        force_n=sequences.force_at(index, share)[0],
+        volume_mm3=whole_mm3 * course.share,  # flat contacts: in proportion to the indentation
+    )
+
+
+def contact(scans: Scans, course: Course) -> NDArray[np.bool_]:
+    """Return the scans (n,) in which the runtime detects a contact."""
+    tracker = TapTracker(taps=1)
+    times_ns = np.rint(course.time_s * 1e9).astype(np.int64)
+    return np.array(
+        [tracker.push(scan, int(now_ns)).contact for scan, now_ns in zip(scans.windows[:, 0], times_ns, strict=True)]
+    )
+
+
+def errors(
+    true_n: NDArray[np.floating], found_n: NDArray[np.floating], gate: NDArray[np.bool_], course: Course
+) -> dict[str, float]:
+    """Return the figures of one press, in [% of RANGE_N] or in [% of scans]."""
+    resting, loaded = course.phase(3), ~course.phase(3)
+    return {
+        "error": _rms_percent(found_n - true_n),
+        "own": _rms_percent(fit_gain(found_n, true_n) * found_n - true_n),
+        "gated": _rms_percent(np.where(gate, found_n, 0) - true_n),
+        "loop": loop_percent(true_n, found_n, course),
+        "rest": 100 * float(np.abs(found_n[resting]).mean()) / RANGE_N,
+        "false": 100 * float((found_n[resting] > CLAIM_N).mean()),
+        "false gated": 100 * float(gate[resting].mean()),
+        "missed": 100 * float((~gate[loaded]).mean()),
+    }
+
+
+def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], course: Course) -> float:
+    """Return the largest difference between press and release at equal true force, in [% of RANGE_N].
+
+    Both branches are interpolated linearly between scans; the tenths next to their turning points are left out.
+    """
+    at_n = np.linspace(0.1, 0.9, 33) * true_n.max()
+    ways: list[NDArray[np.float64]] = []
+    for phase in (0, 2):
+        way = np.flatnonzero(course.phase(phase))
+        way = way[np.argsort(true_n[way], kind="stable")]
+        ways.append(np.interp(at_n, true_n[way], found_n[way]))
+    return 100 * float(np.abs(ways[0] - ways[1]).max()) / RANGE_N
+
+
+def volume_mm3(patterns: NDArray[np.floating], scale: int) -> NDArray[np.floating]:
+    """Return the sum of patterns (n, H, W) in [mm] over their area, (n,) in [mm3]."""
+    return metrics.volume_mm3(patterns, USPA44.pixel_pitch_mm(scale))
+
+
+def _rms_percent(error_n: NDArray[np.floating]) -> float:
+    return 100 * float(np.sqrt(np.mean(error_n**2))) / RANGE_N
+
 
 _RATE_HZ: Final = 100.0
 _QUICK_RATE_HZ: Final = 20.0
@@ -113,8 +217,6 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"more than {CLAIM_N:g} N, and scans that pass the runtime's contact threshold ({ON_COUNTS:g} counts of summed "
         "z), below which no pattern is made; that threshold misses loaded scans, too."
     )
-    for condition in CONDITIONS:
-        report.say(_finding(condition, [row for row in rows if row["nuisances"] == condition]))
     report.table(rows, "Force recovery, means over presses with 95 % intervals.")
     report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
     with report.figure(size=(13, 8)) as figure:
@@ -140,48 +242,27 @@ def _gauges(networks: list[Method]) -> list[Gauge]:
     ]
 
 
+_COLUMNS: Final = {
+    "error": "error %",
+    "own": "with its own factor %",
+    "gated": "above the threshold %",
+    "loop": "loop %",
+    "rest": "at no load %",
+    "false": "false contact, % of scans",
+    "false gated": "past the threshold, % of scans",
+    "missed": "loaded but missed, % of scans",
+}
+
+
 def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
-    taps = np.arange(len(presses))
-    means = {key: np.array([press[key] for press in presses]) for key in presses[0]}
-    columns = {
-        "error": "error %",
-        "own": "with its own factor %",
-        "gated": "above the threshold %",
-        "loop": "loop %",
-        "rest": "at no load %",
-        "false": "false contact, % of scans",
-        "false gated": "past the threshold, % of scans",
-        "missed": "loaded but missed, % of scans",
-    }
+    means = {label: np.array([press[key] for press in presses]) for key, label in _COLUMNS.items()}
     return {
         "nuisances": condition,
         "model": gauge.name,
-        **{label: with_interval(means[key], taps) for key, label in columns.items()},
+        **{label: with_interval(values, np.arange(len(presses))) for label, values in means.items()},
         "N per unit": gauge.newtons_per_unit,
         **gauge.cost,
     }
-
-
-def _finding(condition: str, rows: list[Row]) -> str:
-    """Name the method with the least force error, and list the remaining errors."""
-
-    def mean(row: Row, column: str) -> float:
-        return float(str(row[column]).split()[0])
-
-    real = [row for row in rows if row["model"] != "true pattern"]
-    best = min(real, key=lambda row: mean(row, "error %"))
-    listed = "; ".join(
-        f"{row['model']} {row['error %']} %, loop {mean(row, 'loop %'):.1f} %, false contact "
-        f"{mean(row, 'false contact, % of scans'):.0f} % of scans"
-        for row in real
-    )
-    true = next(row for row in rows if row["model"] == "true pattern")
-    return (
-        f"**{condition}**: least error has {best['model']}. {listed}. A true pattern would be off by "
-        f"{mean(true, 'error %'):.1f} %, as one factor does not suit all shapes. Past the runtime's threshold come "
-        f"{mean(best, 'past the threshold, % of scans'):.0f} % of the scans at no load; it misses "
-        f"{mean(best, 'loaded but missed, % of scans'):.0f} % of those under load."
-    )
 
 
 def _draw(

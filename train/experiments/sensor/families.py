@@ -19,13 +19,12 @@ from edge.evaluation.metrics import psnr_db
 from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regions
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
-from train.data.batches import COUNTS_PER_UNIT
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
-from train.data.press_batches import read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, read_presses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses, load_shipped, pattern_cells
+from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses, pattern_cells
 from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.learning.checkpoint import best_contact_level
@@ -82,8 +81,7 @@ class Baseline:
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate all methods, and write the report `families`."""
     wide = bench.wide_test()
-    model = load_shipped(bench.models)
-    bench.use(bench.models / f"{model.name}.onnx")
+    model = bench.model()
     validation = freeze_presses(bench.presses("validation", VALIDATION), SEED)
     baselines = fit_baselines(bench.presses("gripped", TRAINING), validation)
     best = max(baselines, key=lambda one: one.validation_db).name

@@ -20,7 +20,7 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED, one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
-from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses, load_shipped
+from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
@@ -68,8 +68,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     pool = joblib.Parallel(n_jobs=-1, return_as="generator")
     jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
     read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
-    model = load_shipped(bench.models)
-    bench.use(bench.models / f"{model.name}.onnx")
+    model = bench.model()
     scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
     report = Report("pads", folder, __file__, bench.used, quick=bench.quick)
     plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}

@@ -19,7 +19,7 @@ from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
 from train.data.make_presses import make_presses
-from train.data.posed_batches import stated_poses
+from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
@@ -50,7 +50,7 @@ _WINDOW: Final = 4
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses and write the report `posed-taps`."""
-    models = {name: ModelSession(bench.use(bench.models / f"{name}.onnx")) for name, _ in _WAYS}
+    models = {name: bench.model(name) for name, _ in _WAYS}
     model = models[MODEL]
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)

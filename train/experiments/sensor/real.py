@@ -60,13 +60,7 @@ class Played:
 
 
 def play(grip: Grip, model: ModelSession, hidden: int | None = None) -> Played:
-    """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred.
-
-    Args:
-        grip: the recording.
-        model: model of the runtime.
-        hidden: taxel that is silent from the first scan on.
-    """
+    """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
     options, free = RuntimeOptions(every_scan=True), {name: grip.free}
@@ -107,11 +101,7 @@ def _above_half(patterns: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `real`; the full run takes a minute or two.
-
-    Raises:
-        DatasetError: there are no recordings, or no presses.
-    """
+    """Write the report `real`; the full run takes a minute or two."""
     grips = recorded_grips(recordings_folder())
     bench.use(TAXELS)
     model = ModelSession(bench.use(find_model(DEFAULT_MODEL)))

@@ -3,13 +3,11 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.bundled import DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses
@@ -35,15 +33,6 @@ class Inferred:
     patterns: NDArray[np.float32]
     deviations: NDArray[np.float32]
     run_time_us: float
-
-
-def load_shipped(folder: Path) -> ModelSession:
-    """Load the shipped model.
-
-    Raises:
-        ModelError: it does not exist, or cannot be used.
-    """
-    return ModelSession(folder / f"{DEFAULT_MODEL}.onnx")
 
 
 def known_pads(frozen: FrozenPresses, known: str) -> list[Pad | None]:

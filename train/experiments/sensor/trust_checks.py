@@ -29,7 +29,7 @@ from train.experiments.sensor.contact_verdicts import (
 )
 from train.experiments.sensor.real import play
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
-from train.experiments.sensor.shipped import ALL, NOTHING, known_pads, load_shipped
+from train.experiments.sensor.shipped import ALL, NOTHING, known_pads
 from train.experiments.sensor.wrong_taps import tap_tables
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import SHARES
@@ -47,9 +47,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     Raises:
         CheckpointError: a shipped model has no checks.
     """
-    model = load_shipped(bench.models)
+    model = bench.model()
     names = (_MODELS[0], _SEVERAL) if bench.quick else _MODELS
-    models = [ModelSession(bench.use(bench.models / f"{name}{INT8_SUFFIX}.onnx")) for name in names]
+    models = [bench.model(f"{name}{INT8_SUFFIX}") for name in names]
     for one in models:
         if one.contract.read_trust() is None:
             raise CheckpointError(f"{one.name} has no checks: give it some with export.checks")

@@ -14,8 +14,7 @@ from edge.perception.contact_options import ON_COUNTS
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses
-from train.experiments.sensor.contact_verdicts import share
-from train.experiments.sensor.pushed import PushedSensor
+from train.experiments.sensor.contact_verdicts import PushedSensor, share
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Row, bootstrap_interval
 
@@ -52,13 +51,7 @@ class Guarded:
 
 
 def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> Iterator[Table]:
-    """Yield the tables of dropped taps and of PSNR.
-
-    Args:
-        single: model of one tap.
-        several: file of a model of more.
-        sensors: presses read by one sensor for each pad.
-    """
+    """Yield the tables of dropped taps and of PSNR."""
     guarding, unguarded = ModelSession(several), ModelSession(several)
     unguarded.contract = replace(unguarded.contract, trust={})
     taps, name_of = guarding.contract.taps, guarding.name

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -10,12 +10,14 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.bundled import BUNDLE_DIR
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.generation_config import SEED
+from train.data.generation_config import SEED, one_thread
 from train.data.make_presses import make_presses
 from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import PressSet
@@ -23,7 +25,7 @@ from train.data.world import World
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.networks.blocks import PatternNet
-from train.networks.cost import macs, parameters_count
+from train.networks.symmetric import SymmetricConv2d
 from train.physics.gripped import FRAMES
 from train.physics.sensor_noise import Nuisances
 from train.report import Row, with_interval
@@ -72,6 +74,10 @@ class Workbench:
             )
         self.data_folder.mkdir(parents=True, exist_ok=True)
         return make_presses(world, self.data_folder / f"{name}.npz")
+
+    def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
+        """Return a shipped model, in the session of the runtime."""
+        return ModelSession(self.use(self.models / f"{name}.onnx"))
 
     def wide_test(self) -> FrozenPresses:
         """The wide frozen set."""
@@ -139,20 +145,19 @@ def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
 def cost_cells(net: PatternNet) -> Row:
     """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
     window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    times_ms = []
-    with torch.inference_mode():
-        while len(times_ms) < _TIMED_RUNS and sum(times_ms) < _TIMED_MS:
-            started_s = time.perf_counter()
-            net(window)
-            times_ms.append(1e3 * (time.perf_counter() - started_s))
-    torch.set_num_threads(threads)
-    return {
-        "parameters": parameters_count(net),
-        "MMAC": round(macs(net) / 1e6, 1),
-        "run time ms": round(float(np.median(times_ms[len(times_ms) // 3 :])), 3),
-    }
+    with one_thread(), torch.inference_mode():
+        run_time_ms = median_ms(lambda: net(window))
+    return {"parameters": parameters_count(net), "MMAC": round(macs(net) / 1e6, 1), "run time ms": run_time_ms}
+
+
+def median_ms(run: Callable[[], object]) -> float:
+    """Return the median time of some runs, without the first third of them, in [ms]."""
+    times_ms: list[float] = []
+    while len(times_ms) < _TIMED_RUNS and sum(times_ms) < _TIMED_MS:
+        started_s = time.perf_counter()
+        run()
+        times_ms.append(1e3 * (time.perf_counter() - started_s))
+    return round(float(np.median(times_ms[len(times_ms) // 3 :])), 3)
 
 
 def _quick(training: Training) -> Training:
@@ -161,3 +166,32 @@ def _quick(training: Training) -> Training:
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
+
+
+_TAXEL_AXES: Final = 3
+
+
+def parameters_count(net: nn.Module) -> int:
+    """Return the number of trainable parameters."""
+    return sum(parameter.numel() for parameter in net.parameters())
+
+
+def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
+    """Count multiply-accumulates of one window in convolutions and linear layers, without norms and interpolation."""
+    counted: list[int] = []
+
+    def count(layer: nn.Conv2d | nn.Linear | SymmetricConv2d, _: object, output: torch.Tensor) -> None:
+        # Every output value is the sum of as many products as one row of the weights has entries.
+        counted.append(output[0].numel() * layer.weight[0].numel())
+
+    summing = [layer for layer in net.modules() if isinstance(layer, (nn.Conv2d, nn.Linear, SymmetricConv2d))]
+    hooks = [layer.register_forward_hook(count) for layer in summing]
+    like, training = next(net.parameters()), net.training
+    try:
+        with torch.inference_mode():
+            net.eval()(torch.zeros(1, _TAXEL_AXES * net.taps, rows, cols, device=like.device, dtype=like.dtype))
+    finally:
+        for hook in hooks:
+            hook.remove()
+        net.train(training)
+    return sum(counted)

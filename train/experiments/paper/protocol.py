@@ -1,20 +1,32 @@
-"""Networks that the experiments train, and their data, in one list so that no network is trained twice."""
+"""The paper's protocol: its data, the networks that are trained on them, and the methods that are compared."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
 from edge.evaluation.test_set import FrozenSet
+from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World
-from train.experiments.support.workbench import Workbench
+from train.errors import CheckpointError
+from train.experiments.support.workbench import Workbench, cost_cells, median_ms
 from train.fit import given_taps
-from train.learning.checkpoint import Training
+from train.freeze import CLASSICAL_WINDOWS, fit_classical
+from train.learning.checkpoint import Training, infer
+from train.learning.interval_fit import LEVEL, half_width_mm
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.physics.gripped import FINE_SCALE, SCALE
+from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
+_QUICK_WINDOWS: Final = 300
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
 """Surfaces that Fig. 16 leaves out of a training."""
 KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
@@ -128,3 +140,104 @@ def trained(
 
 
 _STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Method from windows to patterns.
+
+    Attributes:
+        name: as shown in tables.
+        taps: taps of a window that the method uses.
+        contact_level: share of a pattern's maximum from which a pixel counts as touched.
+        cost: parameters, multiply-accumulates and run time, as cells of a row.
+        run: windows (n, taps, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
+    """
+
+    name: str
+    taps: int
+    contact_level: float
+    cost: Row
+    run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
+
+    def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
+        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
+        return self.run(windows[:, : self.taps])
+
+
+def compact_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
+    """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
+    validation = bench.frozen("validation")
+    methods: list[Method] = []
+    for name in names:
+        net, facts = trained(bench, compact(name), data, validation)
+        methods.append(
+            Method(
+                name, net.taps, facts["contact_level"], cost_cells(net), lambda windows, net=net: infer(net, windows)[0]
+            )
+        )
+    return methods
+
+
+def classical_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
+    """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
+    path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
+    if not path.exists():
+        fitted = fit_classical(data, _QUICK_WINDOWS if bench.quick else CLASSICAL_WINDOWS)
+        np.savez_compressed(path, allow_pickle=False, **fitted)
+    by_name = fitted_methods(path, SCALE)
+    methods: list[Method] = []
+    scan = np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
+    for name in names:
+        run = by_name[name]
+        cost: Row = {
+            "parameters": 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1,
+            "MMAC": round(method_macs(name, SCALE) / 1e6, 3),
+            "run time ms": median_ms(partial(run, scan)),
+        }
+        methods.append(Method(name, 1, CONTACT_LEVEL, cost, lambda windows, run=run: run(windows[:, 0])))
+    return methods
+
+
+@dataclass(frozen=True, slots=True)
+class Intervals:
+    """Patterns and deviations predicted for the n frames of a frozen set, with the truth.
+
+    Attributes:
+        frozen: the frames.
+        truth: (n, H, W) in [mm].
+        pattern: (n, H, W) in [mm].
+        deviation: (n, H, W) above 0, in [mm].
+    """
+
+    frozen: FrozenSet
+    truth: NDArray[np.float32]
+    pattern: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+
+    def covered(self, level: float = LEVEL) -> NDArray[np.bool_]:
+        """Return a mask (n, H, W), true where the truth lies within the interval."""
+        return np.abs(self.truth - self.pattern) <= half_width_mm(self.deviation, level)
+
+    def width_percent(self) -> NDArray[np.floating]:
+        """Return the width of the intervals, (n, H, W), in [% of the frame's indentation]."""
+        return 200 * half_width_mm(self.deviation) / self.frozen.indentation_mm[:, None, None]
+
+    def cells(self) -> Row:
+        """Return coverage and mean width of the 90 % interval, each with its interval by tap, as cells of a row."""
+        return {
+            "covered %": with_interval(100 * self.covered().mean(axis=(1, 2)), self.frozen.tap, 1),
+            "width %": with_interval(self.width_percent().mean(axis=(1, 2)), self.frozen.tap, 1),
+        }
+
+
+def intervals(net: PatternNet, frozen: FrozenSet, given: int | None = None) -> Intervals:
+    """Run a network on every frame, with the newest `given` taps or all that it takes.
+
+    Raises:
+        CheckpointError: the network predicts no deviations.
+    """
+    pattern, deviation = infer(net, frozen.windows(net.taps, given))
+    if deviation is None:
+        raise CheckpointError(f"{type(net).__name__} gives no deviations: take a compact network")
+    return Intervals(frozen, frozen.patterns(), pattern, deviation)

@@ -1,4 +1,4 @@
-"""Table III: all methods at x10, on the same targets, compared with the paper's figures."""
+"""Tables III and IV: all methods at x10 on the same targets, and the STSR at five scales, beside the paper's."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,13 +11,22 @@ from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.data.presses import PressSet
-from train.experiments.paper.methods import classical_methods
-from train.experiments.paper.trainings import SEED_BATCH, SEED_STSR_LONGER, compact, mixed, seed_size, trained
+from train.experiments.paper.protocol import (
+    SEED_BATCH,
+    SEED_STSR_LONGER,
+    at_scale,
+    classical_methods,
+    compact,
+    mixed,
+    seed_size,
+    trained,
+)
 from train.experiments.support.workbench import Figures, Workbench, cost_cells, error_cells
 from train.learning.checkpoint import infer
-from train.report import Report, Row, bootstrap_interval
+from train.physics.gripped import SCALE
+from train.report import Report, Row, signed_interval
 
-PAPER: Final[Mapping[str, tuple[float, float, float, float]]] = {
+TABLE_3: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "bilinear": (17.31, 0.5128, 18.10, 0.5663),
     "srcnn": (22.17, 0.8277, 21.10, 0.7690),
     "srgan": (22.05, 0.8241, 21.54, 0.7876),
@@ -31,6 +40,9 @@ PAPER: Final[Mapping[str, tuple[float, float, float, float]]] = {
 }
 """PSNR in [dB] and SSIM on the validation and the test set (Wu and Liu 2024, Table III): other data, other units."""
 
+TABLE_4: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
+"""Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""
+
 SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7")
 CLASSICAL: Final = ("bilinear", "bicubic", "linear map")
 COMPACT_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4", "mtsr7")
@@ -40,7 +52,7 @@ ONE_IN: Final = 8
 Sets = Mapping[str, FrozenSet]
 
 
-def run(bench: Workbench, folder: Path) -> Path:
+def run_table3(bench: Workbench, folder: Path) -> Path:
     """Train absent networks, evaluate all methods, and write table and plot."""
     data = mixed(bench)
     sets = {split: bench.frozen(split) for split in ("validation", "test")}
@@ -57,7 +69,12 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"torch, one thread. All are trained on the same {len(data)} sequences; training min and steps count those of "
         "the network that a row's started from. The paper's figures are of real data in other units."
     )
-    report.say(_epochs(rows, len(data)))
+    epochs = ", ".join(
+        f"{row['method']} {float(str(row['steps'])) * SEED_BATCH / len(data):.2f}"
+        for row in rows
+        if "steps" in row and not str(row["method"]).startswith("compact")
+    )
+    report.say(f"The networks of the paper were trained for a fixed time, here for so many epochs: {epochs}.")
     report.say(_verdicts(test_psnr, test.tap))
     report.table(rows, "Validation and test set, x10.")
     with report.figure(size=(8, 5)) as figure:
@@ -102,20 +119,9 @@ def _row(
     row: Row = {"method": name}
     for split, frozen in sets.items():
         row |= error_cells(figures[split], frozen, split)
-    theirs = PAPER.get(paper)
+    theirs = TABLE_3.get(paper)
     row |= {"paper's test PSNR dB": theirs and theirs[2], "paper's test SSIM": theirs and theirs[3]}
     return row | costs, figures["test"]
-
-
-def _epochs(rows: list[Row], sequences: int) -> str:
-    """State the number of passes over the data in each training of the paper's networks."""
-    of = {
-        str(row["method"]): float(str(row["steps"])) * SEED_BATCH / sequences
-        for row in rows
-        if "steps" in row and not str(row["method"]).startswith("compact")
-    }
-    facts = ", ".join(f"{name} {epochs:.2f}" for name, epochs in of.items())
-    return f"The networks of the paper were trained for a fixed time, on this machine for so many epochs: {facts}."
 
 
 def _verdicts(test_psnr: Mapping[str, NDArray[np.float64]], taps: NDArray[np.integer]) -> str:
@@ -127,7 +133,37 @@ def _verdicts(test_psnr: Mapping[str, NDArray[np.float64]], taps: NDArray[np.int
     )
     lines = []
     for better, worse in (pair for pair in asked if set(pair) <= set(test_psnr)):
-        gain = test_psnr[better] - test_psnr[worse]
-        low, high = bootstrap_interval(gain, taps)
-        lines.append(f"- {better} over {worse}: {gain.mean():+.2f} dB ({low:+.2f}..{high:+.2f})")
+        lines.append(f"- {better} over {worse} [dB]: {signed_interval(test_psnr[better] - test_psnr[worse], taps)}")
     return "On the test set, tap by tap:\n\n" + "\n".join(lines)
+
+
+def run_table4(bench: Workbench, folder: Path) -> Path:
+    """Train absent networks, evaluate each scale against the truth at that scale, and write table and plot."""
+    rows: list[Row] = []
+    means = []
+    for scale, (paper_db, paper_ssim) in tracked(TABLE_4.items(), "scales", "scale"):
+        validation, test = (bench.frozen(split, scale=scale) for split in ("validation", "test"))
+        if scale != SCALE:  # the base is evaluated at its own scale
+            trained(bench, at_scale(SCALE), mixed(bench), bench.frozen("validation"))
+        net, facts = bench.network(at_scale(scale), mixed(bench, scale), validation)
+        row: Row = {"scale": f"x{scale}", "pattern": "{} x {}".format(*test.unit_patterns.shape[1:])}
+        for split, frozen in (("validation", validation), ("test", test)):
+            figures = judge(infer(net, frozen.windows(1))[0], frozen, facts["contact_level"])
+            row |= error_cells(figures, frozen, split)
+        means.append(float(figures["psnr_db"].mean()))
+        row |= {"paper's test PSNR dB": paper_db, "paper's test SSIM": paper_ssim}
+        rows.append(row | cost_cells(net) | bench.training_cells(facts))
+    report = Report("table4", folder, __file__, bench.used, quick=bench.quick)
+    report.say(
+        "The compact STSR. Truth is made at x20 and brought to each scale with anti-aliasing. At x10 the layers that"
+        " make pixels are as old as the base network, at the other scales they are trained from nothing for the last"
+        " steps alone: compare those with each other."
+    )
+    report.table(rows, "STSR by scale.")
+    with report.figure() as figure:
+        axes = figure.subplots()
+        axes.plot(list(TABLE_4), means, "o-", label="compact STSR, simulated")
+        axes.plot(list(TABLE_4), [psnr for psnr, _ in TABLE_4.values()], "x--", label="paper, real data, other units")
+        axes.set(xlabel="scale", ylabel="test PSNR [dB]", xticks=list(TABLE_4))
+        axes.legend()
+    return report.write()
