@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -237,7 +238,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
     with subprocess.Popen(command, cwd=tmp_path, env=where, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         while not list(tmp_path.glob(".new.mcap.*/new.mcap")) and process.poll() is None:
-            pass
+            time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, b"") and b"Traceback" not in err
