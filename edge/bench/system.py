@@ -171,7 +171,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in names])
     pressed = -(-sensors // PRESSED_SHARE) if part == "in contact" else 0
     played = [write_recording(folder / f"{number}.csv", number, pressed=number < pressed) for number in range(sensors)]
-    command = ["-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop", "--buses", str(buses)]
+    command = ["-m", "edge.bench.emulated_buses", "--buses", str(buses)]
     command += ["--rate-hz", str(RATE_HZ), "--frame-us", str(FRAME_US * -(-sensors // buses))]
     command += ["--stamps", str(folder / "stamps.txt"), *map(str, played)]
     program = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]

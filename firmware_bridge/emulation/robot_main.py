@@ -4,16 +4,18 @@
 
 The first line it prints is the port. Each further one is a pose as JSON, with the time at which the pad was there.
 After the line "follow" on stdin it waits, after each tap that a proposal may follow, for a line with the place of the
-next one in [mm], such as [2.35, 0], or null for the next one of the recording. Otherwise it plays the recording.
+next one in [mm], such as [2.35, 0], or null for the next one of the recording. Otherwise it plays the recording, and
+ends with it, or when stdin is closed.
 """
 
+import argparse
 import json
 import os
+import select
 import sys
-from argparse import Namespace
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,15 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.slcan_main import argument_parser, play
+from firmware_bridge.errors import BridgeError
+from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.pose_columns import POSE_FIELDS
 from firmware_bridge.recording.tracks import Recording, Track
 
 FOLLOW: Final = "follow"
+INTERRUPTED: Final = 130
 MOVE_SCANS: Final = 10
 """Scans of the free pad while the robot moves to a tap that was asked for."""
 LONGEST_WAIT_SCANS: Final = 500
 """Scans after which a robot that is not asked any more taps by the recording."""
+_STOP_POLL_S: Final = 0.05
 _OPTIONS: Final = ("tap", "option_counts", "option_pose")
 
 
@@ -111,19 +116,44 @@ class Robot:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play the recording named on the command line."""
-    return play(argument_parser("python -m firmware_bridge.emulation.robot_main", __doc__), arguments, _emulator)
+    """Play the recording named on the command line, and return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m firmware_bridge.emulation.robot_main", description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("file", type=Path, help="recording of one sensor")
+    parser.add_argument("--rate-hz", type=float, help="scans a second (default: as recorded)")
+    parser.add_argument("--loop", action="store_true", help="begin again after the last scan")
+    options = parser.parse_args(arguments)
+    try:
+        recording = load_recording(options.file)
+        robot = Robot(recording, _options(options.file))
+        emulator = Emulator(
+            [recording],
+            rate_hz=options.rate_hz,
+            loop=options.loop,
+            on_scan=robot.state,
+            played=robot.played,
+            take_input=robot.take,
+        )
+        _play(emulator)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except (BridgeError, ValueError) as error:
+        parser.error(str(error))
+    return 0
 
 
-def _emulator(
-    recordings: Sequence[Recording], usual: Mapping[str, Any], options: Namespace, closing: ExitStack
-) -> Emulator:
-    if options.buses > 1:
-        raise ValueError(f"--buses is {options.buses}: the robot has one pad, so leave it out")
-    robot = Robot(recordings[0], _options(recordings[0].path))
+def _play(emulator: Emulator) -> None:
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)
-    return Emulator(recordings, **{**usual, "on_scan": robot.state, "played": robot.played, "take_input": robot.take})
+    with emulator:
+        sys.stdout.write(f"{emulator.port}\n")
+        sys.stdout.flush()
+        while not emulator.wait(_STOP_POLL_S):
+            if select.select([0], [], [], 0)[0]:
+                text = os.read(0, 4096)
+                if not text:
+                    return
+                emulator.take_input(text)
 
 
 def _options(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,7 +1,7 @@
 """Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal.
 
 It is as strict as the device: silent until bitrate and open, deaf at the wrong line speed, and frames
-that the client does not fetch in time are lost. `slcan_main` is its command line.
+that the client does not fetch in time are lost.
 """
 
 import math

@@ -51,7 +51,6 @@ class DemoLink(Link):
                 sys.executable,
                 "-m",
                 "firmware_bridge.emulation.robot_main",
-                "--until-stdin-closes",
                 *rate,
                 *loop,
                 "--",

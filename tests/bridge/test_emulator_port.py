@@ -8,8 +8,6 @@ import subprocess
 import sys
 import termios
 import time
-from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +17,8 @@ import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
 from serial_samples import wait_for
 
-from firmware_bridge.emulation import robot_main
+from firmware_bridge.emulation.robot_main import main
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.slcan_main import main
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -124,38 +121,21 @@ def test_latency_bunches_what_arrives(latency_s, fewest, most):
 
 
 def start(*arguments: object) -> Any:
-    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", *map(str, arguments)]
+    command = [sys.executable, "-m", "firmware_bridge.emulation.robot_main", *map(str, arguments)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_the_command_plays_and_ends_with_who_started_it(tmp_path):
     path = write_recording(tmp_path / "a.csv", make_counts(8))
-    with start(path, path, "--controller", "3,5", "--rate-hz", 200, "--no-acks", "--seed", 4) as process:
+    with start(path, "--rate-hz", 200) as process:
         with SlcanSerialLink(process.stdout.readline().strip()) as link:
             scans = read_until_lost(link)
-        assert {scan.sensor for scan in scans} == {"3", "5"} and len(scans) == 16
-        assert link.counters()["replies"] == 0
+        assert {scan.sensor for scan in scans} == {"4"} and len(scans) == 8
         assert process.wait(60) == 0
-    with start(path, "--rate-hz", 100, "--loop", "--until-stdin-closes") as process:
+    with start(path, "--rate-hz", 100, "--loop") as process:
         assert process.stdout.readline().startswith("/dev/pts/") and process.poll() is None
         process.stdin.close()
         assert process.wait(60) == 0
-
-
-def test_one_command_plays_several_buses_each_to_its_own_end(tmp_path):
-    paths = [write_recording(tmp_path / f"{n}.csv", make_counts(scans, seed=n)) for n, scans in enumerate((8, 20, 8))]
-    options = ("--buses", 2, "--rate-hz", 100, "--link", tmp_path / "skin", "--stamps", tmp_path / "stamps")
-    with start(*paths, *options) as process, contextlib.ExitStack() as opening, ThreadPoolExecutor() as pool:
-        ports = [process.stdout.readline().strip() for _ in range(2)]
-        links = [opening.enter_context(SlcanSerialLink(port)) for port in ports]
-        first, second = pool.map(read_until_lost, links)
-        assert process.wait(10) == 0
-    assert ports == [f"{tmp_path}/skin0", f"{tmp_path}/skin1"]
-    assert [len(scans) for scans in (first, second)] == [16, 20]
-    assert (stacked(first, "4") == make_counts(8)).all() and (stacked(first, "6") == make_counts(8, seed=2)).all()
-    assert (stacked(second, "4") == make_counts(20, seed=1)).all()
-    stamps = Counter(line.split()[0] for line in (tmp_path / "stamps").read_text().splitlines())
-    assert stamps == {"bus0/4": 8, "bus0/6": 8, "bus1/4": 20}
 
 
 def test_the_command_goes_on_where_it_was_after_a_stop(tmp_path):
@@ -198,35 +178,14 @@ def test_a_stop_amid_a_scan_tears_none():
 
 
 @pytest.mark.parametrize(
-    ("command", "arguments", "words"),
-    [
-        (main, ["gone.csv"], "cannot be read"),
-        (main, ["a.csv"], "--rate-hz"),
-        (main, ["a.csv", "--controller", "x"], "'x' are not controller ids, such as 4,6"),
-        (
-            main,
-            ["a.csv", "--rate-hz", "9", "--link", "/nonexist/x"],
-            "link is /nonexist/x, expected a path in a folder",
-        ),
-        (main, ["a.csv", "--rate-hz", "9", "--link", "a.csv"], "a.csv, expected a path that is free or a link"),
-        (main, ["a.csv", "--rate-hz", "9", "--link", "/proc/x"], "link is /proc/x, which cannot be made: "),
-        (main, ["a.csv", "--rate-hz", "9", "--stamps", "/nonexist/x"], "/nonexist/x: cannot be written: No such file"),
-        (main, ["a.csv", "--rate-hz", "0"], "positive"),
-        (main, ["a.csv", "--rate-hz", "100", "--latency-ms", "-1"], "latency_s"),
-        (main, ["a.csv", "a.csv", "--buses", "0"], "--buses is 0, expected 1 to the number of recordings, 2"),
-        (main, ["a.csv", "a.csv", "--buses", "3"], "--buses is 3, expected 1 to the number of recordings, 2"),
-        (
-            robot_main.main,
-            ["a.csv", "a.csv", "--rate-hz", "100", "--buses", "2"],
-            "--buses is 2: the robot has one pad, so leave it out",
-        ),
-    ],
+    ("arguments", "words"),
+    [(["gone.csv"], "cannot be read"), (["a.csv"], "--rate-hz"), (["a.csv", "--rate-hz", "0"], "positive")],
 )
-def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, capsys, command, arguments, words):
+def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, capsys, arguments, words):
     write_recording(tmp_path / "a.csv", make_counts(1))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):
-        command(arguments)
+        main(arguments)
     assert words in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -235,9 +194,9 @@ def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Emulator, "wait", interrupt)
-    path, link = write_recording(tmp_path / "a.csv", make_counts(1)), tmp_path / "skin"
-    assert main([str(path), "--rate-hz", "100", "--link", str(link)]) == 130
-    assert capsys.readouterr() == (f"{link}\n", "") and not link.is_symlink()
+    path = write_recording(tmp_path / "a.csv", make_counts(1))
+    assert main([str(path), "--rate-hz", "100"]) == 130
+    assert capsys.readouterr().err == ""
 
 
 def test_the_terminal_is_left_for_the_client_to_set_up():

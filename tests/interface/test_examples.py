@@ -100,7 +100,7 @@ def closing(empty, tmp_path):
     write_recording(tmp_path / "rest.npz", [0] * 100)
     write_model(tmp_path / "tiny.onnx", make_trusted_contract())
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
-    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop"]
+    command = [sys.executable, "-m", "edge.bench.emulated_buses"]
     with subprocess.Popen(
         [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as emulator:

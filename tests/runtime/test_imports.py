@@ -31,7 +31,7 @@ def test_the_runtime_loads_no_training_library():
         "edge.cli.main",
         "edge.inference.onnx_session",
         "edge.cli.demo_score",
-        "firmware_bridge.emulation.slcan_main",
+        "firmware_bridge.emulation.robot_main",
     } <= set(modules)
     assert not loaded(*modules) & FORBIDDEN
 
@@ -57,7 +57,7 @@ UNUSED_IN_A_REPLAY = {
     "edge.cli.demo_score",
     "edge.terminal.heatmap",
     "edge.cli.realtime",
-    "firmware_bridge.emulation.slcan_main",
+    "firmware_bridge.emulation.robot_main",
     "firmware_bridge.emulation.slcan_emulator",
     "firmware_bridge.links.demo",
     "firmware_bridge.links.slcan_serial",

@@ -95,7 +95,6 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
         "pty_port",
         "robot_main",
         "slcan_emulator",
-        "slcan_main",
         "xela_controller",
     }, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {

@@ -82,7 +82,7 @@ def _name(code: Any) -> str:
 @contextmanager
 def emulated(recording: Path) -> Iterator[str]:
     """Yield the port of an emulated adapter that plays this in a process of its own."""
-    command = [sys.executable, "-m", "firmware_bridge.emulation.slcan_main", "--until-stdin-closes", "--loop"]
+    command = [sys.executable, "-m", "edge.bench.emulated_buses"]
     command += ["--rate-hz", f"{RATE_HZ:g}", "--jitter-ms", "0", str(recording)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         if process.stdin is None or process.stdout is None:
