@@ -122,8 +122,10 @@ def this_machine() -> str:
 def _cpu() -> str:
     """Return the model name of the processor; on ARM, where /proc/cpuinfo has none, the board's name."""
     for path, start in (("/proc/cpuinfo", "model name"), ("/proc/device-tree/model", "")):
-        file = Path(path)
-        lines = file.read_text(errors="replace").replace("\0", "").splitlines() if file.exists() else []
+        try:
+            lines = Path(path).read_text(errors="replace").replace("\0", "").splitlines()
+        except OSError:
+            continue
         for line in lines:
             if line.startswith(start) and line:
                 return line.partition(":")[2].strip() if start else line

@@ -22,7 +22,6 @@ import numpy as np
 
 from edge.bench.errors import BenchError
 from edge.bench.live_report import Page, line
-from edge.bench.ratios import ratio_of
 from edge.pipeline.pump import uncollected
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
@@ -131,8 +130,8 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
             if number == ROUNDS - 1:
                 for tree in trees:
                     cells = map(_middle, zip(*costs[part + tree], strict=True))
-                    name = f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}"
-                    found.append({"method": name} | dict(zip(COLUMNS[1:], cells, strict=True)))
+                    what = f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}"
+                    found.append({"method": what} | dict(zip(COLUMNS[1:], cells, strict=True)))
                     page.say(line([str(cell) for cell in found[-1].values()]))
                 if against is not None:
                     page.say(line(_ratios(f"{part}, ratio", costs[part], costs[f"{part}, {against}"])))
@@ -230,6 +229,35 @@ def write_recording(path: Path, number: int, *, pressed: bool) -> Path:
 
 def _rest_counts() -> Any:
     return np.array([16_000, 16_400, 38_600]) + 37 * np.arange(16)[:, None]
+
+
+class Ratio(NamedTuple):
+    """Ratio of two medians, and its 95 % interval."""
+
+    ratio: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        shown = [f"{float(f'{value:.3g}'):g}" for value in self]
+        return f"{shown[0]} ({shown[1]}..{shown[2]})"
+
+
+def ratio_of(over: Sequence[float], under: Sequence[float]) -> Ratio:
+    """Return the ratio of the medians of two measurements' blocks, of which those of one place belong together.
+
+    The interval is that of 2000 resamples of the blocks.
+
+    Raises:
+        ValueError: no blocks, or not as many of both.
+    """
+    above, below = np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64)
+    if not len(above) or len(above) != len(below):
+        raise ValueError(f"{len(above)} blocks over {len(below)}, expected some, and as many of both")
+    drawn = np.random.default_rng(0).integers(len(above), size=(2000, len(above)))
+    ratios = np.median(above[drawn], axis=1) / np.median(below[drawn], axis=1)
+    low, high = np.quantile(ratios, (0.025, 0.975)).tolist()
+    return Ratio(float(np.median(above) / np.median(below)), low, high)
 
 
 def _middle(values: Sequence[float | None]) -> str:

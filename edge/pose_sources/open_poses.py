@@ -2,7 +2,7 @@
 
 import re
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseQueue
@@ -26,16 +26,8 @@ class PoseSource(Protocol):
         ...
 
 
-class Wanted(NamedTuple):
-    """Source of poses as a user names it: the sensor of the poses, None for all; the form, and what follows it."""
-
-    sensor: str | None
-    form: str
-    target: str
-
-
-def check_poses(text: str) -> Wanted:
-    """Return the source of poses that `text` names: one of FORMS, or SENSOR=FORM; nothing is opened.
+def check_poses(text: str) -> tuple[str | None, str, str]:
+    """Return sensor, form and target of the source that `text` names, FORM or SENSOR=FORM; nothing is opened.
 
     Raises:
         UsageError: no such form.
@@ -50,7 +42,7 @@ def check_poses(text: str) -> Wanted:
         target = base_topic(target)
     else:
         raise UsageError(f"no source of poses {text!r}; they are {', '.join(FORMS)}, or SENSOR= before one of them")
-    return Wanted(sensor, form, target)
+    return sensor, form, target
 
 
 def open_poses(text: str, queue: PoseQueue) -> PoseSource:

@@ -27,18 +27,7 @@ class Ros2Poses:
     def __init__(
         self, topic: str, queue: PoseQueue, sensor: str | None = None, environment: Mapping[str, str] = os.environ
     ) -> None:
-        """Subscribe to a topic, whichever type of pose is published there, now or later.
-
-        Args:
-            topic: its name, without the first slash.
-            queue: of the poses.
-            sensor: sensor of the poses, None for all.
-            environment: ROS_DOMAIN_ID and others are read from it.
-
-        Raises:
-            UsageError: the environment is not valid in ROS.
-            SinkError: the domain cannot be joined.
-        """
+        """Subscribe to a topic, whichever type of pose is published there, now or later; for a sensor, or for all."""
         self._queue, self._sensor = queue, sensor
         self._clock = StampClock(lambda line: queue.warn("clock", line))
         self._domain, self._participant = join(environment)

@@ -3,11 +3,6 @@
 The pose is that of a tool frame with its origin at the middle of the pad's face: x to the right of a pattern, y up, z
 out of the pad, to the object. The z of the other frame stands on the object's plane, towards the pad or away from it.
 docs/poses.md draws both.
-
-A stamp is wall time. Where the clocks of both machines agree, the offset of this machine's wall clock converts it, and
-what a camera or a network delayed stays visible as such. Clocks that do not agree show it: of the poses of the last
-seconds even the fastest seems to arrive before its time, or long after it. Their time is then by the smallest delay, as
-for a device with a clock of its own: a constant delay is lost, but the poses keep their distances in time.
 """
 
 import time
@@ -39,11 +34,7 @@ class Placed(NamedTuple):
 
 
 def placed(place: Mapping[str, float], quaternion: Mapping[str, float]) -> Placed:
-    """Return the place and the rotation in a pose, or a transform, of ROS.
-
-    Raises:
-        PoseError: a number is not finite, or the quaternion is not a rotation.
-    """
+    """Return a pose, or a transform, of ROS; a PoseError where it is not finite, or its quaternion is no rotation."""
     x, y, z, w = (quaternion[name] for name in "xyzw")
     length = hypot(x, y, z, w)
     place_m = np.array([place[name] for name in "xyz"])
@@ -56,12 +47,10 @@ def placed(place: Mapping[str, float], quaternion: Mapping[str, float]) -> Place
 
 
 def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> PadPose:
-    """Return the pose of the pad.
+    """Return the pose of the pad, of its tool frame in the frame of the plane.
 
-    Args:
-        tool: tool frame in the frame of the plane.
-        covariance: (36,) of x, y, z in [m] and of turns about them in [rad], as in PoseWithCovariance; where it is
-            empty, zero or negative, the usual errors hold.
+    The covariance is (36,) of x, y, z in [m] and of turns about them in [rad], as in PoseWithCovariance; where it is
+    empty, zero or negative, the usual errors hold.
 
     Raises:
         PoseError: the pad is tilted out of the plane, or the place is out of range.
@@ -88,15 +77,18 @@ def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> P
         raise PoseError("range", str(error)) from error
 
 
-def unix_offset_now_ns() -> int:
-    """Return what is added to monotonic time for the time since 1970, now, in [ns]."""
-    return time.time_ns() - time.monotonic_ns()
-
-
 class StampClock:
-    """Map from stamps of one source of poses to monotonic time; `warn` takes one line where the clocks do not agree."""
+    """Map from stamps of one source of poses to monotonic time; `warn` takes one line where the clocks do not agree.
 
-    def __init__(self, warn: Callable[[str], object], unix_offset_ns: Callable[[], int] = unix_offset_now_ns) -> None:
+    By this machine's wall clock, so that a delay stays visible. Clocks that do not agree show it: even the fastest pose
+    of the last seconds seems to arrive before its time, or long after. Then the smallest delay counts as none.
+    """
+
+    def __init__(
+        self,
+        warn: Callable[[str], object],
+        unix_offset_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
+    ) -> None:
         self._warn, self._unix_offset_ns = warn, unix_offset_ns
         self._clock = DeviceClock(1, None)
 

@@ -1,8 +1,9 @@
 """Recording as npz, for numpy: arrays with a row for each scan, as docs/formats.md lists them."""
 
 import json
+import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -31,13 +32,7 @@ _PIECE_BYTES: Final = 1 << 20
 def write_npz(
     path: Path, rows: Iterable[Mapping[str, Any]], mountings: Mapping[str, Mounting], poses: PoseColumns | None
 ) -> None:
-    """Write a recording.
-
-    Args:
-        path: of the file.
-        rows: values of each scan by the names of KINDS; what a row lacks is unknown there.
-        mountings: of the sensors, by name.
-        poses: with times; None without.
+    """Write a recording of rows, each the values of a scan by the names of KINDS; what a row lacks is unknown there.
 
     Raises:
         SinkError: patterns change their size.
@@ -65,7 +60,6 @@ class _Columns:
         self._columns: dict[str, tuple[IO[bytes], np.dtype[Any], tuple[int, ...], bytes]] = {}
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add one row."""
         for name in [name for name in row if name not in self._columns]:
             kind, unknown = KINDS[name]
             shape, dtype = np.shape(row[name]), np.dtype(kind)
@@ -86,20 +80,13 @@ class _Columns:
         self._rows += 1
 
     def add_to(self, archive: zipfile.ZipFile) -> None:
-        """Add the arrays to an archive."""
         for name in sorted(self._columns, key=lambda name: name != "origin"):  # first: what loses its end has it
             file, dtype, shape, _ = self._columns[name]
             file.seek(0)
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 header = {"descr": dtype.str, "fortran_order": False, "shape": (self._rows, *shape)}
                 npy.write_array_header_1_0(entry, header)
-                for piece in _pieces(file):
-                    entry.write(piece)
-
-
-def _pieces(file: IO[bytes]) -> Iterator[bytes]:
-    while piece := file.read(_PIECE_BYTES):
-        yield piece
+                shutil.copyfileobj(file, entry, _PIECE_BYTES)
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:

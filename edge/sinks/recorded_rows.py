@@ -28,9 +28,9 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
 _MAP_NAMES: Final = frozenset(field.name for field in MAPS)
-_OF_RECORDS: Final = tuple(field for field in FIELDS if Out.NPZ in field.out and field.name not in _MAP_NAMES)
-_OF_SCANS: Final = frozenset(
-    ("time_ns", "sensor", "scan", "device_time_ns", "counts", "has_pattern", "baseline_counts")
+_OF_SCANS: Final = {"time_ns", "sensor", "scan", "device_time_ns", "counts", "has_pattern", "baseline_counts"}
+_OF_RECORDS: Final = tuple(
+    field for field in FIELDS if Out.NPZ in field.out and field.name not in _MAP_NAMES | _OF_SCANS
 )
 _ELSEWHERE: Final = {"scan_pose": ("pose",), "centre_of_pressure_mm": ("wrench", "centre_of_pressure_mm")}
 """Places in a record of arrays that have another name there."""
@@ -60,8 +60,7 @@ class _Topic(NamedTuple):
 class _Rows:
     def __init__(self, path: Path, geometry: SensorGeometry, origin: str, baselines: dict[str, Baseline]) -> None:
         self._path, self._geometry, self._origin, self._baselines = path, geometry, origin, baselines
-        self._types: dict[int, MessageType | None] = {}
-        self._names: dict[int, str] = {}
+        self._types: dict[int, MessageType] = {}
         self._topics: dict[int, _Topic] = {}
         self._taps = 1
         self._of = ""
@@ -107,7 +106,7 @@ class _Rows:
             if metadata.name == "contract":
                 self._taps = int(metadata.metadata.get("taps", "1"))
 
-    def _read(self, topic: "_Topic", log_ns: int, data: memoryview) -> None:
+    def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
         if topic.kind.name == SCAN_NAME:
             self._of, self._row = topic.sensor, self._begun(data, log_ns)
         elif topic.kind.name == BASELINE_NAME:
@@ -116,10 +115,11 @@ class _Rows:
         elif topic.sensor != self._of or self._row is None:
             return
         elif topic.kind.name == RESULT.name:
-            self._row |= self._made(json.loads(topic.kind.decode(data)["record"]))
+            record = json.loads(topic.kind.decode(data)["record"])
+            known = (field for field in _OF_RECORDS if field.name != "poses" or record.get("poses") is not None)
+            self._row |= {field.name: _value(field, record, self._taps) for field in known}
         elif topic.name in _MAP_NAMES:
-            self._row[topic.name] = _map(topic, data)
-            self._row["has_pattern"] = True
+            self._row |= {topic.name: _map(topic, data), "has_pattern": True}
 
     def _begun(self, data: memoryview, log_ns: int) -> dict[str, Any]:
         scan = decode_scan(data, self._geometry)
@@ -139,27 +139,22 @@ class _Rows:
             row["baseline_age_s"] = log_ns / NS_PER_S - baseline.created_unix_s
         return row
 
-    def _made(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        made = {field.name: self._value(field, record) for field in _OF_RECORDS if field.name not in _OF_SCANS}
-        if record.get("poses") is None:  # as of all scans of a model that takes none
-            del made["poses"]
-        return made
 
-    def _value(self, field: Field, record: Mapping[str, Any]) -> Any:
-        value: Any = record
-        for key in _ELSEWHERE.get(field.name, (field.name,)):
-            value = None if value is None else value.get(key)
-        if field.name == "poses":
-            poses = np.full((self._taps, 5), np.nan, np.float32)
-            if value is not None:
-                poses[: len(value)] = value[: self._taps]
-            return poses
-        if field.parts:
-            known = [np.nan if one is None else one for one in _flat(value)]
-            return (known + [np.nan] * len(field.parts))[: len(field.parts)]
-        if value is None:
-            return field.kind.unknown
-        return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
+def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
+    """Return the value of a field in a record, as an array holds it."""
+    value: Any = record
+    for key in _ELSEWHERE.get(field.name, (field.name,)):
+        value = None if value is None else value.get(key)
+    if field.name == "poses":
+        poses = np.full((taps, 5), np.nan, np.float32)
+        poses[: len(value)] = value[:taps]
+        return poses
+    if field.parts:
+        known = [np.nan if one is None else one for one in _flat(value)]
+        return (known + [np.nan] * len(field.parts))[: len(field.parts)]
+    if value is None:
+        return field.kind.unknown
+    return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
 
 
 def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 import shutil
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import Final, TextIO
 
@@ -17,6 +18,9 @@ REFRESH_S: Final = 0.1
 CLEAR_TO_END: Final = "\x1b[K"
 ALL_DETAILS: Final = 4
 """Levels of detail of the line: 4 has all of it, 0 only what a person must act on."""
+_COUNTED: Final = ("dropped", "overruns", "torn_wire", "unwritten", "poses", "poses_refused", "poses_dropped")
+"""Counters on the line. Of scans torn at the source, noise makes one in forty of a healthy sensor: not an alarm."""
+_SHORTER: Final = {"overruns": "overrun", "torn_wire": "torn"}
 _BETWEEN: Final = " | "
 _MORE: Final = " ..."
 
@@ -38,7 +42,7 @@ class StatusSink(Sink):
         self._columns = columns
         self._terminal = rewritable(self._stream)
         self._latest: dict[str, Result] = {}
-        self._rates: dict[str, Rate] = {}
+        self._rates: defaultdict[str, Rate] = defaultdict(Rate)
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
         self._received_s: dict[str, float] = {}
@@ -48,8 +52,6 @@ class StatusSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
         self._latest[result.scan.sensor] = result
-        if result.scan.sensor not in self._rates:
-            self._rates[result.scan.sensor] = Rate()
         self._rates[result.scan.sensor].add(result.scan.time_ns)
         self._counters = counters
         self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
@@ -107,21 +109,11 @@ class StatusSink(Sink):
         if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
         parts += [self._sensor_text(name, details) for name in sorted(self._latest)]
-        count = self._counters.get
         if self._without_poses:
             of = ",".join(sorted(name or "" for name in self._without_poses))
             parts.append(f"NO POSES {of}".rstrip())
-        counts = {
-            "dropped": count("dropped", 0),
-            "overrun": count("overruns", 0),
-            # Of those torn at the source, noise makes one scan in forty of a healthy sensor: not an alarm.
-            "torn": count("torn_wire", 0),
-            "unwritten": count("unwritten", 0),
-            "poses": count("poses", 0),
-            "poses refused": count("poses_refused", 0),
-            "poses dropped": count("poses_dropped", 0),
-        }
-        parts += [f"{number} {name}" for name, number in counts.items() if number]
+        counted = ((name, self._counters.get(name, 0)) for name in _COUNTED)
+        parts += [f"{count} {_SHORTER.get(name, name.replace('_', ' '))}" for name, count in counted if count]
         if details == ALL_DETAILS:
             zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
             parts += [result.baseline_text() for result in zeroed]

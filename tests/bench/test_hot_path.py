@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hot_path import ROOT, compare, main, slower
 
-from edge.bench.ratios import Ratio, ratio_of
+from edge.bench.system import Ratio, ratio_of
 
 
 def test_a_way_that_takes_longer_than_the_one_before_is_red(tmp_path, monkeypatch, capsys):

@@ -7,7 +7,7 @@ from typing import Any
 
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS
-from edge.sinks.shm_layout import IN_MEMORY, MAPS_IN_MEMORY, MEMBERS, offsets_of
+from edge.sinks.shm import IN_MEMORY, MAPS_IN_MEMORY, MEMBERS, offsets_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 SHAPES = {"scan": "3, rows, cols", "pattern": "H, W", "deviation": "H, W", "traction": "3, h, w", "poses": "taps, 5"}

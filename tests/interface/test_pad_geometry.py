@@ -122,8 +122,7 @@ def test_a_recording_is_played_as_the_pad_it_is_of(folder, model, form):
 
 
 def test_shared_memory_and_page_follow(model, folder):
-    from edge.sinks.shm import SharedMemorySink
-    from edge.sinks.shm_layout import Layout
+    from edge.sinks.shm import Layout, SharedMemorySink
 
     layout = Layout(4, 6, 40, 60, (3, 8, 12))
     assert layout.maps["counts"][1] == (3, 4, 6) and layout.maps["pattern"][1] == (40, 60)

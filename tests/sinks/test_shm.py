@@ -22,8 +22,17 @@ from edge_samples import (
 from shm_samples import fields, latest, make_result, name, sink, values
 
 from edge.errors import SinkError
-from edge.sinks.shm import SharedMemorySink
-from edge.sinks.shm_layout import HEADER, HEARTBEAT_AT, IN_MEMORY, MEMBERS, SLOTS, Layout, offsets_of, struct_of
+from edge.sinks.shm import (
+    HEADER,
+    HEARTBEAT_AT,
+    IN_MEMORY,
+    MEMBERS,
+    SLOTS,
+    Layout,
+    SharedMemorySink,
+    offsets_of,
+    struct_of,
+)
 
 sys.path.append(str(ROOT / "examples"))
 from shm_read import attach

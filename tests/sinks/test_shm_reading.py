@@ -33,8 +33,7 @@ from shm_samples import (
 
 from edge.errors import SinkError
 from edge.perception.event import Event
-from edge.sinks.shm import SharedMemorySink
-from edge.sinks.shm_layout import Layout
+from edge.sinks.shm import Layout, SharedMemorySink
 
 sys.path.append(str(ROOT / "examples"))
 import shm_read

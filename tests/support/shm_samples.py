@@ -12,8 +12,7 @@ import pytest
 from edge_samples import BASELINE, ROOT, FakeModel, make_contract, make_scan
 
 from edge.perception.runtime import Runtime
-from edge.sinks.shm import SharedMemorySink
-from edge.sinks.shm_layout import HEARTBEAT_AT, MEMBERS, Layout, struct_of
+from edge.sinks.shm import HEARTBEAT_AT, MEMBERS, Layout, SharedMemorySink, struct_of
 
 sys.path.append(str(ROOT / "examples"))
 import shm_read

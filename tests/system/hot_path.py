@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Final
 
 from edge.bench.errors import BenchError
-from edge.bench.ratios import Ratio, ratio_of
-from edge.bench.system import tree_of
+from edge.bench.system import Ratio, ratio_of, tree_of
 
 ROOT: Final = Path(__file__).parents[2]
 MOST_RATIO: Final = 1.1
