@@ -103,7 +103,7 @@ class McapScans:
                 self.file.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
                 for fields in self._mountings.values():
                     self.file.add_metadata(MOUNTING_METADATA, fields)
-            except OSError:
+            except BaseException:  # Ctrl-C, too: nothing else would end a thread that has just been started
                 self.file.abandon()
                 raise
         except FileExistsError as error:
