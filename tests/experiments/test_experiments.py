@@ -48,7 +48,11 @@ def run(folder, name, *options, again=False):
     return report
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+NAMES = [pytest.param(name, marks=pytest.mark.night) if name == "table3" else name for name in COLUMNS]
+"""Networks of the paper's size take half a minute."""
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_it_runs_in_miniature(folder, name, capsys):
     report = run(folder, name)
     assert capsys.readouterr().out.endswith(f"{report}.md\n")
@@ -60,6 +64,7 @@ def test_it_runs_in_miniature(folder, name, capsys):
     assert report.with_suffix(".png").exists()
 
 
+@pytest.mark.night
 def test_table3_has_every_method_and_the_papers_figures(folder):
     report = run(folder, "table3")
     with report.with_suffix(".csv").open() as file:

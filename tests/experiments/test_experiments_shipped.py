@@ -6,10 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from edge_samples import FakeModel, make_pad_contract, write_model
+from edge_samples import make_pad_contract, write_model
 from experiment_samples import quick_bench
-from pose_samples import make_posed_contract
-from trust_samples import make_posed_trust, make_trusted_contract
 
 from edge.errors import ModelError
 from train.data.frozen_presses import load_frozen_presses
@@ -114,22 +112,3 @@ def test_the_taps_in_miniature(tmp_path, tmp_path_factory):
     found = [row["PSNR dB"] for row in tables["paper"]]
     assert all(one != other for one, other in pairwise(found)), "each sees something else"
     assert [bool(row["over one tap"]) for row in tables["paper"]] == [False, True, True, True]
-
-
-def test_taps_that_do_not_belong_are_left_out_alone():
-    trust, pad = make_posed_trust(3.0).to_json(), make_trusted_contract()
-    shared = {"pad_inputs": pad.pad_inputs, "takes_gains": True, "traction_scale": pad.traction_scale}
-    model = FakeModel(make_posed_contract(trust=trust, **shared))
-    rng = np.random.default_rng(0)
-    windows, poses = rng.normal(0, 500, (2, 4, 3, 4, 4)).astype(np.float32), np.zeros((2, 4, 5), dtype=np.float32)
-    poses[0, 1, 0], poses[1, 2:, 0] = 4.0, 5.0
-    kept, left_out = posed_taps._guarded(model, windows, poses)
-    assert left_out.tolist() == [[False, True, False, False], [False, False, True, True]]
-    assert not kept[left_out].any() and np.array_equal(kept[~left_out], windows[~left_out])
-
-
-def test_poses_are_off_by_just_so_much():
-    poses = posed_taps._off(np.zeros((50, 4, 3), dtype=np.float32), (2.0, 5.0), (0.2, 1.0))
-    assert np.hypot(poses[:, 1:, 0], poses[:, 1:, 1]) == pytest.approx(2.0)
-    assert np.abs(poses[:, 1:, 2]) == pytest.approx(5.0)
-    assert not poses[:, 0].any() and np.allclose(poses[:, 1:, 3:], (0.2, 1.0))

@@ -61,21 +61,6 @@ def test_after_training_one_tap_is_one_tap_whatever_the_weights_of_earlier_ones(
     assert not torch.allclose(run(net, window, pad, poses)[0], alone, atol=1e-3)
 
 
-def test_places_of_cells_keep_their_digits_in_bfloat16(net, inputs):
-    from train.networks import fusion
-
-    seen = []
-    net.train()
-    try:
-        with pytest.MonkeyPatch.context() as patch, torch.autocast("cpu", torch.bfloat16):
-            carrier = fusion._Carrier
-            patch.setattr(fusion, "_Carrier", lambda *given: seen.append(carrier(*given)) or seen[-1])
-            net(*inputs)
-    finally:
-        net.eval()
-    assert all(weights.dtype == torch.float32 for weights in seen[0]._weights)
-
-
 def test_a_quarter_turn_of_everything_turns_the_pattern(net, inputs):
     window, pad, poses = inputs
     turned = torch.rot90(window.unflatten(1, (3, 3)), 1, (-2, -1))

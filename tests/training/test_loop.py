@@ -219,32 +219,6 @@ def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path, monkeypatch):
         trained(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("cores", "world", "shares"),
-    [
-        (range(4), 2, [{0, 1}, {2, 3}]),
-        (range(3), 2, [{0}, {1, 2}]),
-        ([5, 7], 2, [{5}, {7}]),
-        ([5], 2, [None, {5}]),
-        (range(4), 1, [None]),
-    ],
-)
-def test_processes_keep_to_their_shares_of_the_cores(monkeypatch, cores, world, shares):
-    for rank, share in enumerate(shares):
-        kept = []
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores), raising=False)
-        monkeypatch.setattr(os, "sched_setaffinity", lambda _, mine, kept=kept: kept.append(set(mine)), raising=False)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        loop._keep_apart(rank, world)
-        assert kept == ([] if share is None else [share])
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        loop._keep_apart(rank, world)
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        monkeypatch.delattr(os, "sched_setaffinity")
-        loop._keep_apart(rank, world)
-        assert len(kept) == (share is not None), "a GPU computes, or the system has no such call"
-
-
 def test_every_number_once_in_order_and_none_beyond_the_end():
     drawn = []
 

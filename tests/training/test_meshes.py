@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from train.errors import MeshError, TrainError
+from train.errors import MeshError
 from train.surfaces.meshes import MAX_TRIANGLES, load_mesh
 
 BOX_MM = (10.0, 8.0, 3.0)
@@ -253,7 +253,3 @@ def test_a_file_too_long_to_read_is_not_read(tmp_path):
     with path.open("wb") as file:
         file.truncate(400_000_001)  # a hole in the file: takes no room on the disk
     refused(path, "400 MB; at most 400 MB")
-
-
-def test_a_mesh_error_is_one_of_trainings_and_a_value_error():
-    assert issubclass(MeshError, TrainError) and issubclass(MeshError, ValueError)

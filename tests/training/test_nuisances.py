@@ -205,33 +205,6 @@ def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
     assert np.allclose(weights[0, 0] @ press, stepped[np.searchsorted(times, moments)], atol=1e-5)
 
 
-@pytest.mark.parametrize("ratio", [0.03, 0.3, 1.0, 5.0, 300.0])
-def test_the_loop_of_a_press_and_its_release_has_the_area_of_the_closed_form(ratio):
-    load_s, share = 2.0, 0.1
-    time_s = np.linspace(0, 2 * load_s, 4001)
-    load = 1 - np.abs(time_s / load_s - 1)
-    read = maxwell(load, time_s, share, ratio * load_s)
-    area = -np.trapezoid(read, load)
-    left = np.exp(-1 / ratio)
-    assert area == pytest.approx(share * (2 * ratio - ratio**2 * (1 - left) * (3 - left)), rel=1e-3, abs=1e-6)
-    assert area > 0  # the release reads higher
-
-
-def test_hysteresis_vanishes_when_fast_and_is_a_lesser_gain_when_slow():
-    time_s = np.linspace(0, 1, 50)
-    course = np.sin(3 * time_s)
-    assert np.allclose(maxwell(course, time_s, 0.2, 1e-12), course)
-    assert np.allclose(maxwell(course, time_s, 0.2, 1e12), 0.8 * course)
-    assert np.allclose(maxwell(course, time_s, 0.0, 0.1), course)
-    assert np.allclose(maxwell(np.full(50, 3.0), time_s, 0.2, 0.1), 3.0)
-
-
-def test_a_held_press_creeps_to_its_elastic_reading():
-    time_s = np.array([0.0, 1e-9, 0.5, 1.0, 100.0])
-    read = maxwell(np.array([0.0, 1, 1, 1, 1]), time_s, 0.2, 0.5)
-    assert read[2:] == pytest.approx([1 - 0.2 * np.exp(-1), 1 - 0.2 * np.exp(-2), 1.0], abs=1e-6)
-
-
 def test_sensors_differ_in_their_hysteresis():
     clean = np.full_like(zeros(400, 1, 4), 1e6) * np.linspace(0.25, 1, 4, dtype=np.float32)[:, None, None, None]
     only = alone(Nuisances(), "hysteresis")

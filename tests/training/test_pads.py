@@ -4,8 +4,8 @@ from math import inf
 
 import numpy as np
 import pytest
+from edge_samples import make_pad_contract
 
-from edge.inference.contract import CONTRACT_VERSION, Contract
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.scans.pad_constants import Pad as KnownPad
 from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
@@ -60,38 +60,10 @@ def test_known_numbers_are_values_flags_and_gains_and_zeros_where_nothing_is_kno
     assert np.array_equal(numbers[0], expected)
 
 
-def contract() -> Contract:
-    """One that takes what the bundled networks take of a pad."""
-    return Contract(
-        version=CONTRACT_VERSION,
-        batch=1,
-        taps=1,
-        scale=10,
-        tap_order="newest first",
-        angle_step_deg=5.0,
-        counts_per_unit=(500.0, 500.0, 1000.0),
-        output_unit="mm",
-        output_full_scale=0.5,
-        contact_level=0.5,
-        sensor="uSPa44",
-        rows=4,
-        cols=4,
-        pitch_mm=4.7,
-        arithmetic="float32",
-        interval_factor=None,
-        confidence={},
-        training_sha256="a",
-        test_set_sha256="b",
-        test_error={},
-        pad_inputs=tuple(input_scale()),
-        takes_gains=True,
-    )
-
-
 @pytest.mark.parametrize("gains", [None, (1.0,) * 48])
 def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
     """Pads drawn for training equal those that the runtime makes of a sensor's file."""
-    takes = contract()
+    takes = make_pad_contract(pad_inputs=tuple(input_scale()))
     assert takes.pad_width == KNOWN
     for pad in DRAWN[:20]:
         scaled = constants(pad)[None]

@@ -327,7 +327,7 @@ class TestMagnets:
             skin.movement(np.zeros((3, SIZE, SIZE)), np.zeros((3, SIZE, SIZE)))
 
 
-@pytest.mark.parametrize(("thickness_mm", "poisson"), [(2.0, 0.3), (3.0, 0.4)])
+@pytest.mark.parametrize(("thickness_mm", "poisson"), [(3.0, 0.4)])
 def test_a_patch_pushed_along_moves_a_block_of_finite_elements_as_the_layer(thickness_mm, poisson):
     felupe = pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
     from scipy.sparse.linalg import cg
