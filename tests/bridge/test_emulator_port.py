@@ -55,7 +55,7 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
     assert (emulator.sent_frames, emulator.lost_frames) == (200 * 16, 0)
 
 
-def test_an_answer_waits_for_the_end_of_a_frame_that_found_no_room():
+def test_an_answer_waits_for_the_end_of_a_frame():
     decoder, data = SlcanScans(), b""
     recording = make_recording(100, rate_hz=2000.0)
     with Emulator([recording], frame_s=0, jitter_s=0, waits=True) as emulator, open_raw(emulator.port) as port:

@@ -50,7 +50,7 @@ def test_a_csv_at_its_recorded_rate(tmp_path):
     assert link.counters() == {"scans": 5, "torn_wire": 0, "torn_source": 0, "repeated": 0}
 
 
-def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all_that_is_due(tmp_path):
+def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all(tmp_path):
     time = FakeTime()
     with replay(time, write_recording(tmp_path / "finger.csv", make_counts(9)), rate_hz=10) as link:
         assert len(link.read(0.0)) == 1
@@ -164,7 +164,7 @@ def take(link, count):
     return scans
 
 
-def test_it_waits_for_a_viewer_and_goes_round_with_times_that_go_on(played):
+def test_it_waits_for_a_viewer_and_goes_round(played):
     link, player = played
     assert link.read(0.1) == [] and player.state.waiting and player.state.length_s == 0.08
     player.begin()

@@ -51,7 +51,7 @@ def test_garbage_costs_itself_alone():
     assert counters["messages"] == 1 + 40 + 20 and len(GARBAGE) <= 20
 
 
-def test_a_client_that_does_not_read_gets_what_is_old_and_is_told():
+def test_a_client_that_does_not_read_is_told_what_is_old():
     with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
         read_scans(link, 1)
         sent = server.sent_messages
@@ -262,7 +262,7 @@ def test_others_that_listen_there(answer, words, monkeypatch):
     assert str(refused.value).startswith(url) and "\n" not in str(refused.value)
 
 
-def test_one_that_was_met_and_hangs_holds_up_its_reader_for_less(monkeypatch):
+def test_one_that_was_met_and_hangs_holds_up_nobody_long(monkeypatch):
     monkeypatch.setattr(xela_server, "OPENING_S", 20.0)
     monkeypatch.setattr(xela_server, "REOPENING_S", 0.2)
     with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:

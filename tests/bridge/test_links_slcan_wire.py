@@ -78,7 +78,7 @@ def test_a_torn_scan_has_the_time_of_its_newest_frame_too():
     assert (second - first, third - second) == (10 * MS, 10 * MS)
 
 
-def test_the_same_stamp_is_a_minute_later_and_another_after_an_opening():
+def test_the_same_stamp_again_is_a_minute_later():
     scans = SlcanScans()
     scans.feed(b"".join(cycle_lines(0, 100)), 10**12)  # learns the form
     first, second = (scans.feed(b"".join(cycle_lines(n, 200)), 10**12 + (100 + n * 60_000) * MS)[0] for n in range(2))
@@ -97,7 +97,7 @@ def test_stamps_say_how_many_bytes_a_scan_needs():
     assert stamped.bytes_until_scan() == 15 * 26 - 3
 
 
-def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatch):
+def test_firmware_without_stamps_and_flags_is_read_as_ever(monkeypatch):
     monkeypatch.setattr(slcan_status, "INTERVAL_NS", 20 * MS)
     recording = make_recording(40)
     with Emulator([recording], old_canable=True, waits=True) as emulator, SlcanSerialLink(emulator.port) as link:
@@ -113,7 +113,7 @@ def test_firmware_that_knows_neither_stamps_nor_flags_is_read_as_ever(monkeypatc
     assert {scan.device_ns for scan in scans} == {None} and link.trouble is None
 
 
-def test_stamps_that_are_no_milliseconds_of_a_minute_are_left_out(monkeypatch):
+def test_stamps_that_are_no_milliseconds_are_left_out(monkeypatch):
     """A thread that reads several links must not wait for the quiet line of one of them: it does not with read(0)."""
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     late = [line[:-5] + b"FA00\r" for line in cycle_lines(0, 0)]
@@ -135,7 +135,7 @@ def test_stamps_that_are_no_milliseconds_of_a_minute_are_left_out(monkeypatch):
         assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
-def test_an_adapter_whose_clock_stands_still_is_told_to_leave_stamps_out(monkeypatch):
+def test_stamps_of_a_clock_that_stands_still_are_left_out(monkeypatch):
     monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         assert device.received(10) == b"C\rS8\rZ1\rO\r"
@@ -243,7 +243,7 @@ def test_who_has_answered_once_is_asked_again_after_an_opening(impatient):
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
 
 
-def test_opening_again_does_not_unsay_what_was_said_until_something_else_is(impatient):
+def test_opening_again_does_not_unsay_what_was_said(impatient):
     """A link that lasts opens a silent adapter again and again: its trouble must not come and go with that."""
     with Emulator([make_recording(10)], loop=True) as emulator:
         link = SlcanSerialLink(emulator.port)
