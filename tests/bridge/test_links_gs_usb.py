@@ -331,17 +331,6 @@ def test_the_public_package_never_sees_the_unplugging(public_port):
     assert device.read(frame, 100) is False
 
 
-def test_the_public_package_finds_it_mute_on_the_second_run(public_port):
-    """gs_usb issue 20: it resets the device while a frame waits to be fetched."""
-    for run in range(2):
-        device = GsUsb.scan()[0]
-        device.set_bitrate(1_000_000)
-        device.start()
-        public_port.adapter.hear(*frames_of(1))
-        assert device.read(GsUsbFrame(), 10) is (run == 0)
-        device.stop()
-
-
 def test_python_can_reads_it(public_port):
     with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
         public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)

@@ -63,14 +63,6 @@ def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all(tmp_path):
         assert time.now_ns == scan.time_ns == START_NS + 400 * MS, "the grid stays"
 
 
-def test_two_fingers_side_by_side(tmp_path):
-    paths = [write_recording(tmp_path / f"{name}.csv", make_counts(3, seed), 100) for seed, name in enumerate("ab")]
-    with replay(FakeTime(), *paths) as link:
-        assert link.name == f"replay:{paths[0]},{paths[1]}"
-        read = [[(scan.sensor, scan.number) for scan in link.read(1.0)] for _ in range(3)]
-    assert read == [[("a", n), ("b", n)] for n in range(3)]
-
-
 def test_sources_without_a_name_are_called_by_their_place(tmp_path):
     """Not "1/4", which reads like the first of four sensors."""
     forms = []
