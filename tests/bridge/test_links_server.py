@@ -100,7 +100,7 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     still = make_recording(130, rate_hz=400.0)
     still.tracks[0].counts[:] = REST_COUNTS + np.random.default_rng(1).integers(0, 5, still.tracks[0].counts.shape)
     with ServerEmulator(VendorServer([still], loop=True), message_hz=400) as server:
-        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "1.5"])
+        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "2.5"])
     assert code == 0, capsys.readouterr().err
     lines = [json.loads(line) for line in records.read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
