@@ -44,7 +44,7 @@ def recovering(scans, counts, seed=3):
     return np.concatenate([grip, free]).round().astype(np.int32)
 
 
-def test_where_a_pad_only_recovers_its_freest_scans_are_taken_with_their_uncertainty():
+def test_where_a_pad_only_recovers_its_freest_scans_are_taken():
     stretch = free_stretch(recovering(38, 40))
     assert stretch.touched and not stretch.opens and stretch.rows.tolist() == list(range(48, 78))
     assert stretch.within_counts == pytest.approx(16, abs=5)
@@ -59,7 +59,7 @@ def test_a_free_beginning_is_where_a_live_run_zeroes():
     assert stretch.opens and stretch.rows.tolist() == list(range(100)) and stretch.touched
 
 
-def test_a_recording_without_a_contact_does_not_show_that_its_pad_is_free():
+def test_without_a_contact_nothing_shows_that_a_pad_is_free():
     assert not free_stretch(scans((40, 8), (60, 0), (40, 60))).touched  # 960 counts in all
     assert free_stretch(scans((40, 8), (60, 0), (5, 100))).touched
     assert not free_stretch(scans((40, 8), (60, 0), (4, 100), (40, 0))).touched  # damaged
@@ -78,7 +78,7 @@ GRIPS = sorted(REAL_RECORDINGS.glob("*/xela_sensor?.csv"))
 
 
 @pytest.mark.skipif(not GRIPS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
-def test_of_real_grips_the_stretch_with_the_lowest_z_is_taken_and_known_to_be_free_only_after_a_release():
+def test_of_real_grips_the_stretch_with_the_lowest_z_is_taken():
     """Three trials hold the box to their end. One lets go: it is still at first, too, with 12,000 counts on the pad."""
     for path in GRIPS:
         counts = load_recording(path).tracks[0].counts

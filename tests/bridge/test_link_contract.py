@@ -193,7 +193,7 @@ def test_the_same_frames_make_the_same_scans(rig):
 
 
 @of(CAN)
-def test_a_scan_comes_with_its_last_frame_though_more_time_is_left(rig):
+def test_a_scan_comes_with_its_last_frame(rig):
     with rig.link() as link:
         assert rig.read(link, frames_of(1)[:15]) == [] == link.read(0.0)
         speaker = threading.Timer(0.02, rig.hear, frames_of(1)[15:])

@@ -65,7 +65,7 @@ def test_a_step_of_the_wall_clock_does_not_hurt(bus, step_s):
 
 
 @pytest.mark.parametrize("begun_us", [0, 10**9])
-def test_a_driver_that_counts_from_its_opening_makes_nothing_old(bus, begun_us):
+def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
     """Count stamps from each opening: those after an outage may lie ahead of the earlier ones by any time."""
     now_ns, delays_ns = [5 * 10**12], []
     link = link_to(bus, clock_ns=lambda: now_ns[0])

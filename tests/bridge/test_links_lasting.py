@@ -101,7 +101,7 @@ def test_a_long_outage_is_asked_after_every_two_seconds():
     assert min(time_s for time_s in heard_s if time_s > 2) - 200.0 <= LATE_RETRY_S + 0.02
 
 
-def test_a_device_that_falls_silent_is_opened_anew_and_told_once():
+def test_a_device_that_falls_silent_is_opened_and_told_once():
     """An adapter that was reset has a port, but its channel is closed until it is opened."""
     world = World(mute=[(1.0, 1.0 + LINK_SILENT_S + 0.015)])
     notices, link, heard_s = lasting(world, 4.0)
@@ -132,7 +132,7 @@ def test_each_outage_is_met_with_the_same_haste():
         assert next(time_s for time_s in heard_s if time_s > back_s) - back_s < 0.4
 
 
-def test_the_silence_of_one_that_came_back_begins_with_its_opening():
+def test_the_silence_of_one_that_is_back_begins_anew():
     """A device that has to settle after it was plugged in is not opened over and over."""
     world = World(away=[(1.0, 5.0)], mute=[(5.0, 5.0 + 0.9 * LINK_SILENT_S)])
     lasting(world, 8.0)
@@ -231,7 +231,7 @@ def test_the_first_opening_must_succeed():
         lasting(World(away=[(0.0, 1.0)]), 1.0)
 
 
-def test_trouble_is_told_when_it_comes_and_goes_and_lost_stamps_once():
+def test_trouble_is_told_twice_and_lost_stamps_once():
     world, notices = World(), []
     inner = WorldLink(world)
     with wrapped(world, inner) as link:

@@ -161,7 +161,7 @@ def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
 # The reader of bursts.
 
 
-def test_who_stands_still_after_a_look_takes_it_for_empty_no_later(monkeypatch):
+def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
     """Otherwise bytes that arrive meanwhile would look new."""
     now_s = [100.0]
 
@@ -326,7 +326,7 @@ def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
     assert isinstance(refused.value, BridgeError) and isinstance(refused.value, OSError)
 
 
-def test_who_holds_a_port_is_named_and_so_is_who_tries_each_new_one():
+def test_who_holds_a_port_is_named():
     held = "import fcntl, sys; f = open(sys.argv[1], 'r+b', 0); fcntl.flock(f, fcntl.LOCK_EX); print(1, flush=True)"
     with SilentDevice() as device:
         with SlcanSerialLink(device.port), pytest.raises(DeviceError, match=r"in use by this program, or .*slcand"):

@@ -51,7 +51,7 @@ def test_garbage_costs_itself_alone():
     assert counters["messages"] == 1 + 40 + 20 and len(GARBAGE) <= 20
 
 
-def test_a_client_that_does_not_read_gets_what_is_old_and_is_told():
+def test_a_client_that_does_not_read_is_told_what_is_old():
     with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
         read_scans(link, 1)
         sent = server.sent_messages
@@ -100,7 +100,7 @@ def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
     still = make_recording(130, rate_hz=400.0)
     still.tracks[0].counts[:] = REST_COUNTS + np.random.default_rng(1).integers(0, 5, still.tracks[0].counts.shape)
     with ServerEmulator(VendorServer([still], loop=True), message_hz=400) as server:
-        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "1.5"])
+        code = cli.main(["--source", f"xela-server:{server.url}", "--sink", f"jsonl:{records}", "--duration-s", "2.5"])
     assert code == 0, capsys.readouterr().err
     lines = [json.loads(line) for line in records.read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
@@ -262,7 +262,7 @@ def test_others_that_listen_there(answer, words, monkeypatch):
     assert str(refused.value).startswith(url) and "\n" not in str(refused.value)
 
 
-def test_one_that_was_met_and_hangs_holds_up_its_reader_for_less(monkeypatch):
+def test_one_that_was_met_and_hangs_holds_up_nobody_long(monkeypatch):
     monkeypatch.setattr(xela_server, "OPENING_S", 20.0)
     monkeypatch.setattr(xela_server, "REOPENING_S", 0.2)
     with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:

@@ -43,7 +43,7 @@ def test_of_a_device_with_several_ports_it_is_the_same_one():
         adapter.find(moved[:1])
 
 
-def test_a_serial_number_that_two_adapters_share_identifies_neither():
+def test_a_serial_number_of_two_identifies_neither():
     """Cheap adapters all have the same: the one that is left must not be taken for the other."""
     one, other = (Port(f"/dev/ttyACM{n}", (0xAD50, 0x60C4), "00001", "CANtact", interface="1.0") for n in range(2))
     adapter = PluggedAdapter(one.path)
@@ -56,7 +56,7 @@ def test_a_serial_number_that_two_adapters_share_identifies_neither():
     assert adapter.find([one]) == one.path
 
 
-def test_of_two_with_one_serial_number_each_stays_where_it_is_plugged_in():
+def test_of_two_with_one_serial_number_each_has_its_socket():
     """Names of the kernel change, and sockets do not."""
     left, right = (
         Port(f"/dev/ttyUSB{n}", (0x0403, 0x6001), "0001", "USB CAN", location=f"1-{n + 2}") for n in range(2)

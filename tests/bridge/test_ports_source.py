@@ -178,7 +178,7 @@ def test_texts_that_are_no_source(text):
         ("press.mcap", "replay:press.mcap"),
     ],
 )
-def test_a_source_without_its_form_is_refused_with_what_was_meant(text, meant):
+def test_a_source_without_its_form_is_told_what_was_meant(text, meant):
     with pytest.raises(SourceError) as refused:
         open_source(text)
     assert str(refused.value) == f"source is {text!r}: did you mean {meant}?"
@@ -214,7 +214,7 @@ def frames_of(can_ids):
         ("A", [0x710 | taxel for taxel in range(16)], "1", 16, 7),
     ],
 )
-def test_the_id_map_is_that_asked_for_and_old_controllers_are_woken(tmp_path, model, can_ids, sensor, fresh, boards):
+def test_the_id_map_is_the_one_asked_for(tmp_path, model, can_ids, sensor, fresh, boards):
     rig = SlcanRig(tmp_path, None)
     with open_source(rig.name, model=ID_MAPS[model]) as link:
         scans = rig.read(link, frames_of([*can_ids, can_ids[0]]))
