@@ -85,7 +85,12 @@ SUBJECTS = {
     ),
     "contract": Subject(
         "edge.inference.contract",
-        ("tests/runtime/test_contract_limits.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
+        (
+            "tests/runtime/test_contract_limits.py",
+            "tests/bridge/test_pad.py",
+            "tests/runtime/test_session.py",
+            "tests/runtime/test_trust_contract.py",
+        ),
     ),
 }
 
