@@ -81,7 +81,7 @@ class TestContract:
                 '[["thickness", 1, 1]]',
                 "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane_share",
             ),
-            ("pad_inputs", '[[["thickness_mm"], 4, 1]]', "a list of"),
+            ("pad_inputs", '[[["thickness_mm"], 1, 1]]', "a list of"),
             ("pad_inputs", '[["thickness_mm", 4]]', "a list of"),
             ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
             ("pad_inputs", '[["thickness_mm", 4, 0]]', "spread from 1e-06"),
@@ -91,7 +91,7 @@ class TestContract:
             ("traction_scale", "0", "a whole number from 1 to 256, or null"),
             ("traction_scale", "true", "a whole number"),
             ("traction_scale", "256", "at most 1048576 numbers"),
-            ("taps", "65", "64"),
+            *[(key, "65", "64") for key in ("taps", "rows", "cols")],
             ("batch", "1025", "1024"),
         ],
     )

@@ -7,13 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP, Reading
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, Reading
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
-from firmware_bridge.scans.slcan_scans import SlcanScans
-from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS
 
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
 
@@ -213,55 +211,6 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
         assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
 
 
-def text_of(numbers: range, model=USPA44_MAP) -> bytes:
-    lines = []
-    for number in numbers:
-        for can_id, taxel in model.wire_order("4"):
-            words = b"".join(value.to_bytes(2, "big") for value in (taxel, number, 1000 * taxel + number))
-            lines.append(encode_frame(CanFrame(can_id, b"\x93" + words + b"\x0f")))
-    return b"".join(lines)
-
-
-def test_the_wrong_model_shows_half_of_the_taxels():
-    for sent, read in ((USPA44_MAP, XR1944_MAP), (XR1944_MAP, USPA44_MAP)):
-        scans = SlcanScans(read)
-        got = scans.feed(text_of(range(4), sent), 0)
-        # Of four cycles the first does not prove a sensor yet, and nothing has closed the last.
-        assert [int(scan.fresh.sum()) for scan in got] == [8, 8]
-        assert scans.counters()["foreign"] == 32
-
-
-@given(st.integers(0, 2**32))
-@settings(deadline=None, max_examples=60)
-def test_any_chunking_gives_the_same_scans_and_counters(seed):
-    noise = random.Random(seed)
-    stream = bytearray(text_of(range(6)))
-    for _ in range(noise.randrange(30)):
-        place = noise.randrange(len(stream))
-        match noise.randrange(4):
-            case 0:
-                del stream[place : place + noise.randrange(60)]
-            case 1:
-                stream[place:place] = noise.randbytes(noise.randrange(60))
-            case 2:
-                stream[place] = noise.randrange(256)
-            case 3:
-                stream[place:place] = stream[place : place + noise.randrange(60)]
-    whole = SlcanScans()
-    expected = whole.feed(bytes(stream), 0)
-    cuts = sorted(noise.randrange(len(stream) + 1) for _ in range(noise.randrange(40)))
-    chunked = SlcanScans()
-    got = [
-        scan
-        for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)
-        for scan in chunked.feed(bytes(stream[a:b]), 0)
-    ]
-    assert chunked.counters() == whole.counters()
-    assert [scan.number for scan in got] == [scan.number for scan in expected]
-    for one, other in zip(got, expected, strict=True):
-        assert (one.counts == other.counts).all() and (one.renewed == other.renewed).all()
-
-
 def test_a_scan_is_waited_for_as_long_as_the_slowest_sensor_takes_and_no_longer():
     """One flipped bit in an id, or a sensor unplugged in mid-scan, is not waited for."""
     assert SCAN_GIVEN_UP_NS == 1_000_000_000
@@ -277,6 +226,17 @@ def test_a_scan_is_waited_for_as_long_as_the_slowest_sensor_takes_and_no_longer(
     assert assembler.fewest_missing() == 14
     feed(assembler, cycle(2)[2:], 78 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 16
+
+
+def test_no_read_sleeps_while_the_order_of_the_only_sensor_is_to_be_learnt():
+    assembler = ScanAssembler(USPA44_MAP)
+    feed(assembler, cycle(0, "6")[:1])
+    assert assembler.fewest_missing() == 16
+    for number in range(2 * MOST_DOUBTS):
+        feed(assembler, cycle(number, "5")[13:], 100 * number)
+    assert assembler.fewest_missing() == 1
+    feed(assembler, cycle(0) + cycle(1), 10_000)
+    assert assembler.fewest_missing() == 16, "a sensor that exists does not wait for one that does not"
 
 
 def test_a_sensor_that_was_never_seen_is_not_fed_by_the_cycle():

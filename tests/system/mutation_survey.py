@@ -72,7 +72,6 @@ SUBJECTS = {
             "tests/bridge/test_scan_assembler_cycles.py",
             "tests/bridge/test_scan_assembler.py",
             "tests/bridge/test_slcan_scans.py",
-            "tests/bridge/test_mixed_cycles.py",
             "tests/bridge/test_cycles.py",
         ),
     ),
