@@ -212,7 +212,7 @@ def test_a_header_that_no_adapter_sends_is_skipped(wrong):
     assert decoder.counters()["skipped_bytes"] == 24
 
 
-def test_the_highest_flags_and_the_highest_id_are_told_from_those_that_nothing_sends():
+def test_the_highest_flags_and_the_highest_id_are_lawful():
     decoder = GsUsbDecoder(stamped=False)
     decoder.feed(host_frame(SCAN[0], flags=13, fd=True))
     assert decoder.counters()["fd_frames"] == 1
@@ -239,7 +239,7 @@ def test_frames_are_found_again_behind_a_wreck(lost):
 
 
 @pytest.mark.parametrize("kept_bytes", range(1, 24))
-def test_a_transfer_that_was_cut_short_takes_nothing_from_the_next(kept_bytes):
+def test_a_transfer_cut_short_takes_nothing_from_the_next(kept_bytes):
     """The missing part of a frame was once filled with the next: readings, and a bus-off, that nobody sent."""
     scans = GsUsbScans()
     scans.start(stamped=True, channels=1)
@@ -254,7 +254,7 @@ def test_a_transfer_that_was_cut_short_takes_nothing_from_the_next(kept_bytes):
     assert (counted["skipped_bytes"], counted["frames"], counted["bus_off"]) == (kept_bytes, 47, 0)
 
 
-def test_frames_of_a_channel_that_was_not_announced_swallow_no_other():
+def test_frames_of_an_unknown_channel_swallow_no_other():
     decoder = GsUsbDecoder(stamped=True)
     taken = []
     for frame in SCAN:
@@ -329,7 +329,7 @@ def test_stamps_that_stand_still_are_left_out():
     assert got[0].device_ns is not None and got[-1].device_ns is None
 
 
-def test_without_stamps_there_is_no_device_time_and_counters_go_on_over_a_new_start():
+def test_without_stamps_there_is_no_device_time():
     scans = GsUsbScans()
     for starts in (1, 2):
         scans.start(stamped=False, channels=1)

@@ -63,7 +63,7 @@ class TestContract:
         np.testing.assert_allclose(got, expected, atol=1e-6)
 
     @pytest.mark.parametrize("takes_gains", [False, True])
-    def test_without_inputs_there_is_no_more_than_the_certainty_of_gains(self, takes_gains):
+    def test_without_inputs_there_is_the_certainty_of_gains_alone(self, takes_gains):
         contract = make_contract(takes_gains=takes_gains)
         assert contract.pad_row(PAD) == pytest.approx([0.9] * takes_gains)
         assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
@@ -157,7 +157,7 @@ class TestSession:
             ),
         ],
     )
-    def test_a_graph_that_breaks_its_contract_is_refused_naming_the_tensor(self, tmp_path, graph, message):
+    def test_a_graph_that_breaks_its_contract_is_refused(self, tmp_path, graph, message):
         with pytest.raises(ModelError, match=message):
             ModelSession(write_model(tmp_path / "graph.onnx", **({"contract": make_pad_contract()} | graph)))
 
@@ -220,7 +220,7 @@ class TestRuntime:
         assert np.count_nonzero(model.windows[0]) == 1
 
     @pytest.mark.parametrize("batch", [1, ANY_BATCH])
-    def test_two_sensors_in_one_call_get_what_each_gets_alone_bit_for_bit(self, tmp_path, batch):
+    def test_two_sensors_in_one_call_get_what_each_gets_alone(self, tmp_path, batch):
         contract = make_pad_contract(batch=batch, interval_factor=1.6)
         path = write_model(tmp_path / "pad.onnx", contract)
         pads = {"4": PAD, "6": OTHER}
@@ -237,7 +237,7 @@ class TestRuntime:
         assert [one.wrench_origin for one in together] == ["nominal", "calibrated"]
         assert together[0].traction is not None and not np.shares_memory(together[0].traction, together[1].traction)
 
-    def test_a_pattern_that_is_given_again_keeps_its_wrench_and_a_dropped_scan_has_none(self):
+    def test_a_pattern_that_is_given_again_keeps_its_wrench(self):
         runtime = self.runtime(FakeModel(make_pad_contract()), options=RuntimeOptions())
         first, again = (runtime.push(make_scan(number, press_counts=20_000)) for number in (0, 1))
         assert again.reused_from == 0 and again.wrench == first.wrench is not None
@@ -269,7 +269,7 @@ class TestPad:
         with pytest.raises(ValueError, match="expected"):
             Pad(**wrong)
 
-    def test_gains_go_with_their_places_and_axes_when_the_mounting_is_corrected(self):
+    def test_gains_go_with_their_places_and_axes(self):
         order = tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist())
         widths = tuple((np.asarray(GAINED) / 50).tolist())
         turned = replace(PAD, gain_half_widths=widths).turned(Mounting(order=order, swap_xy=True, signs=(-1, 1, 1)))

@@ -103,7 +103,7 @@ def test_a_recording_without_poses_has_none(tmp_path, kind):
     assert load_recording(record(tmp_path / f"plain.{kind}", [])).poses is None
 
 
-def test_poses_of_another_program_come_in_time_to_be_interpolated(tmp_path):
+def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
     scans = make_scans(40)
     times_ns = np.array([scan.time_ns for scan in scans])
     pose_times_ns = np.arange(10**9 - 5_000_000, 10**9 + 400_000_000, 33_000_000)
@@ -154,7 +154,7 @@ class TestCsv:
         with ReplayLink([path], paced=False) as link:
             return [(scan.number, link.poses()) for _ in range(3) if not link.ended for scan in link.read(0.0)]
 
-    def test_each_row_has_its_pose_or_none_and_its_turn_may_be_left_out(self, tmp_path):
+    def test_each_row_has_its_pose_or_none(self, tmp_path):
         got = self.poses(self.write(tmp_path / "finger.csv", ["1,2,3", ",,", "-4.5, 5e-1,0"]))
         assert got == [
             (0, [TimedPose(PadPose(1, 2, 3), 0, used_from_ns=0)]),

@@ -48,7 +48,7 @@ def fed(scans, lines, rng, longest_ms):
 
 @pytest.mark.parametrize("faults", [0.0, 0.002, 0.05])
 @pytest.mark.parametrize("longest_ms", [6.0, 60.0])
-def test_mixed_cycles_give_the_scans_that_their_frames_give_one_by_one(longest_ms, faults):
+def test_mixed_cycles_give_the_scans_of_their_frames(longest_ms, faults):
     for seed in range(2):
         lines = on_the_bus(random.Random(seed), 60, stamped=True, faults=faults)
         mixed, one_by_one = SlcanScans(), SlcanScans()
@@ -86,7 +86,7 @@ def test_no_scan_closes_when_a_link_breaks():
     assert abandoned > 300
 
 
-def test_without_stamps_nothing_waits_and_a_broken_link_leaves_nothing():
+def test_without_stamps_nothing_waits():
     scans = SlcanScans()
     for stamped in (False, True, False, True):
         lines = [line for _, line in on_the_bus(random.Random(2), 3, stamped=stamped, faults=0.0)]
@@ -103,7 +103,7 @@ def test_without_stamps_nothing_waits_and_a_broken_link_leaves_nothing():
     )
 
 
-def test_a_cycle_that_was_read_in_one_piece_and_has_a_pause_in_it_is_two():
+def test_a_cycle_read_in_one_piece_with_a_pause_in_it_is_two():
     """As after the host stood still: the bus was off between half of one press and half of another."""
     scans, places = SlcanScans(), USPA44_MAP.wire_order("4")
 
@@ -138,7 +138,7 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
         assert alone.can_ids == {frame.can_id for piece in known for frame in piece}
 
 
-def test_the_head_of_a_line_with_the_tail_of_a_later_one_is_no_reading():
+def test_the_head_of_a_line_with_a_later_tail_is_no_reading():
     """It came before the time of its stamp; one whose tail was only read late did not."""
     places, ms = USPA44_MAP.wire_order("4"), 1_000_000
 
