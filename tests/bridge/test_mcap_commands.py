@@ -1,12 +1,10 @@
 """MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
 
 import json
-import os
 import re
 import resource
 import signal
 import subprocess
-import sys
 import threading
 import time
 from contextlib import suppress
@@ -15,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bridge_samples import write_recording
+from cli_samples import run, start
 from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
@@ -31,12 +30,6 @@ from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorFile
 
-EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT)}
-
 
 def scans_on_disk(path):
     """Return the scans that the public package reads, front to back, from a file that has no end yet."""
@@ -50,6 +43,10 @@ def scans_on_disk(path):
     return seen
 
 
+def source_of(folder, rate_hz):
+    return ["--model", f"{folder}/tiny.onnx", "--source", f"replay:{folder}/finger.csv", "--rate-hz", str(rate_hz)]
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A tiny model and a pressed pad: recorded by `edge-sr record`, without a baseline of its own."""
@@ -59,9 +56,8 @@ def made(tmp_path_factory):
     for start in (120, 140):
         counts[start : start + 10, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
-    source = ["--source", f"replay:{folder}/finger.csv", "--rate-hz", "200", "--model", f"{folder}/tiny.onnx"]
     for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
-        assert cli.main(["record", f"{folder}/press.mcap", *source]) == 0
+        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 200)]) == 0
         if any(own for own, _ in patterns(folder / "press.mcap").values()):
             return folder
         (folder / "press.mcap").unlink()
@@ -143,8 +139,7 @@ class TestOffline:
 
 class TestRecord:
     def test_it_says_what_it_recorded_and_ends_the_name_in_mcap(self, made, tmp_path, capsys):
-        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        assert cli.main(["record", f"{tmp_path}/run.1", *source]) == 0
+        assert cli.main(["record", f"{tmp_path}/run.1", *source_of(made, 2000)]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
         said = capsys.readouterr().err.splitlines()[-1]
         assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said
@@ -165,17 +160,14 @@ class TestRecord:
         monkeypatch.chdir(tmp_path)
         (tmp_path / "taken").mkdir()
         (tmp_path / "old.mcap").write_text("old")
-        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        assert cli.main(["record", name, *source]) == code
+        assert cli.main(["record", name, *source_of(made, 2000)]) == code
         assert words in capsys.readouterr().err.splitlines()[-1]
         assert (tmp_path / "old.mcap").read_text() == "old" and len(list(tmp_path.iterdir())) == 2
 
     def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
         """The amount depends on the machine; docs/recordings.md gives a measured one."""
         path = tmp_path / "killed.mcap"
-        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "40"]
-        command += ["--source", f"replay:{made}/finger.csv"]
-        process = subprocess.Popen(command, cwd=ROOT, env=environment(), stderr=subprocess.DEVNULL)
+        process = start("record", path, *source_of(made, 40), stderr=subprocess.DEVNULL)
         while len(written := scans_on_disk(path)) < 12:
             assert process.poll() is None
             time.sleep(0.02)
@@ -195,10 +187,7 @@ class TestRecord:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
         path = tmp_path / "full.mcap"
-        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "100"]
-        command += ["--source", f"replay:{made}/finger.csv"]
-        settings = {"capture_output": True, "text": True, "timeout": 60, "preexec_fn": small_disk}
-        done = subprocess.run(command, cwd=ROOT, env=environment(), **settings)
+        done = run("record", path, *source_of(made, 100), preexec_fn=small_disk)
         assert done.returncode == 5
         recording = load_recording(path)
         scans = len(recording.tracks[0].counts)
