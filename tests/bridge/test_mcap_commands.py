@@ -53,8 +53,8 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     write_model(folder / "tiny.onnx", SURE)
     counts = np.stack([make_scan(number, noise=3).counts for number in range(160)])
-    for start in (120, 140):
-        counts[start : start + 10, 2, 1, 1] += 3000
+    for first in (120, 140):
+        counts[first : first + 10, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
     for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
         assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 200)]) == 0
