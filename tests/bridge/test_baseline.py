@@ -121,7 +121,7 @@ def test_a_load_is_seen_against_a_reference_on_z_above_it(axis, load, refused, s
     zeroed(counts, silent=silent)  # a documented limit: without a reference such a load is zeroed away
 
 
-def test_torn_and_repeated_scans_are_no_samples_and_one_renewed_in_part_is():
+def test_torn_and_repeated_scans_are_no_samples():
     counts = np.stack([REST, REST + 1, REST + 1])
     counts[2, 0, 0, 0] += 2
     gap = counts[1].copy()
@@ -163,7 +163,7 @@ def test_from_counts_takes_what_it_is_given():
             Baseline.from_counts("6", bad, 99.0)
 
 
-def test_a_pad_that_has_drifted_rests_higher_by_that_and_round_the_circle():
+def test_a_pad_that_has_drifted_rests_higher_by_that():
     baseline = of(np.full((3, 4, 4), 65_530))
     drifted = baseline.moved(np.full((3, 4, 4), 10.5, dtype=np.float32))
     assert (drifted.counts == 4.5).all() and drifted.id == baseline.id
@@ -186,7 +186,7 @@ def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
         np.testing.assert_allclose(baseline.counts[:, ~given_up], REST[:, ~given_up], atol=2)
 
 
-def test_a_taxel_that_comes_and_goes_does_not_put_zeroing_off_for_ever():
+def test_a_taxel_that_comes_and_goes_does_not_put_zeroing_off():
     """Scans without another taxel are no samples meanwhile."""
     estimator = BaselineEstimator()
     silent = np.arange(16).reshape(4, 4) == 0

@@ -17,6 +17,8 @@ from cycle_samples import (
     read,
     swapping,
 )
+from wire_faults import FAULTS, STAMPS, Case, play
+from wire_faults import READERS as LINE_READERS
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -140,3 +142,35 @@ def test_a_link_opened_in_mid_cycle_gives_scans_of_one(old_canable):
     assert all(len(set(scan.counts[2][scan.fresh].tolist())) == 1 for scan in scans)
     # Without stamps a machine that is busy for long cannot show that no cycle was lost meanwhile.
     assert len(scans) > (20 if old_canable else 40)
+
+
+SLOW_OR_FAST = [name for name in STAMPS if "%" in name]
+NO_CLOCK = [name for name in STAMPS if name not in ("good", *SLOW_OR_FAST)]
+
+
+@pytest.mark.parametrize("reader", LINE_READERS)
+@pytest.mark.parametrize("lost", FAULTS)
+@pytest.mark.parametrize("stamps", [None, *STAMPS], ids=str)
+def test_no_scan_of_a_faulty_wire_is_of_two_cycles(stamps, lost, reader):
+    found = play(Case(stamps, lost, reader), 400)
+    assert found.mixed == 0 and found.scans == found.whole + found.torn
+    assert found.whole > (350 if lost == "nothing" else 250)
+    assert found.late <= 1 and found.lag_ms < 60
+    if lost == "nothing" and reader != "each 16 ms" and stamps in (None, "good", *SLOW_OR_FAST):
+        assert found.missed == 0 and found.torn == 0
+
+
+@pytest.mark.parametrize("lost", FAULTS)
+@pytest.mark.parametrize("stamps", [None, "good"], ids=str)
+@pytest.mark.parametrize(("sensors", "rate_hz"), [(2, 100), (4, 100), (1, 10), (1, 400)])
+def test_nor_is_one_of_several_sensors_or_of_another_rate(sensors, rate_hz, stamps, lost):
+    found = play(Case(stamps, lost, "each ms", sensors, rate_hz), 600 // sensors)
+    assert found.mixed == 0 and found.whole > 380
+    assert lost != "nothing" or found.missed == found.torn == 0
+
+
+@pytest.mark.parametrize("stamps", [*SLOW_OR_FAST, *NO_CLOCK])
+def test_a_clock_is_followed_or_dropped(stamps):
+    found = play(Case(stamps, "nothing"), 1500)
+    assert found.late <= 1 and found.missed <= 20
+    assert found.lag_ms < 5 or stamps not in SLOW_OR_FAST

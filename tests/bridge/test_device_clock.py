@@ -17,10 +17,21 @@ WRAP_US = 1 << 32  # 71.6 minutes
 HOST_NS = 5_000 * S
 
 
-def test_the_delay_of_a_frame_is_what_it_took_beyond_the_shortest() -> None:
-    clock = DeviceClock(US, WRAP_US)
-    mapped = [clock.host_ns(i * 10_000, HOST_NS + i * 10 * MS + delay) for i, delay in enumerate([0, 3 * MS, 16 * MS])]
-    assert mapped == [HOST_NS + i * 10 * MS for i in range(3)]
+@pytest.mark.parametrize(
+    ("tick_ns", "wrap", "first", "delays_ms"),
+    [
+        (US, WRAP_US, 0, [0, 3, 16]),
+        (US, WRAP_US, WRAP_US - 15_000, [0] * 4),  # the wrap of 32 bits is no step
+        (MS, 60_000, 0, [0] * 20_000),  # milliseconds wrap each minute
+    ],
+)
+def test_a_frame_is_placed_by_the_shortest_delay_over_any_wrap(tick_ns, wrap, first, delays_ms) -> None:
+    clock = DeviceClock(tick_ns, wrap)
+    mapped = [
+        clock.host_ns((first + number * 10 * MS // tick_ns) % wrap, HOST_NS + (number * 10 + delay) * MS)
+        for number, delay in enumerate(delays_ms)
+    ]
+    assert mapped == [HOST_NS + number * 10 * MS for number in range(len(delays_ms))] and clock.restarts == 0
 
 
 @given(st.integers(0, WRAP_US - 1), st.integers(0, 10**9))
@@ -34,14 +45,7 @@ def test_nothing_is_mapped_later_than_it_arrived(first: int, seed: int) -> None:
         assert clock.host_ns(stamp_us, arrival_ns) <= arrival_ns
 
 
-def test_the_wrap_of_32_bits_of_microseconds_is_no_step() -> None:
-    clock = DeviceClock(US, WRAP_US)
-    mapped = [clock.host_ns((WRAP_US - 15_000 + i * 10_000) % WRAP_US, HOST_NS + i * 10 * MS) for i in range(4)]
-    assert mapped == [HOST_NS + i * 10 * MS for i in range(4)]
-    assert clock.restarts == 0
-
-
-def test_hours_of_silence_are_hours_and_not_what_is_left_of_a_turn() -> None:
+def test_hours_of_silence_are_hours() -> None:
     clock = DeviceClock(US, WRAP_US)
     clock.host_ns(1_000, HOST_NS)
     silent_us = 3 * 3600 * 10**6
@@ -52,14 +56,8 @@ def test_hours_of_silence_are_hours_and_not_what_is_left_of_a_turn() -> None:
     assert clock.restarts == 0
 
 
-def test_milliseconds_that_wrap_each_minute() -> None:
-    clock = DeviceClock(MS, 60_000)
-    mapped = [clock.host_ns(i * 10 % 60_000, HOST_NS + i * 10 * MS) for i in range(0, 20_000, 7)]
-    assert mapped == [HOST_NS + i * 10 * MS for i in range(0, 20_000, 7)]
-
-
 @pytest.mark.parametrize("rate", [0.985, 0.99, 0.995, 0.9999, 1.001, 1.01])
-def test_a_device_that_is_slower_or_faster_than_the_host_is_followed(rate) -> None:
+def test_a_device_slower_or_faster_than_the_host_is_followed(rate) -> None:
     clock = DeviceClock(US, WRAP_US)
     for i in range(60_000):
         arrival_ns = HOST_NS + i * 10 * MS
@@ -79,17 +77,20 @@ def test_a_stall_of_this_machine_leaves_distances_as_they_are() -> None:
     assert min(steps_ns) > 7 * MS and max(steps_ns) < 13 * MS
 
 
-def test_two_late_reads_of_frames_drop_no_stamps() -> None:
-    clock, arrival_ms = DeviceClock(MS, 60_000), 0.0
-    for frame in range(100):
-        arrival_ms += {23: 20.3, 24: 488.0}.get(frame, 1.0)
-        stamp_ms = frame + 6 * (frame > 22)
-        assert clock.at(stamp_ms, HOST_NS + round(arrival_ms * MS)) is not None, frame
+LATE_READS_MS = [number + 19.3 * (number >= 23) + 467.7 * (number >= 24) for number in range(1, 101)]
 
 
-def test_a_line_that_is_slower_than_its_bus_keeps_its_stamps() -> None:
+@pytest.mark.parametrize(
+    ("stamps_ms", "arrivals_ms"),
+    [
+        ([frame + 6 * (frame > 22) for frame in range(100)], LATE_READS_MS),  # two late reads of frames
+        ([10 * frame // 16 for frame in range(640)], [frame * 36 / 16 for frame in range(640)]),  # a slow line
+    ],
+)
+def test_frames_that_are_late_keep_their_stamps(stamps_ms, arrivals_ms) -> None:
     clock = DeviceClock(MS, 60_000)
-    assert all(clock.at(10 * frame // 16, HOST_NS + frame * 36 * MS // 16) is not None for frame in range(640))
+    for stamp_ms, arrival_ms in zip(stamps_ms, arrivals_ms, strict=True):
+        assert clock.at(stamp_ms, HOST_NS + round(arrival_ms * MS)) is not None
 
 
 def times(stamps_us, arrivals_ms):
@@ -107,7 +108,7 @@ def test_stamps_of_another_unit_or_none_are_dropped(us_per_ms, within_ms) -> Non
     assert clock.at(10**9, HOST_NS + 20_000 * MS) is None
 
 
-def test_stamps_out_of_order_are_dropped_but_not_for_a_few_of_them() -> None:
+def test_stamps_out_of_order_are_dropped_but_not_for_a_few() -> None:
     for steps_back, dropped in ((7, False), (8, True)):
         stamps_us = [ms * 1000 - 3001 * (ms % 2) * (ms // 2 < steps_back) for ms in range(49)]
         clock, _ = times(stamps_us, range(49))
@@ -132,24 +133,16 @@ def test_reads_that_are_late_drop_nothing(stall_ms) -> None:
     assert oldest_ns >= 0.9 * (stall_ms - 2) * MS
 
 
-def test_a_device_that_begins_anew_now_and_then_is_still_a_clock() -> None:
-    clock, _ = times([ms * 1000 % 1_000_000 for ms in range(0, 20_000, 10)], range(0, 20_000, 10))
+def test_a_device_that_begins_anew_is_still_a_clock() -> None:
+    clock, got = times([ms * 1000 % 1_000_000 for ms in range(0, 20_000, 10)], range(0, 20_000, 10))
     assert clock.restarts == 19 and not clock.dropped
-
-
-def test_a_device_that_began_anew_is_counted_and_mapped_anew() -> None:
-    clock = DeviceClock(US, None)
-    clock.host_ns(50_000_000, HOST_NS)
-    assert clock.host_ns(1_000, HOST_NS + 10 * MS) == HOST_NS + 10 * MS
-    assert clock.restarts == 1
+    assert got[100] is not None and got[100].host_ns == HOST_NS + 1000 * MS, "mapped anew"
 
 
 def test_frames_that_changed_places_are_no_new_beginning() -> None:
-    clock = DeviceClock(US, WRAP_US)
-    clock.host_ns(1_000_000, HOST_NS)
     back_us = BACK_NS // US // 2
-    assert clock.host_ns(1_000_000 - back_us, HOST_NS + MS) == HOST_NS - back_us * US
-    assert clock.restarts == 0
+    clock, (_, back) = times([1_000_000, 1_000_000 - back_us], [0, 1])
+    assert back is not None and back.host_ns == HOST_NS - back_us * US and clock.restarts == 0
 
 
 @pytest.mark.parametrize("back_ms", [-50, 0, 3, 12, 15, 20, 50, 80, 99, 3000])

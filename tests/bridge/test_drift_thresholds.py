@@ -87,7 +87,7 @@ def test_a_new_tracker_has_moved_nothing():
     assert tracker.note is None and tracker.take_event() is None
 
 
-def test_after_five_blocks_of_half_a_second_it_is_followed_one_block_late():
+def test_after_five_blocks_it_is_followed_one_block_late():
     pad = Blocks()
     assert pad.blocks(7) == [*SETTLED, True, True]
     assert pad.block(on_axes(2, -3, 6)) is True and not pad.tracker.counts.any()
@@ -145,7 +145,7 @@ def test_a_touch_too_light_for_a_tap_is_the_cause_of_a_step():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_taxel_has_its_share_of_the_common_rate_and_creeps_beyond_that(sign):
+def test_a_taxel_has_its_share_of_the_common_rate_and_creeps(sign):
     """By hand: of 20 counts/s a quarter of the way each half second, less the noise, times the share, and the creep."""
     pad = resting()
     pad.block(of_z(own=9 * sign))
@@ -164,7 +164,7 @@ def test_a_taxel_has_its_share_of_the_common_rate_and_creeps_beyond_that(sign):
     assert pad.tracker.counts[2, 0, 0] - before == pytest.approx(sign * creep, abs=1e-4), "the rate is forgotten"
 
 
-def test_where_scans_are_rare_a_block_lasts_longer_and_is_followed_as_far():
+def test_where_scans_are_rare_a_block_lasts_longer():
     pad, ahead = resting(), of_z(8, own=9)
     every = partial(pad.block, ahead, after_ns=500_000_000)
     assert [every(), every()] == [True, True]
@@ -188,14 +188,14 @@ def test_a_block_is_the_middle_half_of_its_scans():
 
 
 @pytest.mark.parametrize(("gap_ns", "goes_on"), [(0, True), (5_000_000_000, True), (5_000_000_001, False), (-1, False)])
-def test_a_pause_of_five_seconds_is_a_gap_and_so_is_time_that_goes_back(gap_ns, goes_on):
+def test_a_gap_is_a_pause_or_time_that_goes_back(gap_ns, goes_on):
     pad = resting()
     assert pad.push(after_ns=gap_ns) is False
     answers = [pad.push() for _ in range(9)]
     assert any(answers) is goes_on
 
 
-def test_scans_without_a_living_taxel_do_not_count_and_without_a_dead_one_do():
+def test_scans_without_a_living_taxel_do_not_count():
     dead = NONE_DEAD.copy()
     dead[1, 2] = True
     pad = resting(dead=dead)
@@ -236,7 +236,7 @@ def test_a_restless_block_begins_the_wait_again():
 
 
 @pytest.mark.parametrize(("own", "kept", "told"), [(8, 0, False), (9, 9, False), (15, 15, False), (-16, -16, True)])
-def test_a_step_of_one_taxel_is_kept_above_what_is_a_touch_and_told_of_above_noise(own, kept, told):
+def test_a_step_of_one_taxel_is_kept_and_told_of(own, kept, told):
     pad = resting()
     assert pad.touched(of_z(taxel=7, own=own)) == [False] * 4 + [told]
     assert pad.step == kept
@@ -270,7 +270,7 @@ def test_a_silent_common_change_is_followed_and_not_kept():
         (on_axes(0, 0, 20) + 8 * of_z(own=1)[::-1], 20),
     ],
 )
-def test_since_it_was_zeroed_a_pad_may_have_drifted_by_fifty_counts(level, kept):
+def test_since_zeroing_a_pad_may_have_drifted_by_fifty_counts(level, kept):
     pad = Blocks()
     answers = pad.blocks(5, level)
     assert pad.step == kept and answers == [False] * 4 + [kept > 0]
@@ -286,7 +286,7 @@ def test_half_of_a_step_is_not_yet_common(low, kept):
     assert pad.step == kept
 
 
-def test_all_taxels_alike_are_named_with_what_they_have_in_common():
+def test_all_taxels_alike_are_named_by_what_they_have_in_common():
     pad = resting()
     assert pad.touched(on_axes(3, -40, 30) + of_z(own=5))[-1] is True
     assert pad.event == (

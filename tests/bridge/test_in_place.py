@@ -49,7 +49,7 @@ def full(draft: Path) -> None:
         (lambda draft: None, Path.read_text, OSError),
     ],
 )
-def test_what_cannot_be_written_or_read_back_leaves_what_was_there(tmp_path, write, load, error):
+def test_what_cannot_be_written_or_read_back_leaves_the_former(tmp_path, write, load, error):
     written(tmp_path / "a.json", "good")
     with pytest.raises(error):
         write_in_place(tmp_path / "a.json", write, load)
@@ -66,7 +66,7 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path):
     assert Path("/dev/null").is_char_device() and listing(tmp_path / "folder") == []
 
 
-def test_baselines_that_would_not_load_again_do_not_replace_those_that_do(tmp_path, monkeypatch):
+def test_baselines_that_would_not_load_again_replace_none(tmp_path, monkeypatch):
     path = tmp_path / "zero.json"
     save_baselines(path, [BASELINE])
     monkeypatch.setattr("firmware_bridge.zeroing.baseline.MOST_FILE_BYTES", len(path.read_bytes()) + 10)

@@ -1,12 +1,10 @@
 """MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
 
 import json
-import os
 import re
 import resource
 import signal
 import subprocess
-import sys
 import threading
 import time
 from contextlib import suppress
@@ -15,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bridge_samples import write_recording
+from cli_samples import run, start
 from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from mcap_samples import SURE, TURNED, arrays_of, make_results, messages_of, odd_scans, record_into
+from mcap_samples import SURE, arrays_of, make_results, messages_of, odd_scans, record_into
 
 from edge.cli import main as cli
 from edge.doctor.watch import Watch
@@ -31,13 +30,6 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorFile
-from firmware_bridge.zeroing.baseline import save_baselines
-
-EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
-
-
-def environment():
-    return os.environ | {"PYTHONPATH": str(ROOT)}
 
 
 def scans_on_disk(path):
@@ -52,18 +44,21 @@ def scans_on_disk(path):
     return seen
 
 
+def source_of(folder, rate_hz):
+    return ["--model", f"{folder}/tiny.onnx", "--source", f"replay:{folder}/finger.csv", "--rate-hz", str(rate_hz)]
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A tiny model and a pressed pad: recorded by `edge-sr record`, without a baseline of its own."""
     folder = tmp_path_factory.mktemp("made")
     write_model(folder / "tiny.onnx", SURE)
     counts = np.stack([make_scan(number, noise=3).counts for number in range(160)])
-    for start in (120, 140):
-        counts[start : start + 10, 2, 1, 1] += 3000
+    for first in (120, 140):
+        counts[first : first + 10, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
-    source = ["--source", f"replay:{folder}/finger.csv", "--rate-hz", "200", "--model", f"{folder}/tiny.onnx"]
     for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
-        assert cli.main(["record", f"{folder}/press.mcap", *source]) == 0
+        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 200)]) == 0
         if any(own for own, _ in patterns(folder / "press.mcap").values()):
             return folder
         (folder / "press.mcap").unlink()
@@ -85,7 +80,7 @@ def patterns(path):
 
 
 class TestOffline:
-    def test_the_same_again_is_the_same_and_every_scan_has_its_result(self, made, tmp_path):
+    def test_the_same_again_is_the_same(self, made, tmp_path):
         first = replayed(made, tmp_path / "a.jsonl", "--sink", f"mcap:{tmp_path}/a.mcap")
         second = replayed(made, tmp_path / "b.jsonl", "--sink", f"mcap:{tmp_path}/b.mcap")
         assert len(first) == 160 and {one["state"] for one in first} == {"zeroing", "idle", "contact"}
@@ -104,7 +99,7 @@ class TestOffline:
         assert made_then and made_then.items() <= {scan: one for scan, (_, one) in offline.items()}.items()
 
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
-    def test_it_begins_with_the_baseline_of_its_first_scan_unless_told_otherwise(self, made, tmp_path, suffix):
+    def test_it_begins_with_the_baseline_of_its_first_scan(self, made, tmp_path, suffix):
         """The recording begins in contact: zeroed again, the press would be gone."""
         path = tmp_path / "press.mcap"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
@@ -126,7 +121,7 @@ class TestOffline:
         assert [one["state"] for one in got] == ["zeroing"] * 99 + ["idle"] * 31
 
     @pytest.mark.parametrize("age_s", [3000.0, None])
-    def test_a_baseline_older_than_the_machine_is_so_in_every_generation(self, made, tmp_path, age_s):
+    def test_a_baseline_older_than_the_machine_stays_so(self, made, tmp_path, age_s):
         """An npz holds its age, and its times are those since the machine was started."""
         results = make_results([make_scan(number, press_counts=3000, noise=1) for number in range(5)])
         aged = [replace(result, baseline_age_s=age_s) for result in results]
@@ -142,26 +137,10 @@ class TestOffline:
             assert ages_s[0] == age_s and {one["baseline"] for one in got} == {BASELINE.id}
             path = again
 
-    def test_another_baseline_and_a_sensor_that_sits_turned(self, made, tmp_path):
-        scans = [make_scan(number, press_counts=3000, noise=1) for number in range(5)]
-        results = make_results(scans, mountings={"4": TURNED, "left/6": TURNED})
-        path = record_into(tmp_path / "turned.mcap", results, mountings={"4": TURNED})
-        other = type(BASELINE).of("4", BASELINE.counts - 1, 1500.0, 100, "file")
-        save_baselines(tmp_path / "other.json", [other], {"4": TURNED.order})
-        got = replayed(made, tmp_path / "a.jsonl", file=path)
-        assert [one["force_counts"] for one in got] == [round(result.force_counts, 1) for result in results]
-        assert [one["centroid_mm"] for one in got] == [
-            [round(value, 4) for value in result.centroid_mm] for result in results
-        ]
-        got = replayed(made, tmp_path / "a.jsonl", "--baseline", tmp_path / "other.json", file=path)
-        assert {one["baseline"] for one in got} == {other.id}
-        assert [one["force_counts"] for one in got] == [round(result.force_counts + 16, 1) for result in results]
-
 
 class TestRecord:
-    def test_it_says_what_it_recorded_and_a_name_without_an_ending_is_an_mcap(self, made, tmp_path, capsys):
-        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        assert cli.main(["record", f"{tmp_path}/run.1", *source]) == 0
+    def test_it_says_what_it_recorded_and_ends_the_name_in_mcap(self, made, tmp_path, capsys):
+        assert cli.main(["record", f"{tmp_path}/run.1", *source_of(made, 2000)]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
         said = capsys.readouterr().err.splitlines()[-1]
         assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said
@@ -182,17 +161,14 @@ class TestRecord:
         monkeypatch.chdir(tmp_path)
         (tmp_path / "taken").mkdir()
         (tmp_path / "old.mcap").write_text("old")
-        source = ["--model", f"{made}/tiny.onnx", "--source", f"replay:{made}/finger.csv", "--rate-hz", "2000"]
-        assert cli.main(["record", name, *source]) == code
+        assert cli.main(["record", name, *source_of(made, 2000)]) == code
         assert words in capsys.readouterr().err.splitlines()[-1]
         assert (tmp_path / "old.mcap").read_text() == "old" and len(list(tmp_path.iterdir())) == 2
 
     def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
         """The amount depends on the machine; docs/recordings.md gives a measured one."""
         path = tmp_path / "killed.mcap"
-        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "40"]
-        command += ["--source", f"replay:{made}/finger.csv"]
-        process = subprocess.Popen(command, cwd=ROOT, env=environment(), stderr=subprocess.DEVNULL)
+        process = start("record", path, *source_of(made, 40), stderr=subprocess.DEVNULL)
         while len(written := scans_on_disk(path)) < 12:
             assert process.poll() is None
             time.sleep(0.02)
@@ -204,7 +180,7 @@ class TestRecord:
         assert (recording.tracks[0].counts == np.stack([scan.counts for scan in seen])).all()
         assert "breaks off (without an end" in recording.notes[0] or "within a record" in recording.notes[0]
 
-    def test_a_full_disk_ends_it_in_one_line_and_what_was_written_can_be_played(self, made, tmp_path):
+    def test_a_full_disk_leaves_a_recording_and_one_line(self, made, tmp_path):
         limit = 40_000
 
         def small_disk():
@@ -212,10 +188,7 @@ class TestRecord:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
         path = tmp_path / "full.mcap"
-        command = [*EDGE_SR, "record", path, "--model", made / "tiny.onnx", "--rate-hz", "100"]
-        command += ["--source", f"replay:{made}/finger.csv"]
-        settings = {"capture_output": True, "text": True, "timeout": 60, "preexec_fn": small_disk}
-        done = subprocess.run(command, cwd=ROOT, env=environment(), **settings)
+        done = run("record", path, *source_of(made, 100), preexec_fn=small_disk)
         assert done.returncode == 5
         recording = load_recording(path)
         scans = len(recording.tracks[0].counts)

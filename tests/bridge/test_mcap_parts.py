@@ -45,7 +45,7 @@ def patterns(path):
 
 
 @pytest.mark.parametrize("start_ns", [0, OFFSET_NS + 21 * PERIOD_NS + 1])
-def test_messages_alone_give_the_same_patterns_from_whatever_time_on(turned, tmp_path, start_ns):
+def test_messages_alone_give_the_same_patterns(turned, tmp_path, start_ns):
     part = messages_alone(turned, tmp_path / "part.mcap", start_ns=start_ns)
     recording = load_recording(part)
     assert recording.origin == "device" and recording.notes == () and dict(recording.mountings) == {"4": TURNED}
@@ -53,7 +53,7 @@ def test_messages_alone_give_the_same_patterns_from_whatever_time_on(turned, tmp
     assert patterns(part) == [one for one in patterns(turned) if one[0] + OFFSET_NS >= start_ns]
 
 
-def test_a_baseline_that_was_taken_after_a_part_began_is_none_of_its_beginning(tmp_path):
+def test_a_baseline_of_later_is_none_of_the_beginning(tmp_path):
     results = make_results([make_scan(number, time_ns=(number + 1) * PERIOD_NS) for number in range(60)])
     taken = replace(BASELINE, created_unix_s=(OFFSET_NS + 30 * PERIOD_NS) / 1e9)
     results = [replace(one, baseline=taken if number >= 30 else None) for number, one in enumerate(results)]
@@ -134,7 +134,7 @@ def test_the_files_of_a_bag_are_played_in_their_order(turned, bag, metadata):
     assert load_recording(bag).notes == ()
 
 
-def test_a_bag_goes_by_its_metadata_and_names_a_file_that_is_not_there(bag, tmp_path):
+def test_a_bag_goes_by_its_metadata_and_names_missing_files(bag, tmp_path):
     (bag / "bag_2.mcap").rename(bag / "z.mcap")
     (bag / "metadata.yaml").write_text(METADATA.replace("- bag_2.mcap", "- 'z.mcap'\n    - bag_3.mcap"))
     recording = load_recording(bag)
@@ -152,7 +152,7 @@ def test_a_file_of_a_bag_that_breaks_off_costs_its_end(bag):
 @pytest.mark.parametrize(
     ("names", "words"), [((), "nothing in it"), (("a_0.db3", "metadata.yaml"), "'a_0.db3', .*ros2 bag convert")]
 )
-def test_a_folder_without_mcap_files_is_refused_with_what_is_in_it(tmp_path, names, words):
+def test_a_folder_without_mcap_files_is_refused(tmp_path, names, words):
     (tmp_path / "bag").mkdir()
     for name in names:
         (tmp_path / "bag" / name).touch()

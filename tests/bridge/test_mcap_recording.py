@@ -107,7 +107,7 @@ class TestSink:
             assert got.counts.tobytes() == baseline.counts.tobytes()
             assert (got.id, got.created_unix_s, got.scans) == (baseline.id, 1000.0, 100)
 
-    def test_names_that_ros_cannot_tell_apart_get_topics_of_their_own(self, tmp_path):
+    def test_names_that_ros_cannot_tell_apart_get_own_topics(self, tmp_path):
         scans = [make_scan(sensor=name) for name in ("a b", "a_b", "a.b")]
         topics = messages_of(record_into(tmp_path / "out.mcap", make_results(scans)))
         assert {"/a_b/scan", "/x_612062/scan", "/x_612e62/scan"} <= topics.keys()
@@ -124,7 +124,7 @@ class TestSink:
         first, second = (at for at, _ in messages_of(tmp_path / "out.mcap")["/s4/scan"])
         assert second == first + 1 and abs(first - before_ns) < 60 * 10**9
 
-    def test_what_was_said_is_on_the_disk_within_a_second_also_if_nothing_more_comes(self, tmp_path):
+    def test_scans_are_on_the_disk_within_a_second(self, tmp_path):
         now_s = [0.0]
         sink = McapSink(tmp_path / "out.mcap", SURE, clock_s=lambda: now_s[0])
         sink.write(make_results([make_scan()])[0], {})

@@ -18,7 +18,7 @@ from edge.sinks.run_facts import RunFacts
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 
-def test_public_readers_find_units_frames_and_marks_in_the_file_of_an_emulated_sensor(tmp_path):
+def test_public_readers_find_units_frames_and_marks(tmp_path):
     """By the definitions in the file alone, as Foxglove and Rerun read it."""
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     path = tmp_path / "press.mcap"

@@ -75,13 +75,13 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
 
 
 @pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
-def test_forces_of_the_vendors_server_are_turned_wherever_its_sensor_is(mounting):
+def test_forces_of_the_vendors_server_are_turned(mounting):
     assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), LastingLink)
     as_mapped = open_source("xela-server:ws://robot", mountings={"1": Mounting(gains=(2.0,) * 48)})
     assert not isinstance(as_mapped, LastingLink)
 
 
-def test_what_sits_as_mapped_costs_nothing_and_a_quarter_turn_is_what_it_says():
+def test_what_a_mounting_moves_and_what_costs_nothing():
     """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
     assert placed_map(USPA44_MAP, {"4": Mounting(swap_xy=True)}) is USPA44_MAP
     assert not Mounting().turns_axes and not Mounting().moves_taxels
@@ -89,7 +89,7 @@ def test_what_sits_as_mapped_costs_nothing_and_a_quarter_turn_is_what_it_says():
     assert TURNED.order[0] == 3 and placed_map(USPA44_MAP, {"4": TURNED}).taxels[0x004] == ("4", 0)
 
 
-def test_deformation_is_corrected_once_and_silent_taxels_stay_unknown():
+def test_deformation_is_corrected_once():
     scan = make_scan(press_counts=900, absent=(2,))
     mounting = Mounting(signs=(1, 1, -1), gains=(1.0,) * 32 + (2.0,) * 16)
     plain, corrected = deformation(scan.counts, BASELINE), deformation(scan.counts, BASELINE, mounting)
@@ -121,7 +121,7 @@ def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mount
         open_source(f"replay:{tmp_path}/4.csv", 100.0, mountings={"4": mounting})
 
 
-def test_csv_of_the_vendors_server_is_put_in_place_and_what_edge_sr_recorded_is_not(tmp_path):
+def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
     """A CSV is as the server wrote it; edge-sr writes what it has already put in place."""
     counts = make_scan(0, noise=3).counts
     write_csv(tmp_path / "4.csv", counts[None])

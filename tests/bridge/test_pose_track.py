@@ -14,7 +14,7 @@ def turned(turn_deg):
     return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
 
-def test_a_pose_seen_from_another_gives_the_place_on_the_object_again():
+def test_a_pose_seen_from_another_gives_the_place_again():
     newest, earlier = PadPose(12.0, -3.0, 100.0), PadPose(13.5, -1.0, -170.0)
     seen = earlier.seen_from(newest)
     back = turned(newest.turn_deg) @ (seen.x_mm, seen.y_mm) + (newest.x_mm, newest.y_mm)
@@ -31,7 +31,7 @@ def test_a_number_that_is_none_is_refused_by_name(name, value):
         PadPose(0, 0, error_mm=-1)
 
 
-def test_a_pose_between_two_is_interpolated_the_shorter_way_round():
+def test_a_pose_between_two_turns_the_shorter_way_round():
     track = PoseTrack()
     track.add(0, PadPose(0, 0, 175))
     track.add(100 * MS, PadPose(2, -4, -175))
@@ -39,7 +39,7 @@ def test_a_pose_between_two_is_interpolated_the_shorter_way_round():
     assert (pose.x_mm, pose.y_mm) == pytest.approx((0.5, -1.0)) and pose.turn_deg == pytest.approx(177.5)
 
 
-def test_there_is_no_pose_before_the_first_in_a_gap_and_long_after_the_last():
+def test_there_is_no_pose_beyond_those_that_came():
     track = PoseTrack()
     assert track.at(0) is None
     track.add(10 * MS, PadPose(0, 0))
@@ -48,7 +48,7 @@ def test_there_is_no_pose_before_the_first_in_a_gap_and_long_after_the_last():
     assert track.at(10 * MS + 2 * GAP_NS + AHEAD_NS + 1) is None
 
 
-def test_shortly_after_the_last_pose_the_course_goes_on_with_a_larger_error():
+def test_shortly_after_the_last_pose_the_course_goes_on():
     track = PoseTrack()
     track.add(0, PadPose(0, 0, error_mm=0))
     track.add(10 * MS, PadPose(1, 0, error_mm=0))
@@ -81,7 +81,7 @@ def test_a_pose_that_holds_is_that_of_all_times_until_the_next():
     assert track.at(10**12 - 1) == PadPose(1, 2) and track.at(10**12 + MS) == PadPose(3, 2)
 
 
-def test_a_pose_that_is_not_later_is_not_taken_and_memory_is_bounded():
+def test_a_pose_that_is_not_later_is_not_taken():
     track = PoseTrack()
     assert track.add(5, PadPose(0, 0)) and not track.add(5, PadPose(1, 0)) and not track.add(4, PadPose(1, 0))
     for at in range(6, 2 * MOST_POSES):

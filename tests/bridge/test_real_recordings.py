@@ -16,7 +16,7 @@ TRIALS = sorted(path.parent for path in REAL_RECORDINGS.glob("*/xela_sensor1.csv
 
 @pytest.mark.skipif(not TRIALS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
 @pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
-def test_every_row_is_one_scan_and_torn_and_repeated_ones_are_told(trial):
+def test_every_row_is_one_scan_and_torn_ones_are_told(trial):
     fingers = [load_recording(trial / f"xela_sensor{finger}.csv") for finger in (1, 2)]
     scans, noise, got = SlcanScans(), random.Random(1), {"4": [], "6": []}
     for number, rows in enumerate(zip(*(finger.tracks[0].counts for finger in fingers), strict=True)):

@@ -271,7 +271,7 @@ def test_npz_that_is_none(tmp_path, changes, words):
         load_recording(write_npz(tmp_path, **changes))
 
 
-def test_npz_that_lost_its_end_is_read_as_far_as_its_arrays_are_whole(tmp_path):
+def test_npz_is_read_as_far_as_its_arrays_are_whole(tmp_path):
     whole = write_npz(tmp_path, zpattern=np.arange(5000)).read_bytes()
     expected = load_recording(write_csv(tmp_path, whole, "finger.npz"))
     assert expected.notes == ()

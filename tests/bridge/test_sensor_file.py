@@ -118,7 +118,7 @@ def text_of(**changes):
         ("y", "", "missing"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line_that_names_the_key(tmp_path, key, value, expected):
+def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value, expected):
     (tmp_path / "s.toml").write_text(text_of(**{key: value}))
     with pytest.raises(SensorFileError, match=re.escape(expected)) as refused:
         load_sensor_file(tmp_path / "s.toml")
@@ -221,7 +221,7 @@ def test_that_text_is_refused_for_its_id_alone(tmp_path):
     assert read.baseline is not None and read.baseline.counts[2, 3, 3] == 15
 
 
-def test_a_file_that_cannot_be_replaced_stays_and_leaves_nothing_beside_it(tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_replaced_stays(tmp_path, monkeypatch):
     path = tmp_path / "s.toml"
     path.write_text("old")
     monkeypatch.setattr(
@@ -232,7 +232,7 @@ def test_a_file_that_cannot_be_replaced_stays_and_leaves_nothing_beside_it(tmp_p
     assert path.read_text() == "old" and [one.name for one in tmp_path.iterdir()] == ["s.toml"]
 
 
-def test_numpys_numbers_are_written_as_numbers_and_a_silent_taxel_not_at_all(tmp_path):
+def test_numpys_numbers_are_written_and_a_silent_taxel_is_not(tmp_path):
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(counts_per_newton=np.float64(1180.0))}))
     assert load_sensor_file(tmp_path / "s.toml").sensors["4"].counts_per_newton == 1180.0
     rest = np.full((3, 4, 4), 16_000.0)

@@ -161,7 +161,7 @@ def test_a_stamp_beyond_a_minute_is_none():
 @pytest.mark.parametrize(
     ("usual", "other"), [([GOLDEN] * 4, STAMPED), (STAMPED, [GOLDEN] * 4)], ids=["plain", "stamped"]
 )
-def test_which_form_is_the_adapters_is_learnt_from_four_frames_in_a_row(usual, other):
+def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     few = LINES_TO_LEARN - 1
     # Before that both are taken, in any order.
     assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few

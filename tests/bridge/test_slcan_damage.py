@@ -21,7 +21,7 @@ from firmware_bridge.can.slcan import (
     st.lists(st.tuples(st.text("0123456789ABCDEFabcdef \0zx", max_size=60).map(str.encode), plain_frames), max_size=10)
 )
 @settings(deadline=None)
-def test_noise_without_frame_letters_before_a_frame_costs_nothing(noisy):
+def test_noise_without_frame_letters_costs_nothing(noisy):
     stream = b"".join(noise + encode_frame(frame) for noise, frame in noisy)
     sent, counters = decode(stream)
     assert sent == [frame for _, frame in noisy]
@@ -119,7 +119,7 @@ def test_what_no_decoder_can_tell():
     assert decode(stamped * 4, lost)[0] == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 4
 
 
-def test_no_loss_in_a_stamped_line_makes_a_frame_once_stamps_are_learnt():
+def test_no_loss_makes_a_frame_once_stamps_are_learnt():
     line = STAMPED[2]
     for start in range(len(line)):
         for end in range(start + 1, len(line)):
@@ -129,7 +129,7 @@ def test_no_loss_in_a_stamped_line_makes_a_frame_once_stamps_are_learnt():
 
 
 @pytest.mark.parametrize(("stamp", "learnt", "places"), [(b"", 0, set()), (b"1234", 0, {4}), (b"1234", 4, set())])
-def test_a_letter_in_mid_line_makes_eight_bytes_only_of_a_stamped_line_before_stamps_are_learnt(stamp, learnt, places):
+def test_where_a_letter_in_mid_line_makes_a_whole_frame(stamp, learnt, places):
     noise = random.Random(5)
     made_up = set()
     for _ in range(300):
@@ -140,7 +140,7 @@ def test_a_letter_in_mid_line_makes_eight_bytes_only_of_a_stamped_line_before_st
     assert made_up == places
 
 
-def test_what_a_broken_link_left_unfinished_is_skipped_and_counted():
+def test_what_a_broken_link_left_unfinished_is_skipped():
     decoder = SlcanDecoder()
     line = encode_frame(CanFrame(0x004, bytes(8)))
     decoder.feed(line[:9])

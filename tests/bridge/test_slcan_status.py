@@ -149,7 +149,7 @@ def test_an_answer_is_of_a_silence_only_if_asked_in_it():
     assert not questions.answered_in_silence, "a scan came"
 
 
-def test_a_new_opening_is_a_new_chance_for_who_has_ever_answered():
+def test_a_new_opening_is_a_new_chance_for_who_ever_answered():
     for ever in (True, False):
         status = AdapterStatus()
         if ever:

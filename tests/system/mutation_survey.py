@@ -72,6 +72,7 @@ SUBJECTS = {
             "tests/bridge/test_scan_assembler_cycles.py",
             "tests/bridge/test_scan_assembler.py",
             "tests/bridge/test_slcan_scans.py",
+            "tests/bridge/test_cycles.py",
         ),
     ),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
