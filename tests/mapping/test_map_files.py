@@ -29,7 +29,7 @@ def pressed(sink, places=((0.0, 0.0),), *, posed=True, first=0, **changes):
         sink.write(result_of(letter, pose, number=number, posed=posed, **changes), NONE)
 
 
-def test_layers_come_back_from_the_npz_and_the_picture_shows_them(tmp_path):
+def test_layers_come_back_and_the_picture_shows_them(tmp_path):
     sink = MapSink(ObjectMap(), npz=tmp_path / "m.npz", png=tmp_path / "m.png")
     pressed(sink, ((-12.0, 0.0), (-12.0, 16.0)))
     pressed(sink, ((20.0, -20.0),), first=2, trusted=False)
@@ -73,7 +73,7 @@ def test_files_of_an_emulated_sensor_say_so_also_in_a_replay(tmp_path):
         assert (line.shape[0] > 20) == emulated and set(np.unique(line)) == ({0, 255} if emulated else set())
 
 
-def test_a_reset_ends_the_map_of_one_object_and_begins_that_of_the_next(tmp_path):
+def test_a_reset_ends_a_map_and_begins_the_next(tmp_path):
     reset = (Event(0, "reset", None, ""),)
     sink = MapSink(ObjectMap(40.0, 2.0, centre_mm=(5.0, 0.0)), npz=tmp_path / "m.npz")
     pressed(sink, events=reset)
@@ -91,7 +91,7 @@ def test_a_reset_ends_the_map_of_one_object_and_begins_that_of_the_next(tmp_path
     assert sink.summary() == f"map: 5 patterns fused, 1 not believed; {files} written" and sink.fused == 5
 
 
-def test_two_pads_at_one_place_are_not_fused_since_one_has_the_others_pose():
+def test_two_pads_at_one_place_are_not_fused():
     shared, apart, shown = MapSink(ObjectMap()), MapSink(ObjectMap()), []
     apart.show, apart._pause_ns = shown.append, 0
     for number in range(6):
@@ -111,7 +111,7 @@ def test_two_pads_at_one_place_are_not_fused_since_one_has_the_others_pose():
     assert shared.summary() == "map: 0 patterns fused, 10 of two pads at one place; no file written"
 
 
-def test_a_file_that_exists_is_left_alone_and_an_empty_map_writes_none(tmp_path):
+def test_a_file_is_left_alone_and_an_empty_map_writes_none(tmp_path):
     there = tmp_path / "there.npz"
     there.write_text("a good one")
     with pytest.raises(SinkError, match=r"there\.npz exists: give another name"):

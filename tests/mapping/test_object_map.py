@@ -39,7 +39,7 @@ def over(height, poses):
 
 
 @pytest.mark.parametrize("turns", [(0.0,), (90.0,), (0.0, 45.0, -120.0)], ids=["straight", "upright", "mixed"])
-def test_perfect_patterns_of_a_letter_give_its_outline_to_a_fraction_of_a_pixel(turns):
+def test_perfect_patterns_of_a_letter_give_its_outline(turns):
     whole = fused(letter, over(letter, raster(turns)))
     layers = whole.layers()
     x_mm, y_mm = pixels_mm(whole.grid)
@@ -71,7 +71,7 @@ def test_a_deeper_press_does_not_raise_the_map():
     assert np.nanmax(fused(dome, [HERE, HERE], (0.2, 0.45)).layers().height_mm) < 0.01
 
 
-def test_heights_of_a_curved_part_agree_between_presses_that_do_not_share_the_highest_point():
+def test_heights_of_a_curved_part_agree_between_presses():
     poses = [PadPose(float(x), 0.0, 0.0, 0.0, 0.0) for x in range(-12, 13, 3)]
     whole = fused(dome, poses, (0.4, 0.25))
     layers = whole.layers()
@@ -103,7 +103,7 @@ def test_which_press_of_a_contact_counts(presses, fused, doubted, light):
     assert layers.coverage.any() == np.isfinite(layers.contact).any() == np.isfinite(layers.height_mm).any() == fused
 
 
-def test_a_press_too_light_to_check_is_left_out_where_the_model_checks():
+def test_a_press_too_light_to_check_is_left_out():
     for trusted, fate in (((True, None), (1, 1)), ((None, None), (2, 0))):
         whole = ObjectMap()
         for number, one in enumerate(trusted):
@@ -171,7 +171,7 @@ def test_memory_does_not_grow_with_the_run():
     assert np.isfinite(whole.layers().contact).any()
 
 
-def test_what_lies_outside_the_map_is_left_out_and_a_part_of_a_pad_is_not():
+def test_what_lies_outside_the_map_is_left_out():
     whole = ObjectMap(20.0, 4.0, centre_mm=(100.0, 0.0))
     for x_mm in (0.0, 1e6, 95.0):
         whole.add(result_of(dome, HERE), PadPose(x_mm, 0.0))

@@ -69,7 +69,7 @@ def test_the_contract_tells_the_error_that_is_measured_here(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_intervals_hold_their_share_and_no_figure_or_family_is_left_behind(name):
+def test_intervals_hold_and_no_figure_is_left_behind(name):
     """Intervals are calibrated on presses of the wide world; figures are easier, and more of their pixels held."""
     for test_set, most, hard in ((wide, 0.92, set()), (frozen, 1, HARD_FIGURES)):
         made = errors(name, all_taps(name, test_set), test_set)
@@ -84,7 +84,7 @@ def test_intervals_hold_their_share_and_no_figure_or_family_is_left_behind(name)
 
 
 @pytest.mark.parametrize("test_set", [frozen, wide])
-def test_no_model_of_several_taps_without_poses_is_clearly_better_than_the_default(test_set):
+def test_no_model_without_poses_is_better_than_the_default(test_set):
     """STSR is the default for this: on the wide set 27.27 dB against 27.28, on the figures 28.6 against 28.1.
 
     Clearly: the difference's 95 % interval, frames of one tap drawn together, lies above zero.
@@ -106,7 +106,7 @@ def test_one_tap_of_the_model_with_poses_is_that_of_the_default(suffix):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_is_one_small_file_and_extreme_windows_give_finite_patterns(name):
+def test_each_is_one_small_file_and_always_finite(name):
     path = find_model(name)
     # 3.13 MB with the pad as an input and traction as an output, 0.24 MB of checks; a graph of both, for one tap
     # and for several with poses, 7.8 MB.

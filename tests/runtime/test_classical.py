@@ -18,7 +18,7 @@ def test_bilinear_is_exact_on_a_slope_between_the_outer_taxels():
     assert np.allclose(bilinear(taxels, 7)[3], bilinear(taxels[3], 7)) and bilinear(taxels, 7).shape == (5, 28, 28)
 
 
-def test_bicubic_is_exact_on_a_parabola_where_it_has_two_taxels_on_either_side():
+def test_bicubic_is_exact_on_a_parabola():
     def parabola(x):
         return 1 - 2 * x + 3 * x**2
 
@@ -30,7 +30,7 @@ def test_bicubic_is_exact_on_a_parabola_where_it_has_two_taxels_on_either_side()
     assert not np.allclose(up[5:55, 5:65], expected[5:55, 5:65])
 
 
-def test_bicubic_goes_through_the_taxels_and_reads_none_further_than_two_pitches():
+def test_bicubic_goes_through_the_taxels_and_no_further():
     taxels = np.random.default_rng(4).standard_normal((3, 4, 4))
     assert np.allclose(bicubic(taxels, 5)[:, 2::5, 2::5], taxels)
     assert np.allclose(bicubic(np.full((4, 4), 3.0), 10), 3.0)

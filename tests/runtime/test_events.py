@@ -13,7 +13,7 @@ from firmware_bridge.silence import TAXEL_SILENT_SCANS
 PAGE = [path for path in (ROOT / "edge" / "view").rglob("*") if path.suffix in (".html", ".js")]
 
 
-def test_kinds_are_those_in_the_list_each_with_a_text_and_a_place_in_the_docs():
+def test_each_kind_has_a_text_and_a_place_in_the_docs():
     with pytest.raises(ValueError, match="'runtime', expected one of back, baseline_cleared, baseline_doubted"):
         Event(0, "runtime", None, "told")
     with pytest.raises(ValueError, match="note kind is 'old', expected one of baseline_in_doubt"):
@@ -33,7 +33,7 @@ def test_the_page_goes_by_kinds_that_there_are():
     assert notes and notes <= NOTE_KINDS
 
 
-def test_a_result_has_what_happened_before_it_at_its_own_time_and_once():
+def test_a_result_has_once_what_happened_before_it():
     pad = Pushed()
     pad.runtime.zero()
     first = pad.push()

@@ -45,7 +45,7 @@ class TestSet:
         assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
         assert small.touching()[0].sum() == 40 and not small.touching()[5].any() and small.scale == 10
 
-    def test_a_file_gives_back_the_set_and_is_not_replaced_by_one_that_cannot_be_read(self, small, tmp_path):
+    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, small, tmp_path):
         path = tmp_path / "set.npz"
         small.save(path)
         with pytest.raises(FrozenSetError):
@@ -85,7 +85,7 @@ class TestBundle:
         assert bundle.find_model(asked) == models / "mtsr4-int8.onnx"
         assert [path.stem for path in bundle.bundled_models()] == ["mtsr4-int8", "stsr"]
 
-    def test_a_file_wins_over_a_bundled_name_and_a_directory_is_no_model_file(self, models, tmp_path):
+    def test_a_file_wins_over_a_bundled_name_and_no_directory_does(self, models, tmp_path):
         (tmp_path / "mtsr4").mkdir()
         (tmp_path / "stsr").write_text("mine")
         assert bundle.find_model("mtsr4") == models / "mtsr4.onnx" and bundle.find_model("stsr").read_text() == "mine"

@@ -67,7 +67,7 @@ print("libcrypto" in open("/proc/self/maps").read() if os.path.exists("/proc/sel
 """
 
 
-def test_a_run_loads_what_it_uses_starts_two_threads_and_leaves_no_trace(tmp_path):
+def test_a_run_loads_what_it_uses_and_leaves_no_trace(tmp_path):
     """One thread reads, for as long as scans come; one sleeps until a signal asks for the end.
 
     onnxruntime sends telemetry unless it is switched off.

@@ -25,7 +25,7 @@ def test_psnr_and_rmse_have_the_square_and_the_mean():
 
 
 @pytest.mark.parametrize("full_scale", [0.1, 1.0, 25.0])
-def test_ssim_is_scikit_images_and_that_of_one_window_the_formula(full_scale):
+def test_ssim_is_scikit_images_and_the_formula(full_scale):
     pattern, truth = maps(3)
     gaussian = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     expected = structural_similarity(pattern, truth, data_range=full_scale, **gaussian)
@@ -59,7 +59,7 @@ def test_a_batch_is_its_members_and_what_does_not_fit_is_refused(metric):
         ssim(np.zeros((10, 20)), np.zeros((10, 20)), 1.0)
 
 
-def test_touched_is_a_share_of_the_maximum_and_nothing_on_a_zero_map():
+def test_touched_is_a_share_of_the_maximum():
     pattern = np.array([[0.0, 0.5], [0.79, 1.0]])
     assert touched(pattern, 0.8).tolist() == [[False, False], [False, True]]
     assert touched(pattern, 0.5).tolist() == [[False, True], [True, True]]
@@ -91,7 +91,7 @@ def test_outlines_lie_as_far_apart_as_they_were_moved():
         boundary_distance_mm(nothing, np.ones((1, 4, 4), dtype=bool), 0.5, 2.0)
 
 
-def test_regions_lie_around_the_contact_and_the_pads_own_rim_is_no_edge():
+def test_regions_lie_around_the_contact():
     pattern = np.zeros((1, 40, 40), dtype=np.float32)
     pattern[0, 10:20, 10:20] = 0.2
     region = regions(pattern, 0.3, 4)[0]

@@ -65,7 +65,7 @@ class TestOperators:
         with pytest.raises(ModelError, match="operator 'Loop'"):
             check_plain(b"\x3a" + bytes([len(node)]) + node)
 
-    def test_all_that_are_listed_are_in_the_docs_and_enough_for_the_bundled_models(self):
+    def test_the_list_is_in_the_docs_and_enough_for_our_models(self):
         page = (ROOT / "docs" / "formats.md").read_text()
         listed = re.search(r"Allowed operators: (.*?)\.\n", page, re.DOTALL)
         assert listed is not None and set(re.findall(r"\w+", listed[1])) == OPERATORS
@@ -75,7 +75,7 @@ class TestOperators:
 
 
 class TestFormat:
-    def test_onnxruntimes_own_format_is_not_loaded_though_the_check_were_passed(self, tmp_path, monkeypatch):
+    def test_onnxruntimes_own_format_is_not_loaded(self, tmp_path, monkeypatch):
         options = session.session_options()
         options.optimized_model_filepath = str(tmp_path / "m.ort")
         options.add_session_config_entry("session.save_model_format", "ORT")
@@ -86,7 +86,7 @@ class TestFormat:
         with pytest.raises(ModelError, match="not a model that onnxruntime can load"):
             load_session(tmp_path / "m.onnx")
 
-    def test_an_onnx_file_that_looks_like_it_is_loaded_as_the_onnx_file_that_was_checked(self, tmp_path):
+    def test_an_onnx_file_that_looks_like_it_is_loaded_as_onnx(self, tmp_path):
         model = onnx.load(write_model(tmp_path / "m.onnx"))
         model.producer_name = "ORTM"
         path = written(tmp_path / "m.onnx", model)
@@ -154,7 +154,7 @@ sys.exit(cli.main(["--source", "demo", "--model", sys.argv[1]]))
 
 
 class TestEndlessLoad:
-    def test_it_ends_at_the_limit_with_4_and_one_line_and_does_not_go_on(self, tmp_path, monkeypatch, capsys):
+    def test_it_ends_at_the_limit_with_4_and_one_line(self, tmp_path, monkeypatch, capsys):
         """No work is done on constants while it loads, which nothing could end; the first run can be ended."""
         monkeypatch.setattr(loading, "LOAD_LIMIT_S", 0.5)
         path = written(tmp_path / "slow.onnx", hours_of_work())

@@ -59,7 +59,7 @@ def missed_of(arrivals, pace=True):
     return silence.missed
 
 
-def test_what_was_held_up_and_comes_in_a_burst_was_late_and_not_missed():
+def test_what_comes_in_a_burst_was_late_and_not_missed():
     """Forty scans are held up, two are lost."""
     times_ms = [10 * n for n in range(100)] + [1400 + 0.3 * n for n in range(40)] + [10 * n for n in range(142, 200)]
     assert missed_of(scan(number, time_ms) for number, time_ms in enumerate(times_ms)) == 2
@@ -92,7 +92,7 @@ def busy_reader(seed, *, stamped, away_ms, busy, lost=()):
 
 
 @pytest.mark.parametrize("away_ms", [0, 500])
-def test_a_busy_reader_misses_what_was_lost_with_stamps_and_next_to_nothing_without(away_ms):
+def test_a_busy_reader_misses_only_what_was_lost(away_ms):
     """The pace of reading alone would give thousands missed of a thousand; a guess is off by one now and then."""
     lost, guessed = {*range(300, 307), *range(600, 640)}, []
     for seed in range(6):
@@ -110,7 +110,7 @@ def test_a_busy_reader_misses_what_was_lost_with_stamps_and_next_to_nothing_with
         (["4", "6"], range(200), [("silent", SILENT_MS + 10)]),  # never there
     ],
 )
-def test_a_finger_that_is_silent_while_the_other_goes_on_is_told_once_and_told_back(wanted, gone, told):
+def test_a_silent_finger_is_told_once_and_told_back(wanted, gone, told):
     silence, events = Silence(wanted), []
     for n in range(200):
         for sensor in ("4", "6"):
@@ -125,7 +125,7 @@ def test_a_finger_that_is_silent_while_the_other_goes_on_is_told_once_and_told_b
         assert events[1].text == "sensor 6 is back after 1.0 s"
 
 
-def test_after_a_link_was_away_its_own_sensors_are_not_silent_for_coming_second():
+def test_after_an_outage_its_own_sensors_are_excused():
     silence = Silence()
     for sensor in ("left/4", "left/5", "right/4", "right/6"):
         silence.follow(scan(0, 0, sensor), PERIOD_NS)

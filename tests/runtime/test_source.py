@@ -130,7 +130,7 @@ class TestOpening:
 
 
 class TestOne:
-    def test_a_scan_wakes_who_waits_for_it_and_nothing_comes_after_the_timeout(self):
+    def test_a_scan_wakes_who_waits_for_it(self):
         gate = threading.Event()
         link = FakeLink([gate, presses([0])], endless=True)
         with Source(link) as source:
@@ -142,7 +142,7 @@ class TestOne:
     @pytest.mark.parametrize(
         ("at", "given"), [(1, ["told", 6, 7, 8]), (5, ["told", 5, 6, 7, 8]), (9, [5, 6, 7, "told", 8])]
     )
-    def test_a_notice_keeps_its_place_where_scans_are_thrown_away_that_nobody_took(self, at, given):
+    def test_a_notice_keeps_its_place_among_lost_scans(self, at, given):
         class Telling(FakeLink):
             def notices(self):
                 return [Notice(0, "lost", "told")] if self.reads == at else []
@@ -218,7 +218,7 @@ class TestScripts:
         early, late = (sum(trace.size for trace in held[reads].traces) for reads in (100, 1900))
         assert late - early < 4096
 
-    def test_what_is_told_comes_before_the_scans_that_are_given_with_it(self):
+    def test_a_notice_comes_before_the_scans_given_with_it(self):
         class Telling(FakeLink):
             def notices(self):
                 return [Notice(self.reads, "back", f"before read {self.reads}")]
@@ -229,7 +229,7 @@ class TestScripts:
         assert told[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
 
     @pytest.mark.parametrize("shared", [False, True])
-    def test_one_that_gives_up_ends_all_after_its_scans_and_what_it_told(self, shared):
+    def test_one_that_gives_up_ends_all_after_its_scans(self, shared):
         lost = (PipeLink if shared else FakeLink)([[make_scan(0)]], error=LinkLostError("gone"))
         told = [Notice(0, "lost", "told")]
         lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
@@ -258,7 +258,7 @@ def lasting(port, name):
 
 class TestPorts:
     @pytest.mark.parametrize("together_s", [0.0, 0.003])
-    def test_two_are_read_in_one_thread_and_nothing_is_lost_or_mixed_up(self, together_s):
+    def test_two_are_read_in_one_thread_and_nothing_is_lost(self, together_s):
         recordings = dict(zip(("left", "right"), (make_recording(60, seed=seed) for seed in (1, 2)), strict=True))
         before = set(threading.enumerate())
         with contextlib.ExitStack() as stack:
@@ -284,7 +284,7 @@ class TestPorts:
         assert counters["frames"] == counters["readings"] and counters["torn_source"] == 0
         assert counters["outages"] == counters["reopenings"] == 0
 
-    def test_one_that_is_away_holds_up_no_other_and_comes_back_to_the_common_thread(self, tmp_path):
+    def test_one_that_is_away_holds_up_no_other_and_comes_back(self, tmp_path):
         """The left adapter is pulled out for a while; the right one's scans go on meanwhile, each of them."""
         recordings = [make_recording(120, seed=seed) for seed in (1, 2)]
         port = tmp_path / "left"

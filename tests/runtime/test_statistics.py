@@ -121,12 +121,12 @@ class TestSummary:
         (line,) = [line for line in summary.splitlines() if "no pattern" in line]
         assert line.startswith(f"sensor 4 has no pattern: {why}")
 
-    def test_it_is_silent_of_a_sensor_that_nothing_touched_while_another_was(self):
+    def test_it_is_silent_of_a_sensor_beside_one_that_was_touched(self):
         results = [noted(0, "contact"), noted(0, "idle", sensor="6"), noted(0, "zeroing", sensor="7")]
         (line,) = [line for line in counted(results).summary(source="x").splitlines() if "no pattern" in line]
         assert line.startswith("sensor 7 has no pattern: not zeroed")
 
-    def test_it_tells_the_rate_of_each_sensor_over_more_than_a_second(self):
+    def test_it_tells_rates_over_more_than_a_second(self):
         results = [
             at(n, n * period_ns, sensor) for n in range(111) for sensor, period_ns in (("4", 10**7), ("6", 10**8))
         ]

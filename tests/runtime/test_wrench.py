@@ -102,7 +102,7 @@ def test_a_recording_holds_it_as_messages_and_as_arrays(tmp_path):
     assert arrays["wrench_origin"].tolist() == ["", "nominal"]
 
 
-def test_ros_takes_the_wrench_before_the_calibrated_force_and_the_diagnostics_name_its_origin():
+def test_ros_takes_the_wrench_before_the_calibrated_force():
     both = make_wrench_result(counts_per_newton=1000.0)
     assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
     told = force_and_torque(both, USPA44)
