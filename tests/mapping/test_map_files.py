@@ -1,6 +1,8 @@
+"""Files of the map of an object, and its states while it grows."""
+# pyright: reportArgumentType=false
+
 import errno
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +14,12 @@ from PIL import Image
 from edge.errors import SinkError
 from edge.mapping import map_files
 from edge.mapping.live_map import Box, MapState
-from edge.mapping.map_files import png
 from edge.mapping.object_map import MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
 from edge.perception.event import Event
 from firmware_bridge.poses.pad_pose import PadPose
 
 NONE = {"dropped": 0}
-
-
-class Clock:
-    now_ns = 10**12
-
-    def __call__(self):
-        return self.now_ns
 
 
 def pressed(sink, places=((0.0, 0.0),), *, posed=True, first=0, **changes):
@@ -35,7 +29,7 @@ def pressed(sink, places=((0.0, 0.0),), *, posed=True, first=0, **changes):
         sink.write(result_of(letter, pose, number=number, posed=posed, **changes), NONE)
 
 
-def test_layers_come_back_from_the_npz_and_the_picture_shows_them(tmp_path):
+def test_layers_come_back_and_the_picture_shows_them(tmp_path):
     sink = MapSink(ObjectMap(), npz=tmp_path / "m.npz", png=tmp_path / "m.png")
     pressed(sink, ((-12.0, 0.0), (-12.0, 16.0)))
     pressed(sink, ((20.0, -20.0),), first=2, trusted=False)
@@ -79,7 +73,7 @@ def test_files_of_an_emulated_sensor_say_so_also_in_a_replay(tmp_path):
         assert (line.shape[0] > 20) == emulated and set(np.unique(line)) == ({0, 255} if emulated else set())
 
 
-def test_a_reset_ends_the_map_of_one_object_and_begins_that_of_the_next(tmp_path):
+def test_a_reset_ends_a_map_and_begins_the_next(tmp_path):
     reset = (Event(0, "reset", None, ""),)
     sink = MapSink(ObjectMap(40.0, 2.0, centre_mm=(5.0, 0.0)), npz=tmp_path / "m.npz")
     pressed(sink, events=reset)
@@ -97,7 +91,7 @@ def test_a_reset_ends_the_map_of_one_object_and_begins_that_of_the_next(tmp_path
     assert sink.summary() == f"map: 5 patterns fused, 1 not believed; {files} written" and sink.fused == 5
 
 
-def test_two_pads_at_one_place_are_not_fused_since_one_has_the_others_pose():
+def test_two_pads_at_one_place_are_not_fused():
     shared, apart, shown = MapSink(ObjectMap()), MapSink(ObjectMap()), []
     apart.show, apart._pause_ns = shown.append, 0
     for number in range(6):
@@ -117,12 +111,7 @@ def test_two_pads_at_one_place_are_not_fused_since_one_has_the_others_pose():
     assert shared.summary() == "map: 0 patterns fused, 10 of two pads at one place; no file written"
 
 
-def test_a_png_holds_every_pixel():
-    pixels = np.random.default_rng(1).integers(0, 256, (7, 13, 3)).astype(np.uint8)
-    assert np.array_equal(np.round(255 * imread(BytesIO(png(pixels)))), pixels)
-
-
-def test_a_file_that_exists_is_left_alone_and_an_empty_map_writes_none(tmp_path):
+def test_a_file_is_left_alone_and_an_empty_map_writes_none(tmp_path):
     there = tmp_path / "there.npz"
     there.write_text("a good one")
     with pytest.raises(SinkError, match=r"there\.npz exists: give another name"):
@@ -152,11 +141,11 @@ def test_a_disk_that_is_full_leaves_no_half_of_a_file(tmp_path, monkeypatch):
 
 
 def test_states_are_shown_a_few_times_a_second_and_at_the_end():
-    shown, clock = [], Clock()
-    sink = MapSink(ObjectMap(), show=shown.append, clock_ns=clock)
-    for number in range(100):
+    shown, now_ns = [], [10**12]
+    sink = MapSink(ObjectMap(), show=shown.append, clock_ns=lambda: now_ns[0])
+    for number in range(40):
         pressed(sink, ((number * 0.1 - 5, 0.0),), first=number)
-        clock.now_ns += SHOW_NS // 25
+        now_ns[0] += SHOW_NS // 10
     assert len(shown) == 4
     sink.wait()
     sink.close()

@@ -83,7 +83,7 @@ def doubted(results):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_free_pad_with_an_old_baseline_is_in_doubt_from_the_first_scan(seed):
+def test_an_old_baseline_is_in_doubt_from_the_first_scan(seed):
     for hours in (4, 22):
         doubted(Pad().read(0.3, drift_field(seed, hours)))
     assert states(Pad().read(0.3, drift_field(seed, 1))) <= {"idle", "baseline_in_doubt"}, "of an hour's drift"
@@ -168,7 +168,7 @@ def test_drift_that_creeps_over_the_threshold_is_no_contact(counts_per_s, follow
         assert states(pad.read(0.5, GRIP * 2)) == HELD, "drift does not explain it any more"
 
 
-def test_a_press_slower_than_drift_is_a_contact_where_it_is_local():
+def test_a_local_press_slower_than_drift_is_a_contact():
     pad = Pad(follow_drift=False)
     pad.read(1)
     assert states(pad.read(20, lambda t: LOCAL * t / 20)) == FREE | HELD

@@ -1,3 +1,5 @@
+"""Classical methods of super-resolution: closed forms, fits, and the file of fitted ones."""
+
 import numpy as np
 import pytest
 
@@ -5,34 +7,18 @@ from edge.errors import EdgeError
 from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 
 
-def test_bilinear_keeps_a_constant():
-    assert np.allclose(bilinear(np.full((4, 4), 3.0), 10), 3.0)
-
-
 def test_bilinear_is_exact_on_a_slope_between_the_outer_taxels():
     slope = np.arange(4.0)[None, :].repeat(4, axis=0)
     up = bilinear(slope, 10)
     expected = (np.arange(40) + 0.5) / 10 - 0.5
     assert np.allclose(up[0, 5:35], expected[5:35])
-    assert np.allclose(up[:, :5], 0.0)
-    assert np.allclose(up[:, 35:], 3.0)
-
-
-def test_bilinear_puts_rows_and_columns_where_they_belong():
-    taxels = np.zeros((4, 4))
-    taxels[1, 3] = 1.0
-    row, col = np.unravel_index(bilinear(taxels, 10).argmax(), (40, 40))
-    assert 10 <= row < 20
-    assert 30 <= col < 40
-
-
-def test_bilinear_works_on_a_batch_and_other_scales():
+    assert np.allclose(up[:, :5], 0.0) and np.allclose(up[:, 35:], 3.0)
+    assert np.allclose(bilinear(slope.T, 10), up.T), "rows and columns are where they belong"
     taxels = np.random.default_rng(0).standard_normal((5, 4, 4))
-    assert np.allclose(bilinear(taxels, 7)[3], bilinear(taxels[3], 7))
-    assert bilinear(taxels, 7).shape == (5, 28, 28)
+    assert np.allclose(bilinear(taxels, 7)[3], bilinear(taxels[3], 7)) and bilinear(taxels, 7).shape == (5, 28, 28)
 
 
-def test_bicubic_is_exact_on_a_parabola_where_it_has_two_taxels_on_either_side():
+def test_bicubic_is_exact_on_a_parabola():
     def parabola(x):
         return 1 - 2 * x + 3 * x**2
 
@@ -44,27 +30,14 @@ def test_bicubic_is_exact_on_a_parabola_where_it_has_two_taxels_on_either_side()
     assert not np.allclose(up[5:55, 5:65], expected[5:55, 5:65])
 
 
-@pytest.mark.parametrize("scale", [4, 7, 10])
-def test_bicubic_is_torchs_but_for_the_kernel(scale, monkeypatch):
-    torch = pytest.importorskip("torch")
-    taxels = np.random.default_rng(3).standard_normal((2, 1, 4, 5))
-    other = torch.nn.functional.interpolate(torch.from_numpy(taxels), scale_factor=scale, mode="bicubic")
-    monkeypatch.setattr("edge.evaluation.classical_methods._CUBIC_A", -0.75)
-    assert np.allclose(bicubic(taxels, scale), other.numpy(), atol=1e-12)
-
-
-def test_bicubic_goes_through_the_taxels_and_keeps_a_constant():
+def test_bicubic_goes_through_the_taxels_and_no_further():
     taxels = np.random.default_rng(4).standard_normal((3, 4, 4))
     assert np.allclose(bicubic(taxels, 5)[:, 2::5, 2::5], taxels)
     assert np.allclose(bicubic(np.full((4, 4), 3.0), 10), 3.0)
-
-
-def test_bicubic_reads_no_taxel_further_than_two_pitches():
     spike = np.zeros((8, 8))
     spike[0, 0] = 1.0
     up = bicubic(spike, 10)
-    assert up[24, 4] != 0
-    assert (up[25:] == 0).all()
+    assert up[24, 4] != 0 and (up[25:] == 0).all()
 
 
 def test_fits_find_what_made_the_data():
@@ -74,12 +47,11 @@ def test_fits_find_what_made_the_data():
     assert fit_gain(readings, 2.5 * readings) == pytest.approx(2.5)
 
 
-def test_methods_come_from_a_file(tmp_path):
-    path = tmp_path / "classical.npz"
-    rng = np.random.default_rng(2)
+def test_methods_come_from_a_file_and_another_is_refused(tmp_path):
+    path, rng = tmp_path / "classical.npz", np.random.default_rng(2)
     matrix = rng.standard_normal((48, 1600)).astype(np.float32)
-    np.savez(path, bilinear_gain=np.float32(0.5), bicubic_gain=np.float32(0.25), linear_map=matrix)
     newest = rng.standard_normal((3, 3, 4, 4))
+    np.savez(path, bilinear_gain=np.float32(0.5), bicubic_gain=np.float32(0.25), linear_map=matrix)
     methods = fitted_methods(path, 10)
     assert np.allclose(methods["bilinear"](newest), 0.5 * bilinear(newest[:, 2], 10))
     assert np.allclose(methods["bicubic"](newest), 0.25 * bicubic(newest[:, 2], 10))
@@ -87,8 +59,9 @@ def test_methods_come_from_a_file(tmp_path):
 
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path):
+    path = tmp_path / "other.npz"
     with pytest.raises(EdgeError, match=r"train\.freeze"):
         fitted_methods(tmp_path / "none.npz", 10)
-    np.savez(tmp_path / "other.npz", something=1)
+    np.savez(path, something=1)
     with pytest.raises(EdgeError, match="bilinear_gain"):
-        fitted_methods(tmp_path / "other.npz", 10)
+        fitted_methods(path, 10)

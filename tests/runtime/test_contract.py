@@ -76,7 +76,7 @@ def test_a_key_that_is_missing_or_broken_is_named(key):
 
 
 @pytest.mark.parametrize("version", [1, CONTRACT_VERSION - 1, CONTRACT_VERSION + 1])
-def test_of_another_version_the_version_is_named_not_what_it_lacks(version):
+def test_another_version_is_named_not_what_it_lacks(version):
     metadata = make_contract(version=version).to_metadata()
     del metadata["tactile.interval_factor"]
     with pytest.raises(

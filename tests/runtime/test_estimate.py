@@ -56,7 +56,7 @@ def one_way(shape) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("taxels", "kind"), [((1, 6, 11), 0), ((1, 6), 1)])
-def test_the_dead_are_estimated_by_the_kind_of_contact_that_the_living_show(taxels, kind):
+def test_the_dead_are_estimated_by_the_kind_of_contact(taxels, kind):
     """Without error, where the others tell all."""
     shapes = np.random.default_rng(0).uniform(500, 1500, (2, 16)) * [[1], [-1]]
     filler = TaxelEstimator(np.stack([one_way(shape) for shape in shapes]), GRID).filler(dead(*taxels))
@@ -80,7 +80,7 @@ def test_a_field_that_varies_little_is_estimated_from_neighbours(taxels):
     assert told.filled == twice.filled == "neighbours"
 
 
-def test_of_simulated_taps_the_force_is_told_better_than_with_nothing_in_place_of_the_dead():
+def test_the_force_is_better_than_with_nothing_for_the_dead():
     frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
     newest = frozen.newest[15::16].astype(np.float32)  # ends of taps
     whole, without, told = newest[:, 2].sum(axis=(1, 2)), [], []
@@ -101,7 +101,7 @@ def test_covariances_that_are_none_are_refused(covariances):
         TaxelEstimator(covariances, GRID)
 
 
-def test_a_file_that_is_none_and_a_pad_without_a_living_taxel_are_refused(tmp_path):
+def test_no_file_and_no_living_taxel_are_refused(tmp_path):
     with pytest.raises(EdgeError, match=r"taxels\.npz cannot be read"):
         load_estimator(tmp_path / "taxels.npz", GRID)
     with pytest.raises(EdgeError, match="16 dead taxels"):
@@ -127,7 +127,7 @@ def test_deviations_are_wider_the_more_taxels_are_dead():
     assert list(WIDENING) == sorted(WIDENING) and WIDENING[0] == 1 and len(WIDENING) == 9
 
 
-def test_earlier_taps_are_forgotten_when_a_taxel_dies_and_when_it_is_believed_again():
+def test_taps_are_forgotten_when_a_taxel_dies_or_is_back():
     """A window never holds readings of an undetected dead taxel, or filled in ones, without a note."""
     pad, dies = Pushed(make_runtime(estimator=estimator())), 10 + HOLD_SCANS
     for number, press in enumerate([PRESS, PRESS, 0] * 12):
@@ -137,7 +137,7 @@ def test_earlier_taps_are_forgotten_when_a_taxel_dies_and_when_it_is_believed_ag
     assert max(used[lives : lives + 3]) == 1 < max(used[lives - 3 : lives])
 
 
-def test_patterns_with_dead_taxels_found_are_better_than_with_what_they_send():
+def test_patterns_are_better_where_dead_taxels_are_found():
     frozen, model = load_frozen_set(BUNDLE_DIR / "frozen.npz"), ModelSession(find_model(DEFAULT_MODEL))
     found, unfound = [], []
     for frame in np.arange(15, len(frozen), 16)[::4]:

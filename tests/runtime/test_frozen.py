@@ -1,10 +1,14 @@
+"""The frozen test set, and the files that come with the package."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from edge_samples import write_model
 
+from edge.errors import ModelError, UsageError
 from edge.evaluation.test_set import FrozenSet, FrozenSetError, load_frozen_set
-from edge.inference.bundled import BUNDLE_DIR
+from edge.inference import bundled as bundle
 
 
 @pytest.fixture
@@ -24,60 +28,71 @@ def small():
     )
 
 
-def test_windows_are_newest_first_and_absent_taps_are_zero(small):
-    windows = small.windows(4)
-    assert windows.shape == (6, 4, 3, 4, 4)
-    assert (windows[4, 0] == small.newest[4]).all()
-    assert (windows[4, 2] == small.earlier[1, 1]).all()
-    given_two = small.windows(4, given=2)
-    assert (given_two[:, :2] == windows[:, :2]).all()
-    assert not given_two[:, 2:].any()
-    assert small.windows(1).shape == (6, 1, 3, 4, 4)
+class TestSet:
+    def test_windows_are_newest_first_and_absent_taps_are_zero(self, small):
+        windows = small.windows(4)
+        assert windows.shape == (6, 4, 3, 4, 4)
+        assert (windows[4, 0] == small.newest[4]).all() and (windows[4, 2] == small.earlier[1, 1]).all()
+        given_two = small.windows(4, given=2)
+        assert (given_two[:, :2] == windows[:, :2]).all() and not given_two[:, 2:].any()
+        assert small.windows(1).shape == (6, 1, 3, 4, 4)
+        for taps in (0, 8):
+            with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
+                small.windows(taps)
+
+    def test_truth_is_the_unit_pattern_times_the_indentation(self, small):
+        assert np.allclose(small.patterns()[5], 0.5 * 0.6)
+        assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
+        assert small.touching()[0].sum() == 40 and not small.touching()[5].any() and small.scale == 10
+
+    def test_a_file_gives_back_the_set_and_a_bad_one_replaces_none(self, small, tmp_path):
+        path = tmp_path / "set.npz"
+        small.save(path)
+        with pytest.raises(FrozenSetError):
+            replace(small, full_scale_mm=0.0).save(path)
+        assert load_frozen_set(path).sha256() == small.sha256() and list(tmp_path.iterdir()) == [path]
+        for change in ({"indentation_mm": small.indentation_mm + np.float32(1e-6)}, {"surface": np.array(["C", "G"])}):
+            assert replace(small, **change).sha256() != small.sha256(), "the hash sees every array"
+        with pytest.raises(FrozenSetError, match="No such file"):
+            load_frozen_set(tmp_path / "none.npz")
+        np.savez(path, newest=small.newest)
+        with pytest.raises(FrozenSetError, match="earlier"):
+            load_frozen_set(path)
+
+    def test_the_bundled_one_is_the_one_that_is_frozen(self):
+        frozen = load_frozen_set(bundle.BUNDLE_DIR / "frozen.npz")
+        assert len(frozen) == 1152 and len(set(frozen.surface.tolist())) == 18
+        assert float(frozen.patterns().max()) <= frozen.full_scale_mm
 
 
-@pytest.mark.parametrize("taps", [0, 8])
-def test_more_taps_than_there_are_are_refused(small, taps):
-    with pytest.raises(FrozenSetError, match=f"windows of {taps} taps asked for, the frozen test set has"):
-        small.windows(taps)
+@pytest.fixture
+def models(tmp_path, monkeypatch):
+    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path / "bundled")
+    monkeypatch.chdir(tmp_path)
+    bundle.BUNDLE_DIR.mkdir()
+    for name in ("mtsr4", "stsr"):
+        write_model(bundle.BUNDLE_DIR / f"{name}.onnx")
+    return bundle.BUNDLE_DIR
 
 
-def test_truth_is_the_unit_pattern_times_the_indentation(small):
-    assert np.allclose(small.patterns()[5], 0.5 * 0.6)
-    assert np.allclose(small.patterns()[1].diagonal(), small.indentation_mm[1])
-    assert small.touching()[0].sum() == 40
-    assert not small.touching()[5].any()
-    assert small.scale == 10
+class TestBundle:
+    @pytest.mark.parametrize("name", ["mtsr4", "mtsr4.onnx", "{models}/mtsr4.onnx", "{models}/mtsr4"])
+    def test_a_name_without_precision_is_the_best_file_there_is(self, models, name):
+        write_model(models / "mtsr4-int8.onnx")
+        asked = name.format(models=models)
+        assert bundle.find_model(asked) == models / "mtsr4.onnx"
+        (models / "mtsr4.onnx").unlink()
+        assert bundle.find_model(asked) == models / "mtsr4-int8.onnx"
+        assert [path.stem for path in bundle.bundled_models()] == ["mtsr4-int8", "stsr"]
 
+    def test_a_file_wins_over_a_bundled_name_and_no_directory_does(self, models, tmp_path):
+        (tmp_path / "mtsr4").mkdir()
+        (tmp_path / "stsr").write_text("mine")
+        assert bundle.find_model("mtsr4") == models / "mtsr4.onnx" and bundle.find_model("stsr").read_text() == "mine"
 
-def test_a_file_gives_back_the_set(small, tmp_path):
-    small.save(tmp_path / "set.npz")
-    assert load_frozen_set(tmp_path / "set.npz").sha256() == small.sha256()
-
-
-def test_a_set_that_cannot_be_read_back_does_not_replace_one_that_can(small, tmp_path):
-    path = tmp_path / "set.npz"
-    small.save(path)
-    with pytest.raises(FrozenSetError):
-        replace(small, full_scale_mm=0.0).save(path)
-    assert load_frozen_set(path).sha256() == small.sha256() and [one.name for one in tmp_path.iterdir()] == ["set.npz"]
-
-
-def test_the_hash_sees_every_array(small):
-    changed = replace(small, indentation_mm=small.indentation_mm + np.float32(1e-6))
-    assert changed.sha256() != small.sha256()
-    assert replace(small, surface=np.array(["C", "G"])).sha256() != small.sha256()
-
-
-def test_what_is_no_frozen_set_is_refused(tmp_path, small):
-    with pytest.raises(FrozenSetError, match="No such file"):
-        load_frozen_set(tmp_path / "none.npz")
-    np.savez(tmp_path / "other.npz", newest=small.newest)
-    with pytest.raises(FrozenSetError, match="earlier"):
-        load_frozen_set(tmp_path / "other.npz")
-
-
-def test_the_bundled_set_is_the_one_that_is_frozen():
-    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    assert len(frozen) == 1152
-    assert len(set(frozen.surface.tolist())) == 18
-    assert float(frozen.patterns().max()) <= frozen.full_scale_mm
+    def test_what_is_missing_is_told(self, models):
+        for name in ("mtsr", "mtsr4.onn", "", "none/mtsr4.onnx"):
+            with pytest.raises(ModelError, match=r"no model.*bundled: mtsr4.onnx, stsr.onnx"):
+                bundle.find_model(name)
+        with pytest.raises(UsageError, match=r"demo.npz is missing"):
+            bundle.demo_recording()

@@ -78,7 +78,7 @@ def rms(logs):
 
 
 class TestLearner:
-    def test_gains_are_recovered_within_their_intervals_the_surer_the_more_contacts(self):
+    def test_gains_are_recovered_within_their_intervals(self):
         inside = []
         for seed in range(2):
             gains = draw_gains(seed)
@@ -128,7 +128,7 @@ class TestLearner:
         drift[2] = 45 + np.random.default_rng(0).normal(0, 12, (4, 4))
         assert rms(np.log(taught(draw_contacts(70) + drift).gains)) < 0.03
 
-    def test_it_begins_at_measured_gains_and_stays_where_they_are_right(self):
+    def test_it_begins_at_measured_gains_and_stays_there(self):
         gains = draw_gains()
         start = Pad(gains=tuple(gains.tolist()), gain_half_widths=(0.02,) * GAINS)
         learner = GainLearner(MODEL, start)
@@ -138,7 +138,7 @@ class TestLearner:
         assert rms(np.log(learner.gains / gains)) < 0.015
         assert learner.pad().gains_certainty == pytest.approx(start.gains_certainty, abs=1e-4), "and no surer"
 
-    def test_the_model_that_comes_with_the_package_is_read_and_another_file_named(self, tmp_path):
+    def test_the_bundled_model_is_read_and_another_file_named(self, tmp_path):
         model = load_contact_model(CONTACTS)
         assert len(model.means) >= 24 and CONTACTS.stat().st_size < 400_000
         np.testing.assert_allclose(GainLearner(model).gains, 1)
@@ -152,9 +152,7 @@ class TestFollower:
         ("seed_in_file", "count", "contradicted"),
         [(9, 60, True), (2, 60, False), (9, CONTRADICTED_CONTACTS - 1, False)],
     )
-    def test_gains_of_another_sensor_are_contradicted_once_and_nothing_is_believed(
-        self, seed_in_file, count, contradicted
-    ):
+    def test_gains_of_another_sensor_are_contradicted_once(self, seed_in_file, count, contradicted):
         file = Pad(gains=tuple(draw_gains(seed_in_file)), gain_half_widths=(0.03,) * GAINS)
         contract, events = make_pad_contract(), []
         check = PatternCheck(make_trust(), contract)
@@ -168,7 +166,7 @@ class TestFollower:
         assert check.suspected == contradicted == len(suspected)
         assert not contradicted or ("another sensor's file" in suspected[0] and events[-1][0] == "suspected")
 
-    def test_what_was_learned_before_is_used_until_this_run_is_as_sure(self):
+    def test_what_was_learned_before_is_used_at_first(self):
         true = draw_gains()
         learned = taught(draw_contacts(120, true)).pad()
         follower = GainFollower(MODEL, None, learned)
@@ -180,7 +178,7 @@ class TestFollower:
         assert follower.learned.gains_certainty < learned.gains_certainty, "it is no beginning"
         assert np.allclose(fresh.learned.gains, 1)
 
-    def test_an_untrusted_scan_teaches_nothing_and_takes_back_what_its_contact_would(self):
+    def test_an_untrusted_scan_teaches_nothing(self):
         follower, contact = GainFollower(MODEL, None), draw_contacts(1)[0]
         for _ in range(2 * HELD_SCANS):
             assert not follower.see(False, 5000.0, contact)
@@ -208,7 +206,7 @@ def learning(scans, *, pad=None, learn=True, every_scan=False):
 
 
 class TestRuntime:
-    def test_learned_gains_come_into_use_with_an_event_and_reach_the_model(self):
+    def test_learned_gains_come_into_use_with_an_event(self):
         gains = draw_gains()
         scans = scans_of(draw_contacts(100, gains), noise=2)
         runtime, model, results = learning(scans)
@@ -247,7 +245,7 @@ class TestKeeping:
         save_sensor_file(path, SensorFile(adapter="D30BL366", sensors={"4": SensorEntry(baseline=BASELINE)}))
         return path
 
-    def test_two_runs_that_learn_into_one_file_lose_nothing_of_each_other(self, file):
+    def test_two_runs_that_learn_into_one_file_lose_nothing(self, file):
         keepers = [GainKeeper(file, emulated=False) for _ in range(2)]
         for number in range(12):
             keepers[number % 2].keep(str(number), LEARNED)
@@ -258,7 +256,7 @@ class TestKeeping:
         assert known.pads == {str(number): LEARNED for number in range(12)}
         assert known.adapter == "D30BL366" and known.baselines["4"].id == BASELINE.id
 
-    def test_neither_surer_gains_nor_a_real_sensors_file_are_overwritten(self, file):
+    def test_surer_gains_and_a_real_sensors_file_stay(self, file):
         keep_learned(file, "4", LEARNED, emulated=True)
         assert load_sensor_file(file).sensors["4"].learned is None
         for learned in (SURER, LEARNED):

@@ -19,7 +19,7 @@ HALF_MM = USPA44.pitch_mm / 2
 REACH_MM = 6.0
 
 
-def test_four_taps_make_a_square_of_half_a_pitch_and_none_is_touched_twice():
+def test_four_taps_make_a_square_of_half_a_pitch():
     places = np.zeros((1, 2))
     for _ in range(6):
         shift_mm = next_shift_mm(places[::-1] - places[-1], REACH_MM)
@@ -32,7 +32,7 @@ def test_four_taps_make_a_square_of_half_a_pitch_and_none_is_touched_twice():
     assert apart_mm.max() <= REACH_MM
 
 
-def test_an_earlier_tap_is_neither_touched_again_nor_out_of_reach():
+def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     assert next_shift_mm(np.array([[0.0, 0.0], [HALF_MM + 0.3, -0.2]]), REACH_MM) not in (None, (HALF_MM, 0.0))
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
     assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
@@ -44,7 +44,7 @@ def make_pad(contract=None, **options):
     return Pushed(make_runtime(model, options=RuntimeOptions(idle_reset_s=0.2, **options)))
 
 
-def test_a_robot_that_follows_the_proposals_touches_no_place_twice():
+def test_a_robot_that_follows_touches_no_place_twice():
     pad, places = make_pad(), set()
     pose = begun = PadPose(5, -3, 30)
     for _ in range(4):
@@ -58,7 +58,7 @@ def test_a_robot_that_follows_the_proposals_touches_no_place_twice():
     assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
 
 
-def test_it_stays_until_the_next_tap_or_until_the_taps_are_forgotten():
+def test_it_stays_until_the_next_tap_or_an_idle_time():
     pad = make_pad()
     pad.tap(PadPose(0, 0))
     proposed = pad.results[-1].next_tap
@@ -69,7 +69,7 @@ def test_it_stays_until_the_next_tap_or_until_the_taps_are_forgotten():
     assert [pad.push().next_tap for _ in range(30)][-1] is None
 
 
-def test_it_is_from_the_strongest_scan_of_the_tap_and_of_none_before_a_reset():
+def test_it_is_from_the_strongest_scan_since_a_reset():
     pad = make_pad()
     for press, x_mm in ((0.6 * PRESS, 1), (PRESS, 2), (0.8 * PRESS, 3)):
         pad.place(PadPose(x_mm, 0))

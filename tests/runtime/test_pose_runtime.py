@@ -55,7 +55,7 @@ class TestChoice:
         assert pad.kinds == [] and result.poses.dtype == np.float32
         assert result.poses[1, 3] == pytest.approx(np.hypot(0.1, 0.3)), "both poses may be wrong"
 
-    def test_a_tap_has_the_pose_of_its_peak_and_the_newest_that_of_its_scan(self):
+    def test_a_tap_has_the_pose_of_its_peak(self):
         pad = make_pad()
         for x_mm, press in ((0, PRESS), (1, 2 * PRESS), (2, PRESS), (3, 0)):
             pad.place(PadPose(x_mm, 0))
@@ -145,7 +145,7 @@ class TestChoice:
         for result in results:
             np.testing.assert_allclose(result.pattern, expected(result, session.contract), atol=1e-4)
 
-    def test_an_unchanged_reading_is_inferred_again_where_a_relative_pose_has_changed(self):
+    def test_a_changed_relative_pose_is_inferred_again(self):
         pad = Pushed(make_runtime(model := PosedModel()))
         for x_mm in range(3):  # a single tap has none
             pad.place(PadPose(x_mm, 0))
@@ -180,7 +180,7 @@ class TestChoice:
             with pytest.raises(UsageError, match=r"taps is .*, expected a whole number from 1"):
                 RuntimeOptions(taps=wrong)
 
-    def test_a_model_without_poses_ignores_them_but_its_results_have_the_pads(self):
+    def test_a_model_without_poses_ignores_them(self):
         plain, moved = Pushed(make_runtime(FakeModel())), Pushed(make_runtime(FakeModel()))
         for x_mm in (0, 50):
             without, result = plain.tap(), moved.tap(PadPose(x_mm, 0))
@@ -197,7 +197,7 @@ class TestChoice:
 
 
 class TestChecks:
-    def test_the_check_of_earlier_taps_takes_their_poses_and_a_dropped_tap_is_forgotten(self):
+    def test_the_check_of_earlier_taps_takes_their_poses(self):
         pad = make_pad(make_checked_contract(make_posed_trust(2.5)))
         pad.tap(PadPose(4, 0))
         lose_pose(pad)
@@ -210,7 +210,7 @@ class TestChecks:
         assert result.poses[:, 0].tolist() == [0, -4, -2], "the first tap is forgotten, the others are not"
         assert pad.kinds == ["tap_without_pose", "tap_dropped"]
 
-    def test_a_tap_that_does_not_belong_goes_alone_where_taps_have_poses(self):
+    def test_a_posed_tap_that_does_not_belong_goes_alone(self):
         model = PosedModel(make_checked_contract(make_posed_trust(2.5)))
         pad = Pushed(make_runtime(model))
         for x_mm, more in ((1, 0), (4, 100), (2, 200)):
@@ -228,7 +228,7 @@ class TestChecks:
         assert settled.poses[:, 0].tolist() == [0, 2, 1] and settled.taps_dropped == 0
         assert pad.kinds == ["tap_dropped"]
 
-    def test_taps_of_the_schedule_go_with_the_stranger_that_came_after_them(self):
+    def test_taps_of_the_schedule_go_with_a_later_stranger(self):
         # Without poses every tap lies at 0 mm, so that a limit below that drops them all.
         pad = make_pad(make_checked_contract(make_posed_trust(-1.0)), taps=3)
         for _ in range(5):
@@ -285,7 +285,7 @@ class TestSession:
                 session.run(window, poses=rows)
                 np.testing.assert_allclose(deviations[index], session.deviation, atol=1e-6)
 
-    def test_without_poses_taps_follow_the_schedule_and_absent_ones_have_none(self, session):
+    def test_without_poses_taps_follow_the_schedule(self, session):
         window, _ = random_taps(4)
         poses = scheduled_rows(4, 5.0)
         assert poses[:, 2].tolist() == [0, 5, 10, 15]

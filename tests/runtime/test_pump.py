@@ -51,7 +51,7 @@ class TestOvertaking:
         assert numbers(sink) == list(range(5)), "a record of every scan, in order"
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("scan-reader")]
 
-    def test_scans_that_come_between_the_calls_of_a_round_overtake_those_that_wait(self):
+    def test_scans_between_the_calls_of_a_round_overtake(self):
         """Six sensors press; a call has time for two of them, and the next scans come during the second call."""
         names = [f"{number}" for number in range(6)]
         batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
@@ -95,9 +95,7 @@ class TestOvertaking:
             ([presses([n]) for n in range(1, 11)], 4, {("4", 0): "contact", ("4", 10): "contact"}, 6),
         ],
     )
-    def test_when_inference_falls_behind_the_newest_of_each_sensor_wins_and_the_rest_is_counted(
-        self, meanwhile, capacity_scans, states, overruns
-    ):
+    def test_behind_scans_the_newest_of_each_sensor_wins(self, meanwhile, capacity_scans, states, overruns):
         """One scan occupies the model, and all others arrive meanwhile."""
         busy, arrived = threading.Event(), threading.Event()
         link, sink = FakeLink([presses([0]), busy, *meanwhile]), ListSink()
@@ -130,7 +128,7 @@ class TestEnds:
         with pytest.raises(ZeroDivisionError):
             pumped(FakeLink([], error=ZeroDivisionError()), ListSink())
 
-    def test_stop_and_duration_end_an_endless_source_and_sinks_hear_that_nothing_comes(self):
+    def test_stop_and_duration_end_an_endless_source(self):
         stop = threading.Event()
         sink = ListSink(on_write=lambda result: stop.set())
         pumped(FakeLink([presses([0])], endless=True), sink, stop=stop)
@@ -158,7 +156,7 @@ class TestRecords:
             assert counted == [1, 3, 3] if patient else all(counted[n] >= at for n, at in enumerate((1, 3, 3)))
 
     @pytest.mark.parametrize("error", [None, LinkLostError("gone")])
-    def test_they_tell_what_was_left_out_before_and_the_run_all_of_it(self, error):
+    def test_they_tell_how_many_were_left_out(self, error):
         class Slow(ListSink):
             unwritten = 0
             trouble = "the disk is full"
@@ -175,7 +173,7 @@ class TestRecords:
         assert statistics.unwritten == 3 and statistics.sink_trouble == "the disk is full"
 
     @pytest.mark.parametrize("kind", ["lost", "silent", "back", "trouble", "well"])
-    def test_what_a_link_tells_reaches_runtime_and_sinks_in_its_place(self, kind):
+    def test_a_notice_reaches_runtime_and_sinks_in_its_place(self, kind):
         class Telling(FakeLink):
             def notices(self):
                 return [Notice(0, kind, "told")] if self.reads == 5 else []
@@ -196,7 +194,7 @@ class Patient(ListSink):
 
 class TestPace:
     @pytest.mark.parametrize("impatient", [False, True])
-    def test_scans_may_wait_only_at_rest_and_only_where_every_sink_can_wait(self, impatient):
+    def test_scans_may_wait_at_rest_where_every_sink_can(self, impatient):
         """Close to contact they may not: changes too small to be seen could add up to one."""
         begun, rested, paces = threading.Event(), threading.Event(), []
         rest = [make_scan(n, noise=3) for n in range(120)]

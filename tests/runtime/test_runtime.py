@@ -113,7 +113,7 @@ class TestRefusals:
         with pytest.raises(WindowError, match=r"scan has shape \(3, 2, 4\), expected \(3, 4, 4\)"):
             make_runtime().push(dataclasses.replace(make_scan(), counts=REST[:, :2]))
 
-    def test_a_sensor_that_the_sensor_file_or_the_baseline_does_not_know_is_told(self):
+    def test_a_sensor_that_no_file_knows_is_told(self):
         mountings = {"4": Mounting(), "6": Mounting()}
         runtime = make_runtime(baselines={"left/4": BASELINE}, mountings=mountings)
         result = runtime.push(make_scan(0, sensor="left/4"))
@@ -158,7 +158,7 @@ class TestOvertaken:
         runtime.push(make_scan(3, press_counts=2000))
         assert model.windows[-1][1, 2, 1, 1] == 9.0, "the peak was in the scan without a pattern"
 
-    def test_the_newest_scan_wins_and_keeps_the_place_of_the_one_that_it_overtakes(self):
+    def test_the_newest_scan_wins_and_keeps_the_place(self):
         """Sensor 4 sends three scans while 6 sends one, and both wait: 4 is the first all the same."""
         runtime = make_runtime(baselines=dict.fromkeys("468", BASELINE))
         sent = [make_scan(number, sensor="4", press_counts=PRESS * (number + 1)) for number in range(3)]
@@ -172,7 +172,7 @@ class TestOvertaken:
         assert (newest.scan, other.scan.sensor, runtime.waiting) == (sent[2], "6", 0)
         assert newest.pattern.max() == pytest.approx(3 * other.pattern.max())
 
-    def test_sensors_that_do_not_fit_into_one_call_wait_for_the_next_and_none_starves(self):
+    def test_sensors_beyond_one_call_wait_and_none_starves(self):
         clock_us = itertools.count(0, 3000)  # two looks at it a call: each takes 3 ms
         names = [str(number) for number in range(6)]
         runtime = make_runtime(
@@ -202,7 +202,7 @@ class TestOvertaken:
             max_size=40,
         )
     )
-    def test_any_scans_give_one_result_each_and_a_pattern_only_in_contact(self, scans):
+    def test_any_scans_give_one_result_each(self, scans):
         model = FakeModel()
         runtime = make_runtime(model)
         for number, (sensor, press, absent, infer) in enumerate(scans):

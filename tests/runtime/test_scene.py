@@ -57,7 +57,7 @@ def make_pad(**settings):
     return Pushed(make_runtime(model, **settings)), model
 
 
-def test_a_still_grip_is_inferred_once_and_says_whose_pattern_it_is():
+def test_a_still_grip_is_inferred_once():
     pad, model = make_pad()
     results = [pad.push(PRESS, noise=3) for _ in range(15)]
     assert len(model.windows) == 1
@@ -80,7 +80,7 @@ def test_every_scan_is_inferred_where_that_is_asked_for():
     assert len(model.windows) == 5
 
 
-def test_two_sensors_are_inferred_in_one_call_in_the_order_they_came():
+def test_two_sensors_are_inferred_in_one_call():
     calls = []
 
     class Together(FakeModel):

@@ -68,7 +68,7 @@ def test_windows_run_together_give_what_each_gives_alone(tmp_path, batch):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_window_that_is_not_finite_is_refused_alone_and_among_others(session, bad):
+def test_a_window_that_is_not_finite_is_refused(session, bad):
     window = random_window()
     window[3, 1, 2, 2] = bad
     with pytest.raises(WindowError, match="not finite"):

@@ -44,7 +44,7 @@ def test_contact_and_taps_after_each_scan(taps, z_counts, contact, used, numbers
     assert "".join(str(count) for _, count, _ in told) == used and [number for _, _, number in told] == numbers
 
 
-def test_the_window_shows_the_current_frame_then_peaks_newest_first():
+def test_the_window_is_the_current_frame_then_peaks():
     tracker = TapTracker(3)
     for mark, peak in enumerate([3000, 4000, 5000], start=1):
         for z, m in ((2000, 0), (peak, mark), (peak, 7), (2500, 0)):  # an equal frame later is no new peak
@@ -62,7 +62,7 @@ def test_the_window_shows_the_current_frame_then_peaks_newest_first():
         state.window[0] = 1
 
 
-def test_a_peak_starts_anew_with_each_tap_and_absent_taps_are_zeros():
+def test_a_peak_starts_anew_and_absent_taps_are_zeros():
     tracker = TapTracker(4)
     play(tracker, [9000, 9000, 0, 2000, 2100, 0])
     state = tracker.push(frame(100, 5), S)
@@ -81,7 +81,7 @@ def test_a_peak_starts_anew_with_each_tap_and_absent_taps_are_zeros():
         ([2000, 2000, *[900] * 900], 100 * S, 1),  # a gap within a tap does not end it
     ],
 )
-def test_earlier_taps_are_forgotten_after_so_long_without_contact(first, then_ns, used):
+def test_earlier_taps_are_forgotten_after_an_idle_time(first, then_ns, used):
     tracker = TapTracker(4, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, first)
     assert tracker.push(frame(2000), int(then_ns)).taps_used == used
@@ -97,7 +97,7 @@ def test_time_running_backwards_counts_as_no_time():
         assert tracker.push(frame(2000), then_s * S).taps_used == used
 
 
-def test_reset_forgets_all_and_a_tap_in_progress_becomes_the_first_with_a_new_number():
+def test_after_a_reset_a_tap_in_progress_is_the_first():
     tracker = TapTracker(4)
     play(tracker, [2000, 2000, 0, 9000, 9000])
     tracker.reset()

@@ -101,7 +101,7 @@ class TestWatch:
             (shifted(7, -8000), "far", FAR_SCANS - 1),
         ],
     )
-    def test_a_dead_taxel_is_named_after_so_many_scans_and_believed_after_good_ones(self, fault, reason, after):
+    def test_a_dead_taxel_is_named_and_believed_after_good_scans(self, fault, reason, after):
         pad = Pad()
         assert not any(pad.read(50))
         assert pad.read(after, fault) == [{}] * after
@@ -118,7 +118,7 @@ class TestWatch:
         for _ in range(10):
             assert pad.read(BACK_SCANS - 2) + pad.read(2, fault) == [{3: reason}] * BACK_SCANS
 
-    def test_a_sensor_that_sends_one_scan_for_ever_is_frozen_after_ten(self):
+    def test_a_sensor_that_repeats_one_scan_is_frozen_after_ten(self):
         pad = Pad(noise_counts=0)
         assert not any(pad.read(FROZEN_SENSOR_SCANS))
         assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
@@ -156,7 +156,7 @@ class TestWatch:
         pad.read(HOLD_SCANS + 1, silent(7))
         assert pad.read(FAR_SCANS, silent(7), shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far", 7: "silent"}
 
-    def test_a_taxel_without_reading_or_rest_from_the_start_is_never_believed(self):
+    def test_a_taxel_without_reading_or_rest_is_never_believed(self):
         pad = Pad()
         pad.read(1, silent(2))
         assert pad.watch.waiting
@@ -184,7 +184,7 @@ class TestWatch:
         told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
         assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
 
-    def test_one_at_its_end_among_others_that_are_pressed_is_held_from_the_first_scan(self):
+    def test_one_at_its_end_is_held_from_the_first_scan(self):
         pad = Pad()
         pad.read(3)
         pad.read(1, pressed(0, 5000, share=1))
@@ -194,7 +194,7 @@ class TestWatch:
         assert pad.watch.held[2, 1, 1] == before
         assert "its last reading is held, taxel 5 at the end of its range" in pad.note()
 
-    def test_no_reading_is_held_for_longer_than_the_judge_of_faults_allows(self):
+    def test_no_reading_is_held_for_too_long(self):
         """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
         assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
 
@@ -238,7 +238,7 @@ def saturated(pad, counts, press=PRESS, **changes):
 
 
 class TestRuntime:
-    def test_a_taxel_silent_from_the_start_spoils_no_zeroing_but_half_of_them_do(self):
+    def test_one_silent_taxel_spoils_no_zeroing_but_half_of_them_do(self):
         pad = Pushed(make_runtime(baselines=None), noise=4)
         states = [pad.push(absent=(0,)).state for _ in range(TAXEL_SILENT_SCANS + 100)]
         assert states == ["zeroing"] * (TAXEL_SILENT_SCANS + 98) + ["incomplete"] * 2
@@ -302,7 +302,7 @@ class TestRuntime:
         assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
         assert [saturated(pad, 65534).state for _ in range(HOLD_SCANS + 2)][-1] == "contact", "a count from the end"
 
-    def test_taxels_that_are_silent_are_named_with_one_at_the_end_of_its_range(self):
+    def test_silent_ones_are_named_with_one_at_its_end(self):
         pad, half = Pushed(), tuple(range(8, 16))
         note = [saturated(pad, RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
         assert "taxel 5 at the end of its range" in note

@@ -193,7 +193,7 @@ class TestMismatch:
         pattern, traction = make_maps()
         return operator, pattern, traction, readings_of(operator, pattern, traction)
 
-    def test_readings_of_this_pad_leave_nothing_and_those_of_another_something(self, forward):
+    def test_readings_of_this_pad_alone_leave_nothing(self, forward):
         operator, pattern, traction, tap = self.of_pad(forward, 0.7)
         assert forward.mismatch(operator, tap, pattern, traction, GAIN_ERROR) == pytest.approx(0, abs=1e-9)
         other = self.of_pad(forward)[0]
@@ -239,7 +239,7 @@ class TestFeatures:
             pattern = np.random.default_rng(0).uniform(0, 1, (size, size)).astype(np.float32)
             assert features(pattern, traction)[: GRID**2].mean() == pytest.approx(pattern.mean(), rel=1e-4)
 
-    def test_those_of_a_contact_do_not_depend_on_its_force_but_for_one(self):
+    def test_those_of_a_contact_depend_little_on_its_force(self):
         tap = np.random.default_rng(0).uniform(0.5, 3, (3, 4, 4)).astype(np.float32)
         pad = np.ones(5, dtype=np.float32)
         (light,), (firm,) = contact_features(tap, pad), contact_features(20 * tap, pad)

@@ -39,7 +39,7 @@ class TestTaps:
         assert [one.taps_used for one in taps] == [1, 2, 3, 4, 4] and pad.kinds == []
         assert max(taps[-1].tap_mismatch) < 0.5
 
-    def test_a_foreign_tap_is_dropped_with_those_before_it_and_forgotten(self):
+    def test_a_foreign_tap_is_dropped_with_those_before_it(self):
         pad = make_pad()
         pad.tap()
         pad.tap(taxel=ELSEWHERE)
@@ -59,7 +59,7 @@ class TestTaps:
         assert [share >= 0.5 for share in result.tap_mismatch] == [False, True]
         assert result.taps_used == len(result.window) == 2 and pad.kinds == []
 
-    def test_the_pattern_of_a_window_with_a_dropped_tap_is_that_of_fewer_taps(self):
+    def test_with_a_dropped_tap_it_is_the_pattern_of_fewer(self):
         pad, alone = make_pad(), make_pad()
         pad.tap(taxel=ELSEWHERE)
         while pad.number > alone.number:
@@ -107,7 +107,7 @@ class TestVerdict:
             told.append(result.untrusted_reason)
         assert told.index("stuck") == 15
 
-    def test_a_sensor_that_reads_oddly_is_suspected_and_cleared_with_events(self):
+    def test_an_odd_sensor_is_suspected_and_cleared_with_events(self):
         pad = make_pad()
 
         def touch(x):
@@ -154,7 +154,7 @@ def test_no_record_of_a_pattern_that_is_not_finite_is_believed(bad):
 
 
 @pytest.mark.parametrize("z", [26_000, 60_000])
-def test_counts_at_the_end_of_their_range_give_no_believed_pattern_that_is_not_finite(z):
+def test_counts_at_the_end_of_their_range_are_safe(z):
     pad = make_pad()
     for number in range(30):
         result = counted(pad, np.full_like(REST, z + number % 3))

@@ -1,4 +1,4 @@
-"""Force and torque of a traction, against closed forms, and in every sink."""
+"""Force and torque of a traction, against closed forms, and in sinks."""
 
 import json
 import math
@@ -11,26 +11,18 @@ from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
 from edge.perception.wrench import LEAST_FORCE_N, wrench_of
-from edge.sinks.binary_message import unpack
-from edge.sinks.json_encoding import record
 from edge.sinks.jsonl import record_line
 from edge.sinks.mcap import McapSink
-from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
 from edge.sinks.ros2.map_messages import image_map
 from edge.sinks.ros2.ros_types import WRENCH_STAMPED
-from edge.view.frames import Frames, Run, hello
-from edge.view.run_snapshot import RunSnapshot
-from edge.view.viewer_state import Viewer
 from firmware_bridge.pad_geometry import USPA44
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS
 AREA_MM2 = (4 * PITCH_MM) ** 2
-TAXEL_MM2 = PITCH_MM**2
-FORCE_N = 20 * TAXEL_MM2 / 1000
+FORCE_N = 20 * PITCH_MM**2 / 1000
 """Force of make_wrench_result: 20 kPa on taxel 5, the second of the second row."""
 
 
@@ -38,23 +30,18 @@ def even(x=0.0, y=0.0, z=0.0):
     return np.ones((3, PIXELS, PIXELS), np.float32) * np.array([x, y, z], np.float32)[:, None, None]
 
 
-def test_even_traction_is_its_area_in_newtons_without_torque():
-    wrench = wrench_of(even(1, -2, 10), PIXEL_MM)
-    assert wrench.force_n == pytest.approx(np.array([1, -2, 10]) * AREA_MM2 / 1000)
-    assert wrench.torque_n_mm == pytest.approx((0, 0, 0), abs=1e-6)
-    assert wrench.centre_of_pressure_mm == pytest.approx((0, 0), abs=1e-6)
-
-
-@pytest.mark.parametrize(("row", "col"), [(0, 0), (0, 7), (6, 1), (3, 4)])
-def test_a_patch_beside_the_middle_turns_the_pad_about_its_own_place(row, col):
-    traction = np.zeros((3, PIXELS, PIXELS), np.float32)
-    traction[:, row, col] = (3, 5, 100)
-    x, y = ((place - 3.5) * PIXEL_MM for place in (col, row))
-    fx, fy, fz = np.array([3, 5, 100]) * PIXEL_MM**2 / 1000
-    wrench = wrench_of(traction, PIXEL_MM)
-    assert wrench.force_n == pytest.approx((fx, fy, fz))
-    assert wrench.torque_n_mm == pytest.approx(tuple(np.cross((x, y, 0), (fx, fy, fz))))
-    assert wrench.centre_of_pressure_mm == pytest.approx((x, y))
+@given(st.integers(1, 9), st.integers(1, 9), st.floats(0.1, 10), st.integers(0, 99))
+def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, seed):
+    traction = np.random.default_rng(seed).normal(size=(3, height, width))
+    force, torque = np.zeros(3), np.zeros(3)
+    for row in range(height):
+        for col in range(width):
+            arm = (col - (width - 1) / 2) * pixel_mm, (row - (height - 1) / 2) * pixel_mm, 0
+            part = traction[:, row, col] * pixel_mm**2 / 1000
+            force, torque = force + part, torque + np.cross(arm, part)
+    wrench = wrench_of(traction, pixel_mm)
+    np.testing.assert_allclose(wrench.force_n, force, atol=1e-12 * pixel_mm**2 * 100)
+    np.testing.assert_allclose(wrench.torque_n_mm, torque, atol=1e-10 * pixel_mm**3)
 
 
 def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
@@ -62,8 +49,7 @@ def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
     at = (np.arange(PIXELS) - 3.5) * PIXEL_MM
     traction = np.zeros((3, PIXELS, PIXELS))
     traction[0], traction[1] = -2 * at[:, None], 2 * at[None, :]  # to the right of the middle it pulls down the rows
-    side_mm = 4 * PITCH_MM
-    twist = 2 * 2 * side_mm**4 / 12 * (1 - 1 / PIXELS**2) / 1000
+    twist = 2 * 2 * (4 * PITCH_MM) ** 4 / 12 * (1 - 1 / PIXELS**2) / 1000
     wrench = wrench_of(traction, PIXEL_MM)
     assert wrench.force_n == pytest.approx((0, 0, 0), abs=1e-9)
     assert wrench.torque_n_mm == pytest.approx((0, 0, twist))
@@ -81,93 +67,44 @@ def test_the_ratio_of_shear_is_that_of_the_forces(traction_kpa, ratio):
     assert wrench_of(even(*traction_kpa), PIXEL_MM).shear_ratio == pytest.approx(ratio)
 
 
-@given(st.integers(1, 9), st.integers(1, 9), st.floats(0.1, 10), st.integers(0, 99))
-def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, seed):
-    traction = np.random.default_rng(seed).normal(size=(3, height, width))
-    force, torque = np.zeros(3), np.zeros(3)
-    for row in range(height):
-        for col in range(width):
-            arm = (col - (width - 1) / 2) * pixel_mm, (row - (height - 1) / 2) * pixel_mm, 0
-            part = traction[:, row, col] * pixel_mm**2 / 1000
-            force, torque = force + part, torque + np.cross(arm, part)
-    wrench = wrench_of(traction, pixel_mm)
-    np.testing.assert_allclose(wrench.force_n, force, atol=1e-12 * pixel_mm**2 * 100)
-    np.testing.assert_allclose(wrench.torque_n_mm, torque, atol=1e-10 * pixel_mm**3)
+def test_a_record_has_the_traction_summed_up():
+    told = json.loads(record_line(make_wrench_result(), {}))
+    assert told["wrench"] == {
+        "force_n": [0, 0, round(FORCE_N, 4)],
+        "torque_n_mm": [round(-2.35 * FORCE_N, 3), round(2.35 * FORCE_N, 3), 0],
+        "centre_of_pressure_mm": [-2.35, -2.35],
+    }
+    assert told["wrench_origin"] == "nominal" and np.shape(told["traction"]) == (3, 8, 8)
+    assert np.max(told["traction"]) == 20
+    idle = json.loads(record_line(make_wrench_result(press_counts=0), {}))
+    assert idle["state"] == "idle" and idle["wrench"] is idle["wrench_origin"] is idle["traction"] is None
 
 
-def test_a_result_has_its_traction_summed_up():
-    result = make_wrench_result()
-    assert result.traction is not None and result.traction.shape == (3, 8, 8)
-    assert result.wrench is not None and result.wrench_origin == "nominal"
-    assert result.wrench.force_n == pytest.approx((0, 0, FORCE_N))
-    assert result.wrench.torque_n_mm == pytest.approx((-2.35 * FORCE_N, 2.35 * FORCE_N, 0))
-    assert result.wrench.centre_of_pressure_mm == pytest.approx((-2.35, -2.35))
-    idle = make_wrench_result(press_counts=0)
-    assert idle.state == "idle" and idle.traction is idle.wrench is idle.wrench_origin is None
+def test_a_recording_holds_it_as_messages_and_as_arrays(tmp_path):
+    sink = McapSink(tmp_path / "out.mcap", make_pad_contract(interval_factor=1.6))
+    results = [make_wrench_result(number, press) for number, press in ((0, 0), (1, 20_000))]
+    for result in results:
+        sink.write(result, {})
+    sink.close()
+    told, wrench = messages_of(tmp_path / "out.mcap"), results[1].wrench
+    assert results[1].traction is not None and wrench is not None
+    [(_, traction)], [(_, data)] = told["/s4/traction"], told["/s4/wrench"]
+    np.testing.assert_allclose(image_map(traction).reshape(3, 8, 8), results[1].traction * 1e3, rtol=1e-6)  # in [Pa]
+    stamped = WRENCH_STAMPED.decode(data)["wrench"]
+    assert list(stamped["force"].values()) == pytest.approx([0, 0, FORCE_N])
+    assert list(stamped["torque"].values()) == pytest.approx([one / 1000 for one in wrench.torque_n_mm])
+    arrays = arrays_of(tmp_path / "out.mcap")
+    assert arrays["traction"].shape == (2, 3, 8, 8) and not arrays["traction"][0].any()
+    np.testing.assert_allclose(arrays["traction"][1], results[1].traction, rtol=1e-6)
+    assert np.isnan(arrays["wrench"][0]).all() and np.isnan(arrays["centre_of_pressure_mm"][0]).all()
+    np.testing.assert_allclose(arrays["wrench"][1], (*wrench.force_n, *wrench.torque_n_mm), atol=5e-4)
+    np.testing.assert_allclose(arrays["centre_of_pressure_mm"][1], (-2.35, -2.35), rtol=1e-6)
+    assert arrays["wrench_origin"].tolist() == ["", "nominal"]
 
 
-class TestSinks:
-    def test_json(self):
-        told = json.loads(record_line(make_wrench_result(), {}))
-        assert told["wrench"] == {
-            "force_n": [0, 0, round(FORCE_N, 4)],
-            "torque_n_mm": [round(-2.35 * FORCE_N, 3), round(2.35 * FORCE_N, 3), 0],
-            "centre_of_pressure_mm": [-2.35, -2.35],
-        }
-        assert told["wrench_origin"] == "nominal" and np.shape(told["traction"]) == (3, 8, 8)
-        assert np.max(told["traction"]) == 20
-        idle = json.loads(record_line(make_wrench_result(press_counts=0), {}))
-        assert idle["wrench"] is idle["wrench_origin"] is idle["traction"] is None
-
-    def test_npz(self, tmp_path):
-        sink = open_sink(f"mcap:{tmp_path / 'out.mcap'}", make_pad_contract(interval_factor=1.6))
-        results = [make_wrench_result(number, press) for number, press in ((0, 0), (1, 20_000))]
-        for result in results:
-            sink.write(result, {})
-        sink.close()
-        data = arrays_of(tmp_path / "out.mcap")
-        wrench = results[1].wrench
-        assert wrench is not None
-        assert data["traction"].shape == (2, 3, 8, 8) and not data["traction"][0].any()
-        np.testing.assert_allclose(data["traction"][1], results[1].traction, rtol=1e-6)
-        assert np.isnan(data["wrench"][0]).all() and np.isnan(data["centre_of_pressure_mm"][0]).all()
-        np.testing.assert_allclose(data["wrench"][1], (*wrench.force_n, *wrench.torque_n_mm), atol=5e-4)
-        np.testing.assert_allclose(data["centre_of_pressure_mm"][1], (-2.35, -2.35), rtol=1e-6)
-        assert data["wrench_origin"].tolist() == ["", "nominal"]
-
-    def test_mcap(self, tmp_path):
-        sink = McapSink(tmp_path / "out.mcap", make_pad_contract())
-        results = [make_wrench_result(number, press) for number, press in ((0, 0), (1, 20_000))]
-        for result in results:
-            sink.write(result, {})
-        sink.close()
-        told = messages_of(tmp_path / "out.mcap")
-        [(_, traction)] = told["/s4/traction"]
-        assert results[1].traction is not None
-        pascal = image_map(traction).reshape(3, 8, 8)
-        np.testing.assert_allclose(pascal, results[1].traction * 1e3, rtol=1e-6)
-        [(_, data)] = told["/s4/wrench"]
-        wrench = WRENCH_STAMPED.decode(data)["wrench"]
-        assert list(wrench["force"].values()) == pytest.approx([0, 0, FORCE_N])
-        arm_m = 2.35e-3
-        assert list(wrench["torque"].values()) == pytest.approx([-arm_m * FORCE_N, arm_m * FORCE_N, 0])
-        said = [json.loads(ros_messages.RESULT.decode(one)["record"]) for _, one in told["/s4/result"]]
-        assert [one["wrench_origin"] for one in said] == [None, "nominal"]
-
-    def test_ros_takes_the_wrench_before_the_calibrated_force_and_the_diagnostics_name_its_origin(self):
-        both = make_wrench_result(counts_per_newton=1000.0)
-        assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
-        told = force_and_torque(both, USPA44)
-        assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
-        assert diagnose(both, {}, {}, 0.0, None).values["wrench_origin"] == "calibrated"
-        nominal = diagnose(make_wrench_result(), {}, {}, 0.0, None).values
-        assert nominal["wrench_origin"] == "nominal" and "wrench" not in nominal
-
-    def test_the_live_page(self):
-        heard = RunSnapshot(lambda: 10**12)
-        result = make_wrench_result()
-        heard.add(result, {})
-        header, _ = unpack(Viewer().due(Frames(heard, 10**12, "device"))[0])
-        assert header["wrench"] == record(result, {})["wrench"] and header["wrench_origin"] == "nominal"
-        header, _ = unpack(hello(Run("demo", "emulated", "m", make_pad_contract(), "c0ffee"), None))
-        assert header["wrench"] is True
+def test_ros_takes_the_wrench_before_the_calibrated_force():
+    both = make_wrench_result(counts_per_newton=1000.0)
+    assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
+    told = force_and_torque(both, USPA44)
+    assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
+    assert diagnose(both, {}, {}, 0.0, None).values["wrench_origin"] == "calibrated"

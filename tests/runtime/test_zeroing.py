@@ -102,7 +102,7 @@ class TestCapture:
             (lambda n: [make_scan(0, stale=range(16))], 0, ""),  # frozen: the same readings again and again
         ],
     )
-    def test_a_sensor_that_gives_no_whole_scan_is_told_though_scans_come(self, given, skip, match):
+    def test_a_sensor_that_gives_no_whole_scan_is_told(self, given, skip, match):
         source = Script(given)
         with pytest.raises(DeviceError, match=match or "no whole new scan from sensor [46] for 10 s: .*edge-sr doctor"):
             take_baselines(source, skip=skip, clock_s=source.now_s)
@@ -120,7 +120,7 @@ class TestCapture:
         assert sorted(baselines) == ["4", "6"]
         assert np.abs(baselines["4"].counts - REST).max() <= 2
 
-    def test_what_came_before_an_outage_is_not_mixed_with_what_comes_behind_it(self):
+    def test_scans_on_both_sides_of_an_outage_are_not_mixed(self):
         """A sensor that was powered again rests elsewhere: a baseline of both halves would fit neither."""
         before = [[make_scan(n, press_counts=9)] for n in range(89)]
         assert np.abs(take(Lost(before + rest_scans(100, start=89)))["4"].counts - REST).max() <= 2
@@ -174,7 +174,7 @@ GIVEN_UP = GIVE_UP_NS // PERIOD_NS + 5
 
 
 class TestOnDemand:
-    def test_the_old_baseline_stays_in_use_until_the_new_one_is_there(self):
+    def test_the_old_baseline_stays_until_the_new_one_is_there(self):
         results = Bench().zero(120, 30)
         first = next(index for index, result in enumerate(results) if result.baseline.id != BASELINE.id)
         assert first == 99
@@ -223,12 +223,12 @@ class TestOnDemand:
         bench.runtime.zero("9")
         assert events(bench.play(1)) == ["zeroing refused: no sensor 9, there are 4, 6"]
 
-    def test_before_there_is_a_baseline_there_is_nothing_to_zero_again(self):
+    def test_without_a_baseline_there_is_nothing_to_zero_again(self):
         results = Bench(baselines={}).zero(100)
         assert events(results) == ["sensor 4: no baseline yet, zeroing since the start"]
         assert results[-1].baseline.origin == "start-up"
 
-    def test_earlier_taps_are_forgotten_since_they_were_read_over_another_rest_level(self):
+    def test_taps_over_another_rest_level_are_forgotten(self):
         bench = Bench()
         for _ in range(2):
             bench.play(3, LOCAL)
@@ -252,7 +252,7 @@ class TestAge:
 
 
 class TestDrift:
-    def test_what_was_subtracted_is_in_the_record_and_raw_counts_stay(self, tmp_path):
+    def test_the_record_has_what_was_subtracted_and_raw_counts(self, tmp_path):
         sink = McapSink(tmp_path / "drift.mcap", make_contract())
         results = Bench().play(1500, 25)
         for result in results:
