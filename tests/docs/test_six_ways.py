@@ -52,12 +52,6 @@ def test_a_pattern_is_on_the_page(begins):
         assert run.returncode == 0
 
 
-def test_a_gripper_stops_at_an_area():
-    with start([*written("python examples/stop_on_area.py"), "--oldest-ms", "20000"]) as run:  # of a busy machine
-        out, errors = run.communicate(timeout=120)
-    assert (run.returncode, errors) == (0, "") and "gripper: stopped" in out and "mm2 touch" in out
-
-
 def test_lerobot_observes(monkeypatch, capsys):
     if importlib.util.find_spec("lerobot") is None:
         lerobot_stand_in.install(monkeypatch)
@@ -82,11 +76,3 @@ def test_a_ros_node_reads_a_topic():
     assert f"/{topic}" in WAYS.text
     with start(written("edge-sr --source demo:loop"), **ENVIRONMENT), Listener({topic: "std_msgs/msg/Float64"}) as node:
         node.until(lambda: any(message["data"] > 1e-5 for message in node.of(topic)))
-
-
-def test_a_mesh_becomes_a_model():
-    """test_examples runs it, shortened, and reads the time that it prints before it begins."""
-    words = written("python examples/train_and_deploy.py")
-    assert words[2:] == ["bolt.stl", "--out", "bolt", "--minutes", "4"]
-    example = (ROOT / "tests/interface/test_examples.py").read_text()
-    assert "minutes on this machine" in example and '"--minutes", "4"' in example

@@ -1,7 +1,6 @@
 """`edge-sr` as a user runs it: a process of its own, real pipes, real signals, a real pseudo-terminal."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from cli_samples import TIMEOUT_S, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
-from mcap_samples import arrays_of
 
 from edge import __version__
 from edge.cli import main as cli
@@ -20,7 +18,6 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
 __all__ = ["files"]
-DEMO_SCANS = 1254
 
 
 def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
@@ -57,13 +54,6 @@ class TestHelp:
         done = run(*command, "--version")
         assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
 
-    def test_help_names_all_there_is(self):
-        text = run("--help").stdout
-        options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
-        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps")]
-        for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "mcap:FILE", "models", "reset"):
-            assert word in text
-
     def test_help_loads_no_onnxruntime(self):
         script = (
             "import sys\nfrom edge.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
@@ -91,34 +81,6 @@ class TestReplay:
         assert re.match(r"REPLAY replay:.*taps.npz: 40 scans, \d+ patterns \(\d+ reused\), \d+ dropped", lines[1])
         assert re.search(r"rate held: (29|30)\.\d Hz \(sensor 4\), 30 Hz asked for", done.stderr)
         assert "p50" in done.stderr and "\x1b" not in done.stderr
-
-    def test_what_was_recorded_replays_as_the_same_scans(self, files, tmp_path):
-        options = [*base_options(files), "--rate-hz", "400"]
-        first = run(*options, "--source", f"replay:{files}/taps.npz", "--sink", f"mcap:{tmp_path}/a.mcap")
-        second = run(*options, "--source", f"replay:{tmp_path}/a.mcap", "--sink", f"mcap:{tmp_path}/b.mcap")
-        assert first.returncode == second.returncode == 0
-        original = load_recording(files / "taps.npz").tracks[0].counts
-        for name in ("a", "b"):
-            np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.mcap").tracks[0].counts, original)
-
-    def test_a_model_that_says_how_sure_it_is_is_recorded(self, files, tmp_path):
-        done = run(
-            "--model", files / "sure.onnx", "--baseline", files / "zero.json", "--source", f"replay:{files}/taps.npz",
-            "--sink", "jsonl:-", "--sink", f"mcap:{tmp_path}/out.mcap",
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        stored = arrays_of(tmp_path / "out.mcap")
-        for row, record in enumerate(records(done.stdout)):
-            if record["pattern"] is None:
-                assert record["deviation"] is record["interval_mm"] is None
-                assert not stored["deviation"][row].any() and np.isnan(stored["interval_mm"][row])
-            else:
-                np.testing.assert_allclose(record["deviation"], stored["deviation"][row], rtol=1e-4)
-                np.testing.assert_allclose(
-                    stored["deviation"][row], 0.01 * (1 + abs(stored["pattern"][row])), atol=1e-6
-                )
-                assert record["interval_mm"] == pytest.approx(stored["interval_mm"][row], abs=1e-5)
-        assert stored["has_pattern"].any()
 
     def test_newtons_thresholds_and_idle_time_are_heard(self, files):
         done = run(
@@ -180,15 +142,6 @@ class TestReplay:
         assert 1 in after and after.index(1) < 30
         assert process.stderr is not None and "refused: 1 lines or messages were not commands" in process.stderr.read()
 
-    def test_two_files_are_played_together_as_of_one_source(self, files, tmp_path):
-        data = dict(np.load(files / "taps.npz"))
-        np.savez(tmp_path / "other.npz", **(data | {"sensor": np.array(["6"] * 40)}))
-        paths = f"{files}/taps.npz,{tmp_path}/other.npz"
-        done = run("replay", paths, *base_options(files), "--sink", "jsonl:-")
-        assert done.returncode == 0, done.stderr
-        assert sorted(record["sensor"] for record in records(done.stdout)) == ["4"] * 40 + ["6"] * 40
-        assert "sensor 6 has no pattern: not zeroed, " in done.stderr
-
     def test_a_sensor_of_the_baseline_that_was_not_recorded_has_no_cable(self, files, tmp_path):
         other = Baseline.of("6", BASELINE.counts, BASELINE.created_unix_s, 100, "file")
         save_baselines(tmp_path / "two.json", [BASELINE, other])
@@ -224,27 +177,8 @@ class TestModels:
         p50, p99, *figures = row.split()[6:]
         assert 0 < int(p50) <= int(p99) and figures == ["psnr_db", "33.2,", "rmse_percent", "2.1"]
 
-    def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        assert cli.main(["models"]) == 4
-        assert "no models" in capsys.readouterr().err
-
 
 class TestDemo:
     def test_a_demo_that_ends_before_its_first_tap_says_so(self, files, capsys):
         assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
         assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
-
-    def test_the_demo_scores_its_taps_and_draws_the_last(self, files):
-        done = run("--source", "demo", "--model", files / "tiny.onnx", env=os.environ | {"COLUMNS": "80"})
-        assert done.returncode == 0, done.stderr
-        assert "demo: an emulated sensor taps" in done.stderr and f"EMULATED demo: {DEMO_SCANS} scans" in done.stderr
-        assert "4 of 4 taps scored" in done.stdout
-        rows = re.findall(
-            r"^ +(\d)  0.0  0.0 +(-?\d+) +(\d) +(-?[\d.]+) +([\d.]+) +([\d.]+) +- +(\d+)$", done.stdout, re.MULTILINE
-        )
-        assert [(int(row[0]), int(row[2])) for row in rows] == [(n, n) for n in (1, 2, 3, 4)]
-        angles_deg = [int(row[1]) for row in rows]
-        assert np.diff(angles_deg).tolist() == [-5, -5, -5]
-        assert re.search(r"^taxels, 4 x 4 +not checked, 40 x 40 +truth$", done.stdout, re.MULTILINE)
-        assert "\x1b" not in done.stdout and "@" in done.stdout

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from edge.cli import main as cli
-from edge.cli.devices_command import NOTHING, SERVER_HINT, page
+from edge.cli.devices_command import NOTHING, SERVER_HINT
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import gs_usb_devices
@@ -36,14 +36,7 @@ def roots(tmp_path):
 def test_serial_ports_and_what_to_write_for_them(roots):
     vscom, gripper, built_in = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
     assert vscom == Found(
-        "serial",
-        "/dev/ttyUSB0",
-        "0403:6015",
-        "D30BL366",
-        "VScom USB-CAN Plus",
-        True,
-        "slcan:serial=D30BL366",
-        (),
+        "serial", "/dev/ttyUSB0", "0403:6015", "D30BL366", "VScom USB-CAN Plus", True, "slcan:serial=D30BL366", ()
     )
     assert (gripper.adapter, gripper.looks_like) == (False, "FT231X USB UART by FTDI: no known adapter")
     assert (built_in.usb_id, built_in.source, built_in.looks_like) == (
@@ -134,14 +127,14 @@ def test_can_interfaces(roots):
         ("Option is unknown", None),
     ],
 )
-def test_the_bitrate_is_asked_of_ip(tmp_path, monkeypatch, says, bitrate):
+def test_the_bitrate_is_asked_of_ip(roots, tmp_path, monkeypatch, says, bitrate):
     program = write(tmp_path / "ip", f"#!/bin/sh\n[ \"$*\" = '-json -details link show can0' ] && echo '{says}'\n")
     program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert devices._bitrate_hz("can0") == bitrate
-    assert devices._bitrate_hz("can1") is None  # it fails
-    monkeypatch.setenv("PATH", "")
-    assert devices._bitrate_hz("can0") is None
+    interface(roots[0], "can0", up=True)
+    for path, known in ((f"{tmp_path}:{os.environ['PATH']}", bitrate), ("", None)):
+        monkeypatch.setenv("PATH", path)
+        (found,) = can_interfaces(roots[0])
+        assert found.problems == (() if known is None else (f"runs at {known} bit/s, the sensor at 1000000",))
 
 
 @pytest.fixture
@@ -211,10 +204,6 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, capsys, monkeypatch):
         "libusb cannot be loaded: pip install libusb-package",
         SERVER_HINT,
     ]
-
-
-def test_a_page_of_nothing():
-    assert page([], ["a note"], 200) == ["a note", SERVER_HINT]
 
 
 def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):

@@ -197,12 +197,6 @@ def test_the_gripper_neither_begins_nor_goes_on_by_a_reading_that_is_no_ground(a
     assert gripper.done == ["close", "stop"] and words in grip.why and not grip.reached
 
 
-def test_a_pad_that_is_touched_already_is_not_closed_further(at_once):
-    grip, gripper = grip_of(at_once)
-    grip.follow(reading("contact", area_mm2=50.0))
-    assert gripper.done == [] and not grip.reached
-
-
 def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
     grip.follow(reading(sensor="left", age_ms=1000))
@@ -244,12 +238,6 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
     with Source(Live([[make_scan(n)] for n in range(10)]), sensor_file=SensorFile(sensors=known)) as source:
         grip.run(source, FakeModel(), 60)
     assert set(gripper.done) == {"stop"} and grip.why.startswith("it never began: ")
-
-
-def test_while_nothing_was_heard_it_says_so(at_once):
-    grip, gripper = grip_of(at_once)
-    grip._mind_silence()
-    assert gripper.done == [] and grip.why == "it never began: no scan arrived"
 
 
 @pytest.mark.parametrize("limit", ["--area-mm2", "--most-counts", "--oldest-ms", "--duration-s"])

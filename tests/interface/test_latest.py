@@ -16,7 +16,6 @@ from edge.api import (
     Stream,
     UsageError,
     open_runtime,
-    open_source,
     take_baselines,
 )
 from edge.pipeline.latest import NewestResults
@@ -236,21 +235,6 @@ def test_a_source_has_one_stream_at_a_time():
             assert list(stream_of(source, duration_s=1e-6)) == []
 
 
-def test_a_loop_that_is_closed_while_a_task_waits_ends_nothing():
-    link = StagedLink(scans(0), scans(1))
-    with Source(link) as source:
-        stream = stream_of(source)
-        for _ in range(2):
-            loop = asyncio.new_event_loop()
-            task = loop.create_task(source.wait_async(1000))
-            loop.run_until_complete(asyncio.sleep(0))
-            loop.close()
-            assert not task.done()
-        for stage in range(2):
-            link.let(stage)
-            assert stream.read().result.scan.number == stage
-
-
 def test_a_recording_at_the_speed_of_its_reader_has_no_latest(tmp_path):
     class Patient(FakeLink):
         patient = True
@@ -325,20 +309,6 @@ def test_a_task_that_is_cancelled_loses_no_result(way, when):
     assert asyncio.run(main()) == [0, 1]
 
 
-def test_a_task_wakes_as_soon_as_scans_wait():
-    async def main():
-        link = StagedLink(scans(0), endless=True)
-        with Source(link) as source:
-            waiting = asyncio.create_task(source.wait_async(1000))
-            await asyncio.sleep(0)
-            link.gates[0].set()
-            await asyncio.wait_for(waiting, 10)
-            await asyncio.wait_for(source.wait_async(1000), 10)  # they still wait
-            assert [scan.number for scan in source.take(0)] == [0]
-
-    asyncio.run(main())
-
-
 def test_asyncio_is_told_of_errors_and_of_time():
     async def main():
         with Source(FakeLink([scans(0)], error=LinkLostError("gone"))) as source:
@@ -353,16 +323,3 @@ def test_asyncio_is_told_of_errors_and_of_time():
         return threading.active_count()
 
     assert asyncio.run(main()) == threading.active_count()
-
-
-def test_the_demo_is_followed_beside_other_tasks():
-    async def main():
-        source = open_source("demo", rate_hz=1000).open()
-        try:
-            stream = Stream(source, open_runtime(FakeModel(), source))
-            return [(await stream.read_async()).result.scan.number for _ in range(5)]
-        finally:
-            source.close()
-
-    numbers = asyncio.run(main())
-    assert numbers == sorted(set(numbers))

@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from cli_samples import assert_refused, base_options, files, run, start, wait_for, write_recording
+from cli_samples import base_options, files, run, start, wait_for, write_recording
 
 from edge.api import MapSink, ObjectMap, PadPose, Stream, open_recording, open_runtime
 from edge.mapping.map_files import check_npz
@@ -58,19 +58,6 @@ def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
     assert done.returncode == 0 and list(tmp_path.iterdir()) == []
     assert "patterns came without a pose, so the map is empty: send poses of the pad" in done.stderr
     assert "without a pose; no file written" in done.stderr
-
-
-def test_what_cannot_become_a_map_is_refused_before_anything_is_opened(files, tmp_path):
-    there = tmp_path / "there.npz"
-    there.write_text("a good one")
-    source = ["--source", f"replay:{files / 'absent.npz'}"]
-    assert_refused(run("map", *source, "--out", there), 5, "exists: give another name")
-    assert there.read_text() == "a good one"
-    assert_refused(run("map", *source, "--out", tmp_path / "m.mcap"), 2, "ends in .npz")
-    assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--png", tmp_path / "m.jpg"), 2, "ends in .png")
-    assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--size-mm", "9000"), 2, "pixels along a side")
-    assert_refused(run("map", *source, "--out", tmp_path / "m.npz", "--centre-mm", "0", "nan"), 2, "finite numbers")
-    assert_refused(run("map", *source, "--out", tmp_path / "m.npz"), 2, "absent.npz")
 
 
 def test_a_recording_with_poses_becomes_a_map(files, tmp_path):

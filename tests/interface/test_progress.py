@@ -11,18 +11,15 @@ import subprocess
 import sys
 import termios
 from functools import partial
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, make_contract, write_model
+from edge_samples import ROOT, write_model
 
 from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
-from train.learning import expected_error_table as confidence
 
 CLEARED = re.compile(r"\r *\r$")
 RATE = re.compile(r"scan/s|s/scan")
@@ -196,15 +193,6 @@ def test_what_is_tracked_comes_whole_and_must_tell_how_much_it_is():
     assert list(tracked(iter([1, 2]), "counting", "thing", 2)) == [1, 2]
     with pytest.raises(TypeError, match=r"has no length: pass `total`"):
         next(tracked(iter([1]), "counting", "thing"))
-
-
-def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeypatch):
-    """These steps take most of the time of `python -m export.to_onnx`."""
-    reached = []
-    monkeypatch.setattr(Progress, "advance", lambda bar: reached.append((bar._what, bar._total)))
-    monkeypatch.setattr(confidence, "doubts_and_errors", lambda *_: np.ones((3, 40)))
-    assert set(confidence.fit_confidence(SimpleNamespace(contract=make_contract(taps=2)), [None] * 3)) == {"1", "2"}
-    assert reached == [("confidence", 3)] * 3
 
 
 AT_ONCE = """

@@ -20,11 +20,6 @@ def gps(port, over):
         os.write(port, b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
 
 
-def modem(port, over):
-    while not over.is_set():
-        os.write(port, os.read(port, 100) + b"\r\nERROR\r\n")
-
-
 def another_speed(port, over):
     while not over.wait(0.01):
         os.write(port, bytes(range(0, 256, 5)) + b"\r")
@@ -40,19 +35,13 @@ def motors(port, over):
         os.write(port, CAN[0])
 
 
-def nothing(port, over):
-    over.wait()
-
-
 @pytest.mark.parametrize(
     ("speaks", "words"),
     [
         (gps, f"{ELSE}text of another device"),
-        (modem, f"{ELSE}text of another device"),
         (line_feeds, f"{ELSE}no line that ends as an adapter's: another device, such as one whose lines end with LF"),
         (another_speed, f"{ELSE}no text: another line speed"),
         (motors, "CAN frames came, and "),
-        (nothing, "nothing came: is the sensor powered and its cable in?"),
     ],
 )
 def test_what_is_wrong_is_read_from_what_came(speaks, words):

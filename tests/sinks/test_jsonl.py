@@ -134,15 +134,6 @@ class TestJsonLines:
         assert [axis[0][2] for axis in record["counts"]] == [None] * 3
         assert ABSENT not in np.array(record["counts"]).ravel().tolist()
 
-    def test_a_deviation_stands_beside_its_pattern_in_the_same_digits(self):
-        result = make_sure_results(3)[4]
-        record = json.loads(record_line(result, {}))
-        for name in ("pattern", "deviation"):
-            np.testing.assert_allclose(record[name], getattr(result, name), rtol=2e-7, atol=0.51e-7)
-        assert record["pattern"] != record["deviation"]
-        assert record["interval_mm"] == pytest.approx(1.6 * 0.04, abs=1e-3)
-        assert record["interval_mm"] == round(result.interval_mm, 5)
-
     def test_what_the_vendor_says_is_told_where_it_does(self):
         runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
         newtons = np.full((3, 4, 4), 0.125, dtype=np.float32)

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from cli_samples import base_options, files, records, start
-from edge_samples import BASELINE, ROOT, FakeModel
+from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
@@ -36,20 +36,11 @@ class TestForms:
     def test_what_exists(self, text, expected):
         assert check_poses(text) == expected
 
-    @pytest.mark.parametrize(
-        "text",
-        ["", "ros2", "ros2:", "ros2:/9x", "tf:a:b", "zenoh:a*", "mqtt:x"],
-    )
+    @pytest.mark.parametrize("text", ["", "ros2", "ros2:", "ros2:/9x", "tf:a:b", "zenoh:a*", "mqtt:x"])
     def test_what_does_not(self, text):
         with pytest.raises(UsageError) as caught:
             check_poses(text)
         assert "\n" not in str(caught.value)
-
-    def test_a_program_refuses_it_in_one_line(self):
-        done = subprocess.run(
-            [sys.executable, "-m", "edge.cli.main", "--poses", "mqtt:x"], cwd=ROOT, capture_output=True, text=True
-        )
-        assert done.returncode == 2 and "no source of poses 'mqtt:x'" in done.stderr and done.stderr.count("\n") == 1
 
 
 def until(queue, satisfied, act=lambda: None):
@@ -63,14 +54,14 @@ def until(queue, satisfied, act=lambda: None):
     return poses
 
 
-def used(poses):
-    """Return the tracks of a runtime that took these poses."""
+def used(poses, sensor, time_ns):
+    """Return the pose of a scan of a runtime that took these poses."""
     queue, runtime = PoseQueue(), Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     intake = PoseIntake(runtime, queue)
     for one in poses:
         queue.put(one)
     assert len(intake.take([], None, time.monotonic_ns())) == len(poses)
-    return runtime._tracks
+    return runtime.push(make_scan(sensor=sensor, time_ns=time_ns)).pose
 
 
 class TestZenoh:
@@ -120,7 +111,7 @@ with zenoh.open(config) as session:
         after_ns = time.monotonic_ns()
         assert all(before_ns < one.time_ns < after_ns for one in poses)
         assert {one.sensor for one in poses} == {"4"}
-        assert used(poses)["4"].at(poses[-1].time_ns) == PadPose(poses[-1].pose.x_mm, -2, 3)
+        assert used(poses, "4", poses[-1].time_ns) == PadPose(poses[-1].pose.x_mm, -2, 3)
         put("arm/pose", json.dumps({"cmd": "pose", "sensor": "left/6", "x_mm": -1, "y_mm": 0, "holds": True}))
         own = until(queue, lambda poses: any(one.sensor == "left/6" for one in poses))[-1]
         assert own.holds and own.pose == PadPose(-1, 0)
@@ -151,10 +142,7 @@ class TestRos2:
         pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
         from ros2_samples import ENVIRONMENT, LISTENERS_CONFIGURATION, PYTHONPATH
 
-        environment = os.environ | {
-            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION,
-            "PYTHONPATH": PYTHONPATH,
-        }
+        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION, "PYTHONPATH": PYTHONPATH}
         command = [sys.executable, str(ROOT / "tests/support/ros2_pose_writer.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
         topics = [["arm/pose", kind] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -218,7 +206,7 @@ class TestRos2:
 
         # The first ones may have waited for their writer, and then count as those of a clock that is behind.
         last = until(queue, lambda poses: poses and in_time(poses[-1]), act)[-1]
-        pose = used([last])["4"].at(last.time_ns)
+        pose = used([last], "4", last.time_ns)
         assert (pose.y_mm, pose.error_mm, pose.error_deg) == (-500.0, 0.2, 1.0)
 
     def test_the_covariance_comes_as_errors_and_a_transform_on_the_same_topic(self, opened, publish):

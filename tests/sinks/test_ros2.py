@@ -300,24 +300,6 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
         sink.close()
 
 
-def test_two_sinks_share_the_domain_and_one_outlives_the_other(sink):
-    other = open_sink_in(ENVIRONMENT, "ros2:other/skin")
-    other.write(contact(1), {})
-    other.close()
-    with Listener({"skin/s4/pattern": IMAGE}) as listener:
-        listener.until(lambda: listener.of("skin/s4/pattern"), Talker(sink))
-    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) in ros2_domain._OPEN
-    sink.close()
-    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) not in ros2_domain._OPEN, "threads and sockets are left behind"
-
-
-def open_sink_in(environment, text):
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in environment.items():
-            patch.setenv(name, value)
-        return open_sink(text, make_contract())
-
-
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():
     published = []
     sink = Ros2Sink("skin", ENVIRONMENT, source="emulated")

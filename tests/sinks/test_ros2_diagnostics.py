@@ -111,13 +111,3 @@ def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another(sink):
     assert right.trouble == {} and len(right.shown) == 2
     sink.tell(Event.of(Notice(time.monotonic_ns(), "well", "right: well", "right/")), {})
     assert left.trouble.keys() == {"lost", "trouble"}
-
-
-def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):
-    sink.write(contact(1), {})
-    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
-    assert sink._sensors["4"].trouble == {"lost": "the plug is out"}
-    sink.write(contact(2), {})
-    assert not sink._sensors["4"].trouble
-    sink.tell(Event(time.monotonic_ns(), "silent", "5", "another one is silent"), {})
-    assert not sink._sensors["4"].trouble and sink._sensors["4"].shown, "what 4 shows is as true as before"

@@ -3,24 +3,20 @@
 import json
 import math
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import make_scan
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap_samples import OFFSET_NS, make_results, odd_scans
+from mcap_samples import make_results, odd_scans
 
-from edge.perception.event import Event
-from edge.perception.result import Result
 from edge.sinks.json_encoding import record
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import map_messages, ros_types
 from firmware_bridge.errors import CdrError
-from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.recording.cdr import HEADER, MessageType, stamp
+from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.scan_messages import SCAN, decode_scan, encode_scan
 from firmware_bridge.scans.scan import VendorReading
 
@@ -35,47 +31,6 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
     stamp: Time
     frame_id: str
-
-
-@dataclass
-class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
-    header: Header
-    height: types.uint32
-    width: types.uint32
-    encoding: str
-    is_bigendian: types.uint8
-    step: types.uint32
-    data: types.sequence[types.uint8]
-
-
-@dataclass
-class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
-    x: types.float64
-    y: types.float64
-    z: types.float64
-
-
-@dataclass
-class Wrench(IdlStruct, typename="geometry_msgs::msg::dds_::Wrench_"):
-    force: Vector3
-    torque: Vector3
-
-
-@dataclass
-class WrenchStamped(IdlStruct, typename="geometry_msgs::msg::dds_::WrenchStamped_"):
-    header: Header
-    wrench: Wrench
-
-
-@dataclass
-class Log(IdlStruct, typename="rcl_interfaces::msg::dds_::Log_"):
-    stamp: Time
-    level: types.uint8
-    name: str
-    msg: str
-    file: str
-    function: str
-    line: types.uint32
 
 
 @dataclass
@@ -97,15 +52,6 @@ UNIX_NS = 1_700_000_000_123_456_789
 STAMP = Time(1_700_000_000, 123_456_789)
 
 
-@pytest.mark.parametrize("sensor", ["4", "left/4", "ünten", "a" * 64])
-def test_an_image_is_what_cyclonedds_writes(sensor):
-    values = np.random.default_rng(1).normal(size=(3, 5)).astype(np.float32)
-    expected = Image(Header(STAMP, sensor), 3, 5, "32FC1", 0, 20, list(values.tobytes())).serialize()
-    data = map_messages.image(values, sensor, UNIX_NS)
-    assert data == bytes(expected)
-    assert map_messages.image_map(data).tobytes() == values.tobytes()
-
-
 def test_an_image_of_columns_is_written_row_by_row():
     values = np.arange(12, dtype=np.float32).reshape(3, 4).T
     assert (map_messages.image_map(map_messages.image(values, "4", 0)) == values).all()
@@ -115,25 +61,6 @@ def test_another_image_is_not_taken_for_a_map():
     said = ros_types.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
         map_messages.image_map(ros_types.IMAGE.encode({**said, "encoding": "mono8"}))
-
-
-def test_a_force_is_a_wrench_where_all_of_it_is_known():
-    newtons = np.full((3, 4, 4), 0.125, np.float32)
-    scan = make_scan(press_counts=3000)
-    result = Result(replace(scan, vendor=VendorReading(newtons)), "device", "m", "contact", force_n=2.5)
-    nothing = Vector3(0.0, 0.0, 0.0)  # equal forces all over the pad turn it nowhere
-    expected = WrenchStamped(Header(STAMP, "4"), Wrench(Vector3(2.0, 2.0, 2.0), nothing)).serialize()
-    said = ros_messages.wrench(replace(result, force_n=2.0), USPA44, UNIX_NS)
-    assert said is not None and abs(np.frombuffer(said[-48:]) - np.frombuffer(bytes(expected)[-48:])).max() < 1e-12
-    assert said[:-48] == bytes(expected)[:-48]
-    assert ros_messages.wrench(result, USPA44, UNIX_NS) is None, "z of another calibration than x and y"
-    assert ros_messages.wrench(replace(result, scan=scan), USPA44, UNIX_NS) is None
-
-
-@pytest.mark.parametrize(("kind", "level"), [("lost", 40), ("silent", 30), ("back", 20), ("sink", 40)])
-def test_an_event_is_a_line_of_the_log(kind, level):
-    data = ros_messages.log_message(Event(5, kind, None, "über"), UNIX_NS)
-    assert data == bytes(Log(STAMP, level, "edge-sr", "über", "", kind, 0).serialize())
 
 
 @pytest.mark.parametrize("number", range(4))
@@ -215,7 +142,3 @@ def test_a_definition_names_the_messages_in_it():
             MessageType("x/msg/X", wrong)
     with pytest.raises(ValueError, match=r"f has 3 numbers, expected 2"):
         MIXED.encode({"a": "", "b": 0, "c": [], "d": 0, "e": 0, "f": [1, 2, 3], "g": ""})
-
-
-def test_a_time_is_of_1970():
-    assert stamp(OFFSET_NS + 5) == {"sec": OFFSET_NS // 10**9, "nanosec": 5} and HEADER == b"\0\1\0\0"

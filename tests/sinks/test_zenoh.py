@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +28,6 @@ from zenoh_samples import (
     wait_for,
 )
 
-from edge import api
 from edge.errors import SinkError
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
@@ -66,12 +64,7 @@ class TestMessages:
             if number == 20:
                 sink.tell(event, counters)
                 expected.append(
-                    (
-                        "grip/event",
-                        "application/json",
-                        plain(event_record(event, counters, "emulated")),
-                        {},
-                    )
+                    ("grip/event", "application/json", plain(event_record(event, counters, "emulated")), {})
                 )
         sink.close()
         messages, lives = consumer.until_gone()
@@ -88,43 +81,6 @@ class TestMessages:
             for name, values in maps.items():
                 np.testing.assert_array_equal(got[name], values)
 
-    def test_a_replay_by_the_program_loses_nothing(self, endpoint, consume, tmp_path):
-        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
-        rng = np.random.default_rng(1)
-        presses = [0] * 110 + [2000 + 300 * (number // 3) for number in range(60)]
-        counts = np.stack(
-            [make_scan(n, press_counts=z).counts + rng.integers(-2, 3, (3, 4, 4)) for n, z in enumerate(presses)]
-        )
-        write_recording(tmp_path / "taps.csv", counts)
-        command = [
-            sys.executable,
-            "-m",
-            "edge.cli.main",
-            "replay",
-            f"{tmp_path}/taps.csv",
-            "--zero",
-            "--model",
-            str(model),
-        ]
-        sinks = ["--sink", f"zenoh:grip?connect={endpoint}", "--sink", f"jsonl:{tmp_path}/out.jsonl"]
-        consumer = consume(endpoint)
-        done = subprocess.run(
-            [*command, "--rate-hz", "400", "--every-scan", *sinks], env=ENVIRONMENT, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        messages, _ = consumer.until_gone()
-        records = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
-        scans = [json.loads(payload) for key, *_, payload in messages if key.endswith("/scan")]
-        patterns = [unpack(payload) for key, *_, payload in messages if key.endswith("/pattern")]
-        new = [one for one in records if one["pattern"] is not None and one["reused_from"] is None]
-        assert new and [header["scan"] for header, _ in patterns] == [one["scan"] for one in new]
-        for (header, maps), one in zip(patterns, new, strict=True):
-            assert header["source"] == "replay"
-            np.testing.assert_allclose(maps["pattern"], one["pattern"], atol=1e-7)
-        for scan, one in zip(scans, records, strict=True):
-            assert scan.pop("counters", {}).keys() | {"unwritten"} >= one.get("counters", {}).keys()
-            assert scan == {name: one[name] for name in scan}
-
     def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
         write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
@@ -138,15 +94,6 @@ class TestMessages:
             )
         why = f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
         assert done.returncode == 0 and f"edge-sr: {why}\n" in done.stderr and f"\nsinks: {why}\n" in done.stderr
-
-    def test_events_say_of_what_they_are(self):
-        with api.open_source("demo") as source:
-            sink = api.open_sink("zenoh:grip", CONTRACT, source)
-        put = []
-        sink._put = lambda publisher, message: put.append(json.loads(message))
-        sink.tell(Event(5, "lost", None, "the cable is out"), {})
-        sink.close()
-        assert [(said["event"], said["source"]) for said in put] == [("lost", "emulated")]
 
     @pytest.mark.parametrize("sensor", ["4", "left/4", "/4", "a//b", "a*?#$b", "%2F", "@left", "右 手"])
     def test_every_name_of_a_sensor_makes_a_key_and_is_told(self, sensor):
@@ -264,11 +211,6 @@ class TestWhoComesAndGoes:
         done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
         assert done.returncode == 1 and done.stderr.startswith("zenoh_listen: ") and done.stderr.count("\n") == 1
 
-    def test_the_example_says_how_it_is_called(self):
-        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py")]
-        done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
-        assert done.returncode == 1 and done.stderr == "usage: python zenoh_listen.py KEY [tcp/ADDRESS:7447]\n"
-
 
 class TestOpening:
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
@@ -325,16 +267,3 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
         time.sleep(0.3)  # for a call to another, were there one
         assert [str(peer) for peer in sink._session.info.peers_zid()] == [str(known.zid())]
         sink.close()
-
-
-def test_a_reader_that_stands_still_holds_up_no_end(endpoint, consume):
-    consumer, result = consume(endpoint), make_results(2)[1]
-    sink = ZenohSink(f"grip?connect={endpoint}")
-    wait_for(lambda: sink._events.matching_status.matching)
-    consumer.process.send_signal(signal.SIGSTOP)
-    for _ in range(500):
-        sink.write(result, {})
-    closing = threading.Thread(target=sink.close)
-    closing.start()
-    closing.join(8)  # zenoh itself gives up after ten seconds
-    assert not closing.is_alive()
