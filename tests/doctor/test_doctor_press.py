@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from doctor_samples import finger, visit
 
-from edge.doctor.pad_orientation import Answer, Press, corner_taxel, find_axes, find_order, judge_press, orders, z_sign
+from edge.doctor.pad_orientation import Answer, Press, find_axes, find_order, judge_press, orders, z_sign
 from edge.doctor.press_guide import PATIENCE_S, GuidedPress
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
@@ -113,14 +113,6 @@ class TestAnswers:
             assert mounting is not None and mounting.moves_taxels
             assert findings[0].verdict == verdict and words in findings[0].remedy
             assert findings[0].measured == "turned by 270 degrees clockwise"
-
-    def test_corners_by_the_load(self):
-        assert [corner_taxel(finger(place)) for place in USPA44.corners] == list(USPA44.corners)
-        assert [corner_taxel(-finger(place)) for place in USPA44.corners] == list(USPA44.corners)
-        assert corner_taxel(np.zeros((4, 4))) is None
-        middle = np.zeros((4, 4))
-        middle[0, 1:3] = 900
-        assert corner_taxel(middle) is None
 
 
 class TestPerson:

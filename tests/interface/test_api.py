@@ -4,7 +4,6 @@ import gc
 import itertools
 import json
 import re
-import shlex
 import threading
 import time
 from dataclasses import fields
@@ -78,10 +77,12 @@ def played(files, **settings):
 @pytest.mark.parametrize(
     ("options", "settings"),
     [
-        ([], {}),
+        ("", {}),
         (
-            shlex.split("--every-scan --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200"),
-            {"every_scan": True, "contact_on_counts": 2000, "contact_off_counts": 900} | {"counts_per_newton": 1200},
+            "--every-scan --contact-on-counts 2000 --contact-off-counts 900 --counts-per-newton 1200 "
+            "--idle-reset-s 0.1",
+            {"every_scan": True, "contact_on_counts": 2000, "contact_off_counts": 900, "counts_per_newton": 1200}
+            | {"idle_reset_s": 0.1},
         ),
     ],
 )
@@ -89,7 +90,9 @@ def test_records_of_the_command_line_are_those_of_the_api(files, options, settin
     fixed = ["--model", files / "tiny.onnx", "--baseline", files / "zero.json", "--rate-hz", "20"]
     for _ in range(5):
         made = played(files, **settings)
-        said = records(run(*fixed, "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", *options).stdout)
+        said = records(
+            run(*fixed, "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", *options.split()).stdout
+        )
         if not [one for one in (*made, *said) if one["state"] == "dropped"]:  # which depends on the machine
             break
     assert len(said) == 30 and {one["state"] for one in said} == {"idle", "contact"}

@@ -63,9 +63,6 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     ("wrong", "match"),
     [
         ({"x_mm": float("nan")}, "a pose: x_mm is nan, expected a number from"),
-        ({"y_mm": "2"}, "a pose: y_mm is '2', expected a number"),
-        ({"error_mm": -1}, "a pose: error_mm is -1.0, expected a number from 0"),
-        ({"sensor": ""}, "a pose: sensor is '', expected the name of a sensor"),
         ({"time_ns": 10**18}, "a pose: time_ns is .* ahead of now"),
     ],
 )

@@ -263,14 +263,6 @@ def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back()
     assert commands.poll() == [], "asked of a sink that is closed"
 
 
-def test_what_nobody_subscribes_to_is_not_made(sink):
-    published = []
-    sink._publish = lambda writer, message: published.append(writer.topic.name)
-    sink.write(contact(1), {})
-    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
-    assert set(published) == {"rt/skin/events"}
-
-
 def test_commands_are_taken_only_where_that_was_asked_for(sink):
     commands = Commands()
     with pytest.MonkeyPatch.context() as patch:

@@ -169,15 +169,6 @@ class TestStatus:
         sink.wait()
         assert self.shown()[-1].startswith("EMULATED | no scan for 3 s | 4 idle")
 
-    def test_the_last_line_stands_at_the_end(self):
-        sink = self.make()
-        first, last = make_results(1)
-        sink.write(first, {})
-        sink.write(last, {})
-        sink.close()
-        assert "| 6 no stored" in self.stream.getvalue().rsplit("\r", 1)[1]
-        assert self.stream.getvalue().endswith("\n")
-
     def test_a_window_that_was_closed_ends_nothing(self):
         self.now_s = 0.0
         leader, follower = os.openpty()

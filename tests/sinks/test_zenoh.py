@@ -1,7 +1,9 @@
-"""Results over zenoh: what another process reads, in a session of its own over loopback TCP."""
+"""Results over zenoh: what another process reads, in a session of its own over loopback TCP, and how programs end."""
 
 import json
 import os
+import re
+import select
 import signal
 import subprocess
 import sys
@@ -34,10 +36,11 @@ from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
-
-zenoh = pytest.importorskip("zenoh")
+from edge.terminal.forced_end import EXIT_FORCED
 
 __all__ = ["consume", "endpoint"]
+
+zenoh = pytest.importorskip("zenoh")
 
 
 def plain(said):
@@ -108,20 +111,6 @@ class TestMessages:
 
 
 class TestWhoComesAndGoes:
-    def test_a_reader_that_comes_late_hears_the_rest_and_who_is_there(self, endpoint, consume):
-        results = make_results(3)
-        sink = ZenohSink(f"grip?connect={endpoint}")
-        sink.write(results[0], {})
-        consumer = consume(endpoint)
-        sink.write(results[1], {})
-        wait_for(lambda: sink._events.matching_status.matching)
-        sink.write(results[2], {})
-        sink.close()
-        messages, lives = consumer.until_gone()
-        assert [words[0] for words in lives] == ["came", "went"]
-        scans = [json.loads(payload)["scan"] for key, *_, payload in messages if key.endswith("/scan")]
-        assert scans[-1] == 2 and 0 not in scans
-
     def test_that_nobody_subscribes_is_told_until_somebody_does(self, endpoint):
         with listening(endpoint) as place:
             sink, (result,) = ZenohSink(f"grip?connect={endpoint}"), make_results(1)
@@ -206,11 +195,6 @@ class TestWhoComesAndGoes:
             assert listener.stderr is not None
             assert (listener.stderr.read(), listener.wait(60)) == ("", 0)
 
-    def test_the_example_says_what_is_wrong_with_its_place(self):
-        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", "tcp/192.0.2.1:7447"]
-        done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
-        assert done.returncode == 1 and done.stderr.startswith("zenoh_listen: ") and done.stderr.count("\n") == 1
-
 
 class TestOpening:
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
@@ -267,3 +251,39 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
         time.sleep(0.3)  # for a call to another, were there one
         assert [str(peer) for peer in sink._session.info.peers_zid()] == [str(known.zid())]
         sink.close()
+
+
+def sending(*words, **settings):
+    """A program that puts every scan, and hears signals as from a terminal."""
+    command = [sys.executable, "-m", "edge.cli.main", *words, "--every-scan"]
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} | settings
+    return ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes))
+
+
+def until_quiet(pipe, quiet_s=1.0):
+    while select.select([pipe], [], [], quiet_s)[0] and os.read(pipe.fileno(), 1 << 20):
+        pass
+
+
+class TestEndOfTheProgram:
+    """Two seconds are promised; a busy machine may take longer."""
+
+    def test_a_replay_that_waits_for_a_peer_that_is_gone_is_ended_by_force(self, endpoint, consume, tmp_path):
+        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
+        press = np.where(np.arange(8000) < 110, 0, 2000 + 7 * np.arange(8000) % 997)
+        noise = np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
+        counts = make_scan(0).counts + noise
+        counts[:, 2] += press[:, None, None] // 16
+        recording = write_recording(tmp_path / "long.csv", counts)
+        consumer = consume(endpoint)
+        words = ["replay", str(recording), "--zero", "--rate-hz", "2000", "--model", str(model)]
+        sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
+        with sending(*words, *sinks, stdout=subprocess.PIPE) as program:
+            while consumer.next()[0] != "got":
+                pass
+            consumer.process.send_signal(signal.SIGSTOP)
+            until_quiet(program.stdout)  # what zenoh has no room for holds up everything, for five seconds at most
+            program.send_signal(signal.SIGTERM)
+            words = program.communicate()[1].decode()
+        assert program.returncode == EXIT_FORCED
+        assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words)
