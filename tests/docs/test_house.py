@@ -1,5 +1,7 @@
-"""House rules of the tree: few modules at a root, one meaning of a file name, no long file."""
+"""House rules of the tree: few modules at a root, one meaning of a file name, no long file, and a checked English."""
 
+import ast
+import importlib.util
 import subprocess
 from collections import Counter
 from pathlib import Path
@@ -43,3 +45,34 @@ def test_no_file_name_of_a_package_stands_for_two_things(package):
 def test_no_file_is_of_four_hundred_lines_or_more():
     long = {str(path) for path in sources() if len((ROOT / path).read_bytes().splitlines()) >= MOST_LINES}
     assert long == LONG
+
+
+_SPEC = importlib.util.spec_from_file_location("plain_english", ROOT / ".ci" / "plain_english.py")
+assert _SPEC is not None and _SPEC.loader is not None
+plain_english = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(plain_english)
+
+
+def shown(source):
+    return [text for _, text in plain_english.strings(ast.parse(source))]
+
+
+@pytest.mark.parametrize(
+    "planted", ["no scan was heard yet", "no sensor is told apart", "If none is dead, measured anew."]
+)
+def test_a_planted_word_of_the_dialect_is_seen_in_shown_text(planted):
+    assert shown(f"raise UsageError({planted!r})") == [planted]
+    assert plain_english.shown_dialect(planted)
+
+
+def test_strings_are_whole_sentences_without_docstrings_and_values():
+    source = '"""Heard by nobody at all."""\nsay(f"no scan of {name} in {told} s")\nkinds = ("lost", "given_up")\n'
+    assert shown(source) == ["no scan of _ in _ s"]
+
+
+def test_a_page_shows_its_text_its_labels_and_the_strings_of_its_script():
+    html = '<p id="told" aria-label="newest scan">What was heard</p>'
+    assert set(plain_english.shown_dialect(plain_english.page_text(html, ".html"))) == {"heard"}
+    assert "newest scan" in plain_english.page_text(html, ".html")
+    script = 'const told = 1; // heard here\nsay(`doubt of ${told}`, "beside it");\n'
+    assert set(plain_english.shown_dialect(plain_english.page_text(script, ".js"))) == {"doubt", "beside"}

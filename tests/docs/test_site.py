@@ -10,8 +10,6 @@ from edge_samples import ROOT
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
-from edge.bench.provenance import read_provenance
-
 FETCHED = {
     "img": "src",
     "script": "src",
@@ -95,12 +93,6 @@ def test_what_links_of_the_repository_lead_to_is_there():
                 assert (page.parent / address).exists(), f"{page.name} leads to {address}"
 
 
-def test_reports_that_are_named_are_there():
-    for page in (ROOT / "README.md", ROOT / "mkdocs.yml", *(ROOT / "docs").glob("*.md")):
-        for name in re.findall(r"\breports/[\w/.-]+\.(?:md|png|csv|json)\b", page.read_text(encoding="utf-8")):
-            assert (ROOT / name).is_file(), f"{page.name} names {name}"
-
-
 def test_each_example_is_named_on_a_page_and_its_folder_in_the_layout():
     pages = "\n".join(page.read_text() for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
     examples = sorted((ROOT / "examples").glob("*.py"))
@@ -109,32 +101,3 @@ def test_each_example_is_named_on_a_page_and_its_folder_in_the_layout():
     layout = (ROOT / "README.md").read_text().split("## Layout", 1)[1]
     packages = {path.parent.name for path in ROOT.glob("*/*.py")} - {"site"}
     assert [name for name in sorted(packages) if f"\n{name}/ " not in layout] == []
-
-
-def test_each_page_of_the_navigation_has_more_than_a_heading(site):
-    def leaves(entries):
-        for entry in entries:
-            for target in entry.values():
-                yield from leaves(target) if isinstance(target, list) else [target]
-
-    told = list(leaves(load_config(str(ROOT / "mkdocs.yml")).nav))
-    assert len(told) > 20
-    for target in told:
-        page = (site / target).with_suffix(".html").read_text(encoding="utf-8")
-        text = re.sub(r"<[^>]+>", " ", page.split("<article", 1)[1].split("</article>", 1)[0])
-        assert len(text.split()) > 60, f"{target} says next to nothing"
-
-
-def test_each_picture_has_the_command_that_makes_it():
-    table = (ROOT / "docs" / "bench.md").read_text().split("## Pictures", 1)[1]
-    made = re.findall(r"^\| (`[^|]+`) \| `(?:python|edge-sr) [^|]+\|$", table, re.MULTILINE)
-    patterns = [pattern for cell in made for pattern in re.findall(r"`([^`]+)`", cell)]
-    pictures = [path for folder in ("docs", "reports") for path in (ROOT / folder).rglob("*.[ps][nv]g")]
-    assert len(pictures) > 10
-    for picture in sorted(pictures):
-        pages = [page for page in picture.parent.glob("*.md") if f"]({picture.name})" in page.read_text()]
-        by_page = any(read_provenance(page.read_text()) is not None for page in pages)
-        by_row = any(picture.relative_to(ROOT).match(pattern) for pattern in patterns)
-        assert by_page or by_row, f"{picture}: by which command? See docs/bench.md, Pictures"
-    for pattern in patterns:
-        assert list(ROOT.glob(pattern)), f"{pattern}: there is none"

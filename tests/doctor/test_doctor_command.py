@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cli_samples import write_recording
 from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
 from edge_samples import ROOT, FakeLink
 
@@ -139,7 +140,12 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
         done = doctor(monkeypatch, emulator.port, "--json")
     document = json.loads(done.out)
     assert verdicts(done) == {}
-    assert document["kind"] == "emulated" and document["sensor_file"] is None and document["id_map"] == "uSPa44"
+    assert (
+        document["stopped"] is False
+        and document["kind"] == "emulated"
+        and document["sensor_file"] is None
+        and document["id_map"] == "uSPa44"
+    )
     names = [one["name"] for one in document["findings"]]
     of_link = "link, baud rate, latency timer, id map"
     of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
@@ -343,16 +349,7 @@ def test_the_serial_number_of_the_adapter_is_kept(monkeypatch, tmp_path):
 
 def test_a_recording_is_examined_but_not_pressed(monkeypatch, tmp_path):
     out, err = io.StringIO(), Terminal(Person())
-    counts = healthy_counts(150)
-    np.savez(
-        tmp_path / "r.npz",
-        format=np.array("tactile-recording"),
-        version=np.array(1),
-        sensor=np.array(["4"] * 150),
-        scan=np.arange(150),
-        time_ns=np.arange(150) * 10_000_000,
-        counts=counts,
-    )
+    write_recording(tmp_path / "r.npz", [0] * 150)
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)
     kept = tmp_path / "sensor.toml"

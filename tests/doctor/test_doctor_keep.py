@@ -1,4 +1,4 @@
-"""The doctor's sensor file: never less than it held, and marked where it was not made from a real sensor."""
+"""The doctor's sensor file, never less than it held and marked where emulated, and the summary of what was found."""
 
 import io
 import json
@@ -6,13 +6,15 @@ import sys
 
 import numpy as np
 import pytest
-from doctor_samples import healthy_counts
+from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, recording
 
-from edge.api import open_source
 from edge.cli import main as cli
+from edge.cli.run_options import parser
+from edge.doctor import command, watch
 from edge.doctor import write_sensor_file as keep
+from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.gain_keeper import keep_learned
 from edge.pipeline.scan_reader import Source
@@ -80,7 +82,9 @@ class TestLoss:
             keep.keep(path, SensorFile(), None, found, NONE, NONE)
         keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
-        assert keep._lost(held, load_sensor_file(path).sensors["4"]) == []
+        now = load_sensor_file(path).sensors["4"]
+        assert (now.mounting, now.pad, now.frame) == (held.mounting, held.pad, held.frame)
+        assert (now.counts_per_newton, now.baseline is None) == (held.counts_per_newton, held.baseline is None)
         assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
 
     def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, monkeypatch, tmp_path):
@@ -108,12 +112,6 @@ class TestLoss:
         now = load_sensor_file(path)
         assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
 
-    def test_the_adapters_number_is_a_part(self, tmp_path):
-        path = tmp_path / "s.toml"
-        save_sensor_file(path, SensorFile(adapter="D30BL366", sensors={"4": SensorEntry()}))
-        with pytest.raises(SensorFileError, match="would be lost: serial number of the adapter"):
-            keep.keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE)
-
     def test_what_cannot_be_found_is_told_before_the_visit(self, good):
         check_writable(good, SensorFile(adapter="D30BL366"), presses=True, weighs=True)
         check_writable(good, load_sensor_file(good), presses=False, weighs=False)
@@ -130,12 +128,6 @@ class TestLoss:
         with pytest.raises(SensorFileError, match="would be lost: baseline of sensor 4"):
             keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE, emulated=True)
         keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
-
-    def test_what_is_no_sensor_file_may_be_replaced(self, tmp_path):
-        path = tmp_path / "s.toml"
-        path.write_text("damaged")
-        keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
-        assert load_sensor_file(path).baselines and path.with_name("s.toml.bak").read_text() == "damaged"
 
 
 class TestMarks:
@@ -158,14 +150,6 @@ class TestMarks:
         third = keep.keep(path, load_sensor_file(path), None, NONE, {"4": Mounting()}, NONE)
         assert not third.sensors["4"].emulated and load_sensor_file(path).sensors["4"].emulated == frozenset()
 
-    def test_marks_that_cannot_be_are_refused(self, tmp_path):
-        path = tmp_path / "s.toml"
-        path.write_text('format = "tactile-sensor"\nversion = 1\nmodel = "A"\n[sensors.4]\nassumed = ["weight"]\n')
-        with pytest.raises(
-            SensorFileError, match=r"'sensors.4.assumed': .*, expected a list of mounting, force, baseline, gains"
-        ):
-            load_sensor_file(path)
-
 
 EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=frozenset({"baseline"}))})
 
@@ -186,14 +170,6 @@ class TestUse:
                 pass
         refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
 
-    def test_every_command_that_reads_a_sensor_takes_the_force(self, tmp_path, monkeypatch):
-        save_sensor_file(tmp_path / "s.toml", EMULATED)
-        monkeypatch.setattr("edge.api.links_to", lambda *_, **__: [FakeLink([], kind="device")])
-        with pytest.raises(SensorFileError), open_source(sensor=tmp_path / "s.toml"):
-            pass
-        with open_source(sensor=tmp_path / "s.toml", force=True):
-            pass
-
     @pytest.mark.parametrize("command", [["doctor", "--drift-s", "0.1"], ["baseline", "--out", "zero.json"], []])
     def test_on_the_command_line_it_is_2_and_one_line(self, tmp_path, monkeypatch, capsys, command):
         monkeypatch.chdir(tmp_path)
@@ -203,3 +179,58 @@ class TestUse:
         code = cli.main([*command, "--sensor", "s.toml"])
         lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
         assert code == 2 and len(lines) == 1
+
+
+WELL = as_scans(healthy_counts(200))
+
+
+def told(*arguments, link=None, out=None):
+    """The exit code, and what the doctor printed of a link that is well."""
+    options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
+    out = io.StringIO() if out is None else out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watch, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()])
+        return command.run(options, out, io.StringIO()), out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "words"),
+    [
+        (["ok", "ok"], "all well"),
+        (["ok", "not known", "not known"], "nothing wrong, 2 not known"),
+        (["look", "ok"], "0 wrong, 1 to look at"),
+        (["wrong", "look", "not known"], "1 wrong, 1 to look at, 1 not known"),
+    ],
+)
+def test_what_is_not_known_is_not_well(verdicts, words):
+    assert summary([Finding("noise", verdict, "") for verdict in verdicts]) == words
+
+
+def test_the_last_line_says_it():
+    code, page = told()
+    findings = [line for line in page.splitlines() if line.startswith("  ?")]
+    assert code == 0 and page.splitlines()[-1] == f"nothing wrong, {len(findings)} not known" and len(findings) == 2
+
+
+@pytest.mark.parametrize("name", ["no/such/s.toml", "", "/proc/s.toml"])
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_opened(tmp_path, name):
+    def open_link():
+        raise AssertionError("opened")
+
+    with pytest.raises(SensorFileError, match=r"cannot be written: .*: pass --out a file"):
+        told("--out", tmp_path / name, link=open_link)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_was_found_is_told_though_the_file_cannot_be_written_any_more(tmp_path):
+    folder = tmp_path / "stick"
+    folder.mkdir()
+    out = io.StringIO()
+
+    def open_link():
+        folder.rmdir()
+        return FakeLink([WELL], kind="replay")
+
+    with pytest.raises(SensorFileError, match=r"s\.toml: cannot be written: No such file"):
+        told("--out", folder / "s.toml", link=open_link, out=out)
+    assert "noise:" in out.getvalue() and "kept in" not in out.getvalue()

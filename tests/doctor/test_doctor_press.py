@@ -1,22 +1,15 @@
 """The guided press, by simulated fingers: every way a pad can lie, by itself and over a real pseudo-terminal."""
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
-from bridge_samples import read_until_lost
-from doctor_samples import finger, healthy_counts, visit
+from doctor_samples import finger, visit
 
-from edge.doctor.examine import check_baseline
-from edge.doctor.pad_orientation import Answer, Press, corner_taxel, find_axes, find_order, judge_press, orders, z_sign
+from edge.doctor.pad_orientation import Answer, Press, find_axes, find_order, judge_press, orders, z_sign
 from edge.doctor.press_guide import PATIENCE_S, GuidedPress
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.zeroing.baseline import deformation
 
 AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]
 UPRIGHT = list(range(16))
@@ -51,24 +44,6 @@ def test_every_turn_and_every_axis_is_found(name):
         assert (findings["axis signs"].verdict == "ok") == (not mounting.turns_axes)
 
 
-def test_there_are_eight_ways_and_they_are_all_there_are():
-    assert len(set(orders().values())) == 8
-    for order in orders().values():  # neighbours stay neighbours
-        grid = np.array(order).reshape(4, 4)
-        assert set(np.abs(np.diff(grid, axis=0)).ravel()) | set(np.abs(np.diff(grid, axis=1)).ravel()) == {1, 4}
-
-
-def test_the_dialogue_is_what_a_person_is_told():
-    asked, _ = answer_to(visit(UPRIGHT, False, (1, 1, 1)))
-    assert asked[:5] == [
-        "Press the top left corner with a finger, about as hard as a stiff doorbell, and hold it.",
-        "Still pressing, push towards the middle of the pad.",
-        "Good. Let go.",
-        "Press the top right corner with a finger, about as hard as a stiff doorbell, and hold it.",
-        "Still pressing, push towards the middle of the pad.",
-    ]
-
-
 def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next():
     guide = GuidedPress()
     pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
@@ -89,33 +64,6 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
         ended.skip()
         answer_to([np.zeros((3, 4, 4))] * 25, ended)
     assert ended.done and ended.skip() is None and not ended.answer.presses
-
-
-def test_a_pad_that_is_held_over_eight_real_sensors_on_one_pseudo_terminal():
-    """Each turn with another swap and signs; its order, axes and z come out of CAN frames over a serial line."""
-    ways = [(list(order), *axes) for order, axes in zip(orders().values(), AXES[::2], strict=True)]
-    ways = [(order, swap, (x, y, -z if n == 5 else z)) for n, (order, swap, (x, y, z)) in enumerate(ways)]
-    tracks = []
-    for number, way in enumerate(ways):
-        moved = np.rint(visit(*way, rest=22, hold=35)).astype(np.int32)
-        free = healthy_counts(120, number)
-        noise = healthy_counts(len(moved), number + 100)
-        tracks.append(Track(str(number), np.concatenate([free, noise + moved]), None))
-    recording = Recording(Path("made.csv"), tuple(tracks), 200.0)
-    with (
-        Emulator([recording], controllers=range(8), frame_s=0, jitter_s=0, waits=True) as emulator,
-        SlcanSerialLink(emulator.port) as link,
-    ):
-        scans = read_until_lost(link)
-    for number, way in enumerate(ways):
-        own = [scan for scan in scans if scan.sensor == str(number)]
-        baseline, finding = check_baseline(own[5:115], np.ones(16, dtype=bool), None, 0.0)
-        assert baseline is not None, finding
-        guide = GuidedPress()
-        for scan in own[115:]:
-            guide.push(deformation(scan.counts, baseline), scan.time_ns / 1e9)
-        _, mounting = judged(guide)
-        assert mounting == Mounting(tuple(way[0]), way[1], way[2]), number
 
 
 def press(place, taxel=None, z=4000.0, push=(500.0, 500.0)):
@@ -166,14 +114,6 @@ class TestAnswers:
             assert findings[0].verdict == verdict and words in findings[0].remedy
             assert findings[0].measured == "turned by 270 degrees clockwise"
 
-    def test_corners_by_the_load(self):
-        assert [corner_taxel(finger(place)) for place in USPA44.corners] == list(USPA44.corners)
-        assert [corner_taxel(-finger(place)) for place in USPA44.corners] == list(USPA44.corners)
-        assert corner_taxel(np.zeros((4, 4))) is None
-        middle = np.zeros((4, 4))
-        middle[0, 1:3] = 900
-        assert corner_taxel(middle) is None
-
 
 class TestPerson:
     def test_a_press_in_the_middle_is_asked_for_again(self):
@@ -217,9 +157,4 @@ class TestPerson:
     def test_a_torn_scan_is_not_taken_for_letting_go(self):
         script = visit(UPRIGHT, False, (1, 1, 1), rest=25)
         script[5::7, :, :2] = np.nan
-        assert judged(answer_to(script)[1])[1] == Mounting()
-
-    def test_silent_taxels_count_as_nothing(self):
-        script = visit(UPRIGHT, False, (1, 1, 1))
-        script[:, :, 1, 2] = np.nan
         assert judged(answer_to(script)[1])[1] == Mounting()

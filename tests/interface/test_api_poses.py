@@ -1,14 +1,12 @@
 """Poses through the library: from any thread, to the patterns and into records."""
 
 import json
-import re
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_samples import run, write_recording
-from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan
+from edge_samples import BASELINE, FakeLink, FakeModel, make_scan
 from mcap_samples import arrays_of
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 
@@ -65,9 +63,6 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     ("wrong", "match"),
     [
         ({"x_mm": float("nan")}, "a pose: x_mm is nan, expected a number from"),
-        ({"y_mm": "2"}, "a pose: y_mm is '2', expected a number"),
-        ({"error_mm": -1}, "a pose: error_mm is -1.0, expected a number from 0"),
-        ({"sensor": ""}, "a pose: sensor is '', expected the name of a sensor"),
         ({"time_ns": 10**18}, "a pose: time_ns is .* ahead of now"),
     ],
 )
@@ -128,23 +123,6 @@ def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(posed_records
     assert np.isnan(arrays["poses"][-1, 2:]).all()
 
 
-def test_an_mcap_holds_both_in_the_message_of_a_result(posed_records):
-    from mcap.reader import make_reader
-
-    from edge.sinks.ros2.cdr_messages import RESULT
-
-    made, folder = posed_records
-    with (folder / "out.mcap").open("rb") as file:
-        messages = [
-            RESULT.decode(message.data)
-            for schema, _, message in make_reader(file).iter_messages()
-            if schema.name == RESULT.name
-        ]
-    assert len(messages) == len(made) and np.isnan(messages[0]["pose_x_mm"])
-    assert messages[2]["pose_x_mm"] == pytest.approx(2 / 3) and messages[2]["pose_turn_deg"] == 30
-    np.testing.assert_allclose(json.loads(messages[-1]["record"])["poses"], made[-1].poses, atol=1e-4)
-
-
 def test_the_command_line_takes_the_most_taps(tmp_path):
     write_posed_model(tmp_path / "posed.onnx")
     save_baselines(tmp_path / "zero.json", [BASELINE])
@@ -157,13 +135,3 @@ def test_the_command_line_takes_the_most_taps(tmp_path):
     assert said[-1]["poses"] == [[0] * 5, [0, 0, 5, 0.2, 1], [0, 0, 10, 0.2, 1]]
     done = run("replay", tmp_path / "taps.npz", *fixed, "--taps", "8")
     assert done.returncode == 2 and "taps is 8, but model 'posed' takes 7 at most" in done.stderr
-
-
-def test_the_program_on_the_page_runs(tmp_path, monkeypatch):
-    page = (ROOT / "docs" / "python.md").read_text().partition("## Poses")[2]
-    (program,) = re.findall(r"```python\n(.*?)```", page.partition("\n## ")[0], re.DOTALL)
-    program = program.replace('"slcan:serial=D30BL366"', '"demo"')
-    done = threading.Event()
-    names = {"print": lambda *said: done.set() if isinstance(said[0], PadPose) else None}
-    exec(compile(program, Path("python.md"), "exec"), names)
-    assert done.is_set()

@@ -1,7 +1,6 @@
 """Arrays to patterns in one call, results of two fingers in pairs, and objects that print in a line."""
 
 import weakref
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,16 +8,7 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_scan
 
-import edge
-from edge.api import (
-    Stream,
-    UsageError,
-    infer,
-    load_model,
-    open_recording,
-    open_runtime,
-    paired,
-)
+from edge.api import Stream, UsageError, infer, open_recording, open_runtime, paired
 
 PRESSES = [0] * 5 + [3000] * 5 + [0] * 5
 COUNTS = np.stack([make_scan(number, press_counts=press, noise=3).counts for number, press in enumerate(PRESSES)])
@@ -145,18 +135,3 @@ def test_a_silent_finger_lets_nothing_pile_up():
 def test_a_pair_is_of_two_sensors(sensors):
     with pytest.raises(UsageError, match="expected two or more different names"):
         paired([], sensors)
-
-
-def test_what_is_printed_is_a_line(tmp_path):
-    results = infer(FakeModel(), COUNTS, BASELINE)
-    model = load_model("stsr-small-int8")
-    with open_recording(write_recording(tmp_path / "taps.npz", PRESSES)) as source:
-        runtime = open_runtime(model, source, baselines={"4": BASELINE})
-        stream = Stream(source, runtime)
-        next(iter(stream))
-        said = [repr(one) for one in (source, runtime, stream, model, model.contract, BASELINE, results[7].scan)]
-    assert all("\n" not in text and len(text) < 1500 for text in said)
-    assert repr(results[7]).startswith("<Result of scan 7 of sensor 4, replay: contact, 30")
-    assert "pattern (40, 40) to " in repr(results[7]) and repr(results[0]).endswith(" counts>")
-    assert repr(replace(results[7], trusted=False, untrusted_reason="stuck")).endswith(", not trusted (stuck)>")
-    assert edge.__version__.count(".") == 2

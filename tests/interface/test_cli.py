@@ -1,26 +1,28 @@
-"""`edge-sr` as a user runs it: a process of its own, real pipes, real signals, a real pseudo-terminal."""
+"""`edge-sr` as a user runs it: help, recordings, models, baselines, and refusals."""
 
 import json
-import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_samples import TIMEOUT_S, base_options, files, records, run, start, write_recording
+from cli_samples import TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
-from mcap_samples import arrays_of
 
 from edge import __version__
 from edge.cli import main as cli
 from edge.cli import models_command
 from edge.inference import bundled as bundle
+from firmware_bridge.links import registry as source
+from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.zeroing.baseline import Baseline, save_baselines
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.zeroing.baseline import load_baselines
 
 __all__ = ["files"]
-DEMO_SCANS = 1254
 
 
 def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
@@ -57,13 +59,6 @@ class TestHelp:
         done = run(*command, "--version")
         assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
 
-    def test_help_names_all_there_is(self):
-        text = run("--help").stdout
-        options = "model source sink rate-hz duration-s baseline counts-per-newton contact-on-counts contact-off-counts"
-        words = [f"--{name}" for name in (*options.split(" "), "idle-reset-s", "taps")]
-        for word in (*words, "slcan:/dev/ttyUSB0", "replay:FILE", "demo", "jsonl:-", "mcap:FILE", "models", "reset"):
-            assert word in text
-
     def test_help_loads_no_onnxruntime(self):
         script = (
             "import sys\nfrom edge.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
@@ -92,48 +87,6 @@ class TestReplay:
         assert re.search(r"rate held: (29|30)\.\d Hz \(sensor 4\), 30 Hz asked for", done.stderr)
         assert "p50" in done.stderr and "\x1b" not in done.stderr
 
-    def test_what_was_recorded_replays_as_the_same_scans(self, files, tmp_path):
-        options = [*base_options(files), "--rate-hz", "400"]
-        first = run(*options, "--source", f"replay:{files}/taps.npz", "--sink", f"mcap:{tmp_path}/a.mcap")
-        second = run(*options, "--source", f"replay:{tmp_path}/a.mcap", "--sink", f"mcap:{tmp_path}/b.mcap")
-        assert first.returncode == second.returncode == 0
-        original = load_recording(files / "taps.npz").tracks[0].counts
-        for name in ("a", "b"):
-            np.testing.assert_array_equal(load_recording(tmp_path / f"{name}.mcap").tracks[0].counts, original)
-
-    def test_a_model_that_says_how_sure_it_is_is_recorded(self, files, tmp_path):
-        done = run(
-            "--model", files / "sure.onnx", "--baseline", files / "zero.json", "--source", f"replay:{files}/taps.npz",
-            "--sink", "jsonl:-", "--sink", f"mcap:{tmp_path}/out.mcap",
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        stored = arrays_of(tmp_path / "out.mcap")
-        for row, record in enumerate(records(done.stdout)):
-            if record["pattern"] is None:
-                assert record["deviation"] is record["interval_mm"] is None
-                assert not stored["deviation"][row].any() and np.isnan(stored["interval_mm"][row])
-            else:
-                np.testing.assert_allclose(record["deviation"], stored["deviation"][row], rtol=1e-4)
-                np.testing.assert_allclose(
-                    stored["deviation"][row], 0.01 * (1 + abs(stored["pattern"][row])), atol=1e-6
-                )
-                assert record["interval_mm"] == pytest.approx(stored["interval_mm"][row], abs=1e-5)
-        assert stored["has_pattern"].any()
-
-    def test_newtons_thresholds_and_idle_time_are_heard(self, files):
-        done = run(
-            *base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-",
-            "--counts-per-newton", "1000", "--contact-on-counts", "2999000", "--rate-hz", "30",
-        )  # fmt: skip
-        got = records(done.stdout)
-        assert not any(record["contact"] for record in got)
-        assert got[7]["force_n"] == pytest.approx(3, abs=0.1)
-        assert "30 Hz asked for" in done.stderr
-        done = run(
-            *base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-", "--idle-reset-s", "0.03",
-        )  # fmt: skip
-        assert {record["taps_used"] for record in records(done.stdout)} == {0, 1}
-
     def test_two_sensors_and_several_sinks_at_once(self, files, tmp_path):
         other = write_recording(tmp_path / "other.csv.npz", [0] * 10)
         data = dict(np.load(other))
@@ -146,13 +99,6 @@ class TestReplay:
         assert done.returncode == 0
         assert (tmp_path / "copy.jsonl").read_text() == done.stdout
         assert [len(track.counts) for track in load_recording(tmp_path / "out.mcap").tracks] == [40, 10]
-
-    def test_two_sources_are_named_in_the_records(self, files, tmp_path):
-        sources = ["--source", f"left=replay:{files / 'taps.npz'}", "--source", f"replay:{files / 'rest.npz'}"]
-        done = run("--model", files / "tiny.onnx", *sources, "--rate-hz", 500, "--sink", "jsonl:-")
-        assert done.returncode == 0, done.stderr
-        assert {record["sensor"] for record in records(done.stdout)} == {"left/4", "source2/4"}
-        assert len(records(done.stdout)) == 160
 
     def test_duration_ends_it(self, files, tmp_path):
         slow = write_recording(tmp_path / "slow.npz", [0] * 3, period_ns=10**11)
@@ -180,25 +126,6 @@ class TestReplay:
         assert 1 in after and after.index(1) < 30
         assert process.stderr is not None and "refused: 1 lines or messages were not commands" in process.stderr.read()
 
-    def test_two_files_are_played_together_as_of_one_source(self, files, tmp_path):
-        data = dict(np.load(files / "taps.npz"))
-        np.savez(tmp_path / "other.npz", **(data | {"sensor": np.array(["6"] * 40)}))
-        paths = f"{files}/taps.npz,{tmp_path}/other.npz"
-        done = run("replay", paths, *base_options(files), "--sink", "jsonl:-")
-        assert done.returncode == 0, done.stderr
-        assert sorted(record["sensor"] for record in records(done.stdout)) == ["4"] * 40 + ["6"] * 40
-        assert "sensor 6 has no pattern: not zeroed, " in done.stderr
-
-    def test_a_sensor_of_the_baseline_that_was_not_recorded_has_no_cable(self, files, tmp_path):
-        other = Baseline.of("6", BASELINE.counts, BASELINE.created_unix_s, 100, "file")
-        save_baselines(tmp_path / "two.json", [BASELINE, other])
-        options = ["--model", files / "tiny.onnx", "--baseline", tmp_path / "two.json"]
-        done = run("replay", write_recording(tmp_path / "long.npz", [0] * 80), *options)
-        assert (
-            "no scan from sensor 6 for 0.5 s: the recording has none of it, though there is a baseline" in done.stderr
-        )
-        assert "cable" not in done.stderr
-
 
 class TestModels:
     def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
@@ -224,27 +151,167 @@ class TestModels:
         p50, p99, *figures = row.split()[6:]
         assert 0 < int(p50) <= int(p99) and figures == ["psnr_db", "33.2,", "rmse_percent", "2.1"]
 
-    def test_none_bundled_is_4(self, monkeypatch, capsys, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        assert cli.main(["models"]) == 4
-        assert "no models" in capsys.readouterr().err
-
 
 class TestDemo:
     def test_a_demo_that_ends_before_its_first_tap_says_so(self, files, capsys):
         assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
         assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
 
-    def test_the_demo_scores_its_taps_and_draws_the_last(self, files):
-        done = run("--source", "demo", "--model", files / "tiny.onnx", env=os.environ | {"COLUMNS": "80"})
-        assert done.returncode == 0, done.stderr
-        assert "demo: an emulated sensor taps" in done.stderr and f"EMULATED demo: {DEMO_SCANS} scans" in done.stderr
-        assert "4 of 4 taps scored" in done.stdout
-        rows = re.findall(
-            r"^ +(\d)  0.0  0.0 +(-?\d+) +(\d) +(-?[\d.]+) +([\d.]+) +([\d.]+) +- +(\d+)$", done.stdout, re.MULTILINE
-        )
-        assert [(int(row[0]), int(row[2])) for row in rows] == [(n, n) for n in (1, 2, 3, 4)]
-        angles_deg = [int(row[1]) for row in rows]
-        assert np.diff(angles_deg).tolist() == [-5, -5, -5]
-        assert re.search(r"^taxels, 4 x 4 +not checked, 40 x 40 +truth$", done.stdout, re.MULTILINE)
-        assert "\x1b" not in done.stdout and "@" in done.stdout
+
+@pytest.fixture
+def there(files, tmp_path):
+    """Folder with what the refused commands name."""
+    (tmp_path / "text.onnx").write_text("text")
+    write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
+    (tmp_path / "kept.npz").write_text("old")
+    (tmp_path / "kept.jsonl").write_text("old")
+    (tmp_path / "bad.toml").write_text("format = 1")
+    save_sensor_file(tmp_path / "s.toml", SensorFile("XR1944", sensors={"4": SensorEntry()}))
+    write_recording(tmp_path / "moving.npz", range(0, 2000, 10))
+    return tmp_path
+
+
+KNOWN = "--model {files}/tiny.onnx --baseline {files}/zero.json"
+REST = "--source replay:{files}/rest.npz"
+MAP = "map --source replay:none.npz --out"
+ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
+
+
+@pytest.mark.parametrize(
+    ("code", "typed", "words"),
+    [
+        (2, "--rate-hz 0", ["--rate-hz: '0' is not a positive number"]),
+        (2, "--rate-hz 1e-300", ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
+        (2, "--counts-per-newton 1e8", ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
+        (2, "--duration-s nan", ["--duration-s: 'nan' is not a positive number"]),
+        (2, "--mode x", ["unrecognized arguments: --mode"]),
+        (2, "demo --source gs_usb", ["unrecognized arguments: --source gs_usb"]),
+        (2, "model", ["no command 'model': did you mean models?"]),
+        (2, "press", ["no command 'press': commands are demo, record, replay"]),
+        (2, "models x", ["unrecognized arguments: x", "edge-sr models --help"]),
+        (2, "baseline", ["--out"]),
+        (2, "baseline --out x --scans 29", ["'29' is not a whole number from 30"]),
+        (2, "baseline --out x --source demo --scans 99", ["scans is 99", "from 100"]),
+        (2, "baseline --out x --skip -1", ["--skip"]),
+        (2, "replay --view a.mcap", ["'a.mcap' is not a port", "write FILE or command before it"]),
+        (2, "--view 65536", ["'65536' is not a port: expected 0 to 65535"]),
+        (2, "--source serial:x", ["'serial:x'", "slcan:/dev/ttyUSB0", "replay:FILE", "demo"]),
+        (2, "--source replay:none\nsuch.npz", ["none such.npz"]),
+        (2, "--source replay:none.npz", ["none.npz", "No such file"]),
+        (2, "--source demo --baseline none.json", ["none.json", "No such file"]),
+        (2, "--poses mqtt:x", ["no source of poses 'mqtt:x'"]),
+        (2, "--source demo --sensor {tmp}/bad.toml", ["'format': 1, expected 'tactile-sensor'"]),
+        (2, "--sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
+        (2, "baseline --out x --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
+        (2, "doctor --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
+        (5, f"{MAP} {{tmp}}/kept.npz", ["exists: give another name"]),
+        (2, f"{MAP} {{tmp}}/m.mcap", ["ends in .npz"]),
+        (2, f"{MAP} {{tmp}}/m.npz --png {{tmp}}/m.jpg", ["ends in .png"]),
+        (2, f"{MAP} {{tmp}}/m.npz --size-mm 9000", ["pixels along a side"]),
+        (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
+        (2, f"{MAP} {{tmp}}/m.npz", ["none.npz"]),
+        (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),
+        (3, f"{KNOWN} --source slcan:/dev/null", ["/dev/null"]),
+        (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
+        (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
+        (3, f"{ZERO}{{files}}/taps.npz --skip 1", ["ended before 100 complete scans"]),
+        (4, f"{REST} --model none", ["no model 'none'", "bundled: "]),
+        (4, f"{REST} --model {{tmp}}/text.onnx", ["text.onnx"]),
+        (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
+        (5, f"{KNOWN} {REST} --sink jsonl:{{tmp}}/none/x", ["none/x", "No such file"]),
+    ],
+)
+def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, words, files, there):
+    before = {path.name: path.read_bytes() for path in there.iterdir()}
+    assert_refused(run(*typed.format(files=files, tmp=there).split(" ")), code, *words)
+    assert {path.name: path.read_bytes() for path in there.iterdir()} == before
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["record", "new"], ["replay", "none.npz"]])
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (["--contact-on-counts", "10"], ["on 10", "off 750"]),
+        (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "mcap:FILE"]),
+        (["--sink", "npz:x.npz"], ["record by --sink mcap:x.mcap, then edge-sr convert x.mcap x.npz"]),
+        (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
+        (["--sink", "jsonl:-", "--fields", "x"], ["no field 'x'", "expected time_ns, sensor, "]),
+        (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),
+        (["--sink", "mcap:/dev/full"], ["'mcap:/dev/full'", "a file whose name ends in .mcap"]),
+        (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
+        (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),
+        (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
+    ],
+)
+def test_thresholds_and_sinks_that_cannot_be_are_2_before_anything_is_opened(command, wrong, words):
+    assert_refused(run(*command, "--model", "none", *wrong), 2, *words)
+
+
+@pytest.mark.parametrize("ports", [[], ["/dev/ttyUSB0", "/dev/ttyUSB1"]])
+def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(monkeypatch, capsys, tmp_path, ports):
+    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+    seen = [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
+    monkeypatch.setattr(source, "serial_ports", lambda: [*seen, Port("/dev/ttyS9", None, None, "n/a")])
+    assert cli.main(["--sink", "jsonl:-"]) == 3
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    for word in ("--source demo", "/dev/ttyS9", *ports):
+        assert word in err
+
+
+def test_a_demo_that_is_not_installed_is_2(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+    assert cli.main(["--source", "demo"]) == 2
+    assert "demo.npz is missing" in capsys.readouterr().err
+
+
+def test_a_full_disk_is_5_after_the_summary(files):
+    done = run(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:/dev/full")
+    lines = done.stderr.splitlines()
+    assert done.returncode == 5 and lines[1].startswith("REPLAY")
+    assert lines[-1] == "edge-sr: cannot write records to /dev/full: No space left on device"
+    with Path("/dev/full").open("w") as full:
+        process = start(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:-", stdout=full)
+        assert "cannot write records to stdout: No space left" in process.communicate()[1] and process.returncode == 5
+
+
+def test_a_baseline_is_taken_kept_and_used(files, tmp_path):
+    zero = tmp_path / "zero.json"
+    done = run("baseline", "--source", f"replay:{files}/rest.npz", "--rate-hz", "1000", "--skip", "5", "--out", zero)
+    assert done.returncode == 0 and done.stderr == ""
+    baseline = load_baselines(zero)["4"]
+    assert done.stdout == f"sensor 4: baseline {baseline.id} of 100 scans (REPLAY) -> {zero}\n"
+    assert np.abs(baseline.counts - BASELINE.counts).max() <= 2
+    done = run(
+        "--model", files / "tiny.onnx", "--source", f"replay:{files}/taps.npz",
+        "--baseline", zero, "--sink", "jsonl:-",
+    )  # fmt: skip
+    assert {record["baseline"] for record in records(done.stdout)} == {baseline.id}
+    assert any(record["contact"] for record in records(done.stdout))
+
+
+def test_of_a_recording_a_few_free_scans_are_enough(files, tmp_path):
+    begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
+    done = run(
+        "baseline", "--source", f"replay:{begins_in_contact}", "--rate-hz", "1000", "--out", tmp_path / "zero.json",
+        "--skip", "50", "--scans", "40",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert load_baselines(tmp_path / "zero.json")["4"].scans == 40
+    done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", tmp_path / "free.json")
+    assert "sensor 4: zeroed from its scans 5" in done.stderr
+    assert done.stderr.count("where the pad is still and pressed least\n") == 1
+    free, zero = (load_baselines(tmp_path / f"{name}.json")["4"] for name in ("free", "zero"))
+    assert np.abs(free.counts - zero.counts).max() < 5
+
+
+def test_a_recording_that_hardly_changes_may_be_of_a_held_pad(tmp_path):
+    """Nothing in it shows that the pad is free, so that is not stated."""
+    for begins, why in (
+        ([400] * 60, " to be believed: baseline in doubt: taken from this recording"),
+        ([], ": no contact: its readings never reached"),
+    ):
+        held = write_recording(tmp_path / "held.npz", [*begins, *[0] * 110])
+        done = run("replay", held)
+        assert "Its readings hardly change: is the pad free, or held? If it holds something all" in done.stderr
+        assert f"sensor 4 has no pattern{why}" in done.stderr

@@ -4,18 +4,16 @@ import json
 
 import numpy as np
 import pytest
-from cli_samples import assert_refused, records, run, write_recording
+from cli_samples import records, run, write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
 
 from edge.api import Stream, open_recording, open_runtime, open_source
 from edge.cli.run_options import parser
 from edge.doctor.write_sensor_file import keep
 from edge.errors import UsageError
-from edge.perception.runtime import Runtime
-from edge.perception.taxel_health import TaxelWatch
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import references, settled
-from firmware_bridge.errors import RecordingError, SensorFileError
+from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -117,25 +115,12 @@ def test_what_is_asked_for_goes_before_the_file_but_for_another_id_map(file, pre
         open_source(pressed, id_map="C")
 
 
-@pytest.mark.parametrize("command", [[], ["baseline", "--out", "x"], ["doctor"]])
-def test_every_command_goes_by_the_file(command, file):
-    assert_refused(run(*command, "--sensor", file, "--id-map", "A"), 2, "is of a XR1944")
-
-
 def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(file, tmp_path):
     newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
     save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
     for arguments, expected in (([], BASELINE), (["--baseline", str(tmp_path / "zero.json")], newer)):
         options = parser("doctor").parse_args(["--sensor", str(file), *arguments])
         assert references(options.baseline, settled(options.sensor, None))["4"].id == expected.id
-
-
-def test_a_file_that_cannot_be_used_is_2(tmp_path):
-    (tmp_path / "s.toml").write_text("format = 1")
-    done = run("--sensor", tmp_path / "s.toml", "--source", "demo")
-    assert_refused(done, 2, "'format': 1, expected 'tactile-sensor'")
-    with pytest.raises(SensorFileError):
-        open_source("demo", sensor=tmp_path / "none.toml")
 
 
 def turned_rest():
@@ -154,33 +139,6 @@ def test_a_run_goes_by_it(tmp_path):
     assert [record["contact"] for record in made] == [False] * 5 + [True] * 5
     assert made[-1]["force_n"] == pytest.approx(2.0, abs=0.1) and made[-1]["counts"][2][1][1] < REST[2, 1, 1]
     assert made[-1]["baseline"] == BASELINE.id and json.dumps(made[-1]["dead"]) == "{}"
-
-
-@pytest.mark.parametrize("press_counts", [900, 3000, 9000])
-def test_taxels_are_judged_by_the_axes_of_the_pad(press_counts):
-    """Uncorrected, a z that falls by so much is what no contact makes, and the taxel is taken for dead."""
-    mounting = Mounting(signs=(1, 1, -1))
-    scans = [make_scan(n, press_counts=-press_counts if n > 5 else 0, noise=3) for n in range(60)]
-    for scan in scans:
-        scan.counts.setflags(write=True)
-        scan.counts[2][scan.number % 2 :: 2] -= press_counts // 4 if scan.number > 5 else 0
-    corrected, plain = TaxelWatch((4, 4), mounting), TaxelWatch((4, 4))
-    for scan in scans:
-        zeroed = corrected.push(scan, BASELINE)
-        raw = plain.push(scan, BASELINE)
-    assert np.allclose(zeroed, mounting.correct(raw)) and not corrected.reasons
-    assert bool(plain.reasons) == (press_counts > 2800)
-
-
-def test_forces_are_those_of_each_sensor():
-    runtime = Runtime(
-        FakeModel(),
-        source="device",
-        baselines={name: Baseline.of(name, REST, 1000.0, 100, "file") for name in "46"},
-        counts_per_newton={"4": 1000.0},
-    )
-    assert runtime.push(make_scan(press_counts=3000)).force_n == pytest.approx(3.0)
-    assert runtime.push(make_scan(press_counts=3000, sensor="6")).force_n is None
 
 
 def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):

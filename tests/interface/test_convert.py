@@ -162,15 +162,6 @@ def test_files_of_version_0_1_are_read(tmp_path):
         assert same_scan(other, one)
 
 
-def test_a_recording_that_breaks_off_gives_what_is_whole_with_a_note(made, tmp_path, capsys):
-    whole = made[0].read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
-    code = convert(tmp_path / "cut.mcap", tmp_path / "cut.npz")
-    err = capsys.readouterr().err
-    assert (code, "breaks off" in err) in ((0, True), (2, True)), err
-    assert (tmp_path / "cut.npz").exists() == (code == 0)
-
-
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [

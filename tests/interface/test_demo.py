@@ -1,11 +1,10 @@
 import dataclasses
-import re
 from itertools import pairwise, takewhile
 
 import cli_samples
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
+from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
@@ -13,7 +12,7 @@ from edge.api import load_model
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.cli.demo_scenes import SLIDE, DemoScenes
-from edge.cli.demo_score import DemoScore, score_picture, score_table
+from edge.cli.demo_score import DemoScore, score_table
 from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.inference.bundled import POSED_MODEL, demo_recording
@@ -87,11 +86,6 @@ def test_a_lost_scan_shifts_nothing(recording):
     assert gappy[0].result.scan.number != whole[0].result.scan.number
 
 
-def test_without_a_pattern_at_the_peak_the_next_strongest_counts(recording):
-    first, _ = play(recording, overtaken=(3,)).scores()
-    np.testing.assert_allclose(first.truth.max(), 2 / 8)
-
-
 def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
     model, score = FakeModel(), None
     score, runtime = DemoScore(recording, model), Runtime(model, source="emulated", baselines={"4": BASELINE})
@@ -108,26 +102,6 @@ def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(rec
     )
     assert second.alone_percent == pytest.approx(float(rmse_percent(alone, second.truth, 2.0)))
     assert second.alone_percent != second.rmse_percent and first.alone_percent == first.rmse_percent
-
-
-def test_a_tap_without_any_pattern_has_no_score(recording):
-    assert [score.pose for score in play(recording, lost=(2, 3, 4)).scores()] == [(0, 0, -5)]
-    assert play(recording, lost=range(9)).scores() == []
-
-
-def test_when_the_last_tap_is_over_it_says_so_once_and_a_second_pass_changes_nothing(recording):
-    told = []
-    score = DemoScore(
-        recording, FakeModel(), lambda score: told.append([one.result.scan.number for one in score.scores()])
-    )
-    runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
-    series = ScanSeries("4", USPA44)
-    with np.load(recording) as data:
-        for index, counts in enumerate([*data["counts"]] * 2):
-            assert score.complete == (index >= len(PRESSES))
-            score.write(runtime.push(series.close(counts.copy(), index * 10_000_000)), {})
-    assert told == [[3, 7]]
-    assert [one.result.scan.number for one in score.scores()] == [3, 7]
 
 
 def told_of_scenes(results, path):
@@ -189,44 +163,19 @@ def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
     assert max(used[scene == 1]) == 1
 
 
-def test_rest_and_foreign_scans_are_not_scored(recording):
-    score = DemoScore(recording, FakeModel())
-    runtime = Runtime(FakeModel(), source="emulated", baselines={"4": BASELINE})
-    score.write(runtime.push(make_scan(0, press_counts=9999)), {})
-    assert score.scores() == []
-
-
 def test_the_table_has_a_line_a_tap_and_says_what_the_taps_are_worth(recording):
     scores = [
         dataclasses.replace(s, psnr_db=-12.301, rmse_percent=99.99, alone_percent=88.88, pose=(-7.05, 2.35, -15))
         for s in play(recording).scores()
     ]
-    scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, run_time_us=321.4))
     *lines, verdict = score_table(scores).splitlines()
     assert len(lines) == 2 + 2 and max(map(len, lines)) <= 50
-    assert lines[2].split() == ["1", "-7.0", "2.4", "-15", "1", "-12.30", "99.99", "88.88", "-", "321"]
     assert "did not fall: 99.99 % of full scale, 88.88 % with it alone" in verdict and "rose" not in verdict
-    scores[0] = dataclasses.replace(scores[0], result=dataclasses.replace(scores[0].result, interval_mm=0.1234))
     scores[1] = dataclasses.replace(scores[1], rmse_percent=88, alone_percent=99)
-    *lines, verdict = score_table(scores).splitlines()
-    assert max(map(len, lines)) <= 50 and lines[2].split()[-2:] == ["123", "321"]
-    assert lines[0].index("+-") + 1 == lines[1].rindex("um") + 1 == lines[2].index("123", 40) + 2
-    assert "error fell: 88.00" in verdict
+    assert "error fell: 88.00" in score_table(scores)
     scores[1] = dataclasses.replace(scores[1], rmse_percent=99.995)
     assert "rose at tap 2" in score_table(scores)
     assert score_table(scores[:1]).splitlines()[-1].startswith("Each pattern is of one tap")
-
-
-def test_the_picture_shows_taxels_result_and_truth_on_their_scales(recording):
-    score = play(recording).scores()[0]
-    text = score_picture(score, 80, "plain")
-    title, *_, scale = text.splitlines()
-    assert title.split("  ")[0] == "taxels, 4 x 4" and "not checked, 40 x 40" in title and title.endswith("truth")
-    assert scale.count(f" {score.result.pattern.max():.3g} mm") == 2 and "counts" in scale
-    louder = score_picture(dataclasses.replace(score, truth=score.truth * 100), 80, "plain")
-    assert louder.splitlines()[-1].count(f" {score.truth.max() * 100:.3g} mm") == 2
-    taxels_z = score.result.scan.counts[2] - REST[2]
-    assert f" {taxels_z.max():.0f} counts" in scale
 
 
 def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(monkeypatch, capfd):
@@ -335,15 +284,9 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
             assert after.used[-1] == before.used[-1] + 1, (taps, done.stderr)
     undisturbed = taps[-1].breaks == 0 and all(tap.used for tap in taps)
     assert compared == 3 or (compared and not undisturbed), (taps, done.stderr)
-    row = r"^ +\d +(-?[\d.]+) +(-?[\d.]+) +(-?\d+) +(\d) "
-    table = [tuple(map(float, one)) for one in re.findall(row, done.stderr, re.MULTILINE)]
-    assert f"{len(table)} of 4 taps scored" in done.stderr, done.stderr
     if undisturbed:
         assert taps[0].place == (0, 0, 0) and len({tap.place for tap in taps}) == 4, taps
-        np.testing.assert_allclose(table, [(*tap.place, n) for n, tap in enumerate(taps, 1)], atol=0.051)
-    for *place, used in table:
-        (tap,) = [one for one in taps if one.place == pytest.approx(place, abs=0.051)]
-        assert used in tap.used
+        assert "4 of 4 taps scored" in done.stderr
     sliding = [one["pose"] for one in results[-250:] if one["pose"]]  # where the machine stands still poses are lost
     assert len({pose["x_mm"] for pose in sliding}) > 100 and "map of a letter of 50 mm" in done.stderr
 
@@ -370,9 +313,3 @@ def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(mo
     monkeypatch.setattr(cli, "_open_source", ask)
     monkeypatch.setattr(cli, "_exit_code", lambda error: str(error))
     assert cli.main(arguments) == source
-
-
-def test_the_demo_takes_no_other_source(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(["demo", "--source", "gs_usb"])
-    assert "unrecognized arguments: --source gs_usb" in capsys.readouterr().err

@@ -1,18 +1,26 @@
+"""Devices that are plugged in, and advice for a port that gives no scan: real ports on which something else speaks."""
+
 import json
 import os
+import pty
+import re
 import subprocess
+import threading
+import tty
 from pathlib import Path
 
 import pytest
 
 from edge.cli import main as cli
-from edge.cli.devices_command import NOTHING, SERVER_HINT, page
+from edge.cli.devices_command import NOTHING, SERVER_HINT
+from edge.pipeline.silence_hint import silence_hint
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import gs_usb_devices
 from firmware_bridge.links.discovery import Found, can_interfaces, serial_devices
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice
 from firmware_bridge.links.serial_ports import Port
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus", "USB-CAN Plus", "VScom")
 GRIPPER = Port("/dev/ttyUSB1", (0x0403, 0x6015), "GRIP1", "FT231X USB UART", "FT231X USB UART", "FTDI")
@@ -36,14 +44,7 @@ def roots(tmp_path):
 def test_serial_ports_and_what_to_write_for_them(roots):
     vscom, gripper, built_in = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
     assert vscom == Found(
-        "serial",
-        "/dev/ttyUSB0",
-        "0403:6015",
-        "D30BL366",
-        "VScom USB-CAN Plus",
-        True,
-        "slcan:serial=D30BL366",
-        (),
+        "serial", "/dev/ttyUSB0", "0403:6015", "D30BL366", "VScom USB-CAN Plus", True, "slcan:serial=D30BL366", ()
     )
     assert (gripper.adapter, gripper.looks_like) == (False, "FT231X USB UART by FTDI: no known adapter")
     assert (built_in.usb_id, built_in.source, built_in.looks_like) == (
@@ -134,14 +135,14 @@ def test_can_interfaces(roots):
         ("Option is unknown", None),
     ],
 )
-def test_the_bitrate_is_asked_of_ip(tmp_path, monkeypatch, says, bitrate):
+def test_the_bitrate_is_asked_of_ip(roots, tmp_path, monkeypatch, says, bitrate):
     program = write(tmp_path / "ip", f"#!/bin/sh\n[ \"$*\" = '-json -details link show can0' ] && echo '{says}'\n")
     program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert devices._bitrate_hz("can0") == bitrate
-    assert devices._bitrate_hz("can1") is None  # it fails
-    monkeypatch.setenv("PATH", "")
-    assert devices._bitrate_hz("can0") is None
+    interface(roots[0], "can0", up=True)
+    for path, known in ((f"{tmp_path}:{os.environ['PATH']}", bitrate), ("", None)):
+        monkeypatch.setenv("PATH", path)
+        (found,) = can_interfaces(roots[0])
+        assert found.problems == (() if known is None else (f"runs at {known} bit/s, the sensor at 1000000",))
 
 
 @pytest.fixture
@@ -213,10 +214,6 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, capsys, monkeypatch):
     ]
 
 
-def test_a_page_of_nothing():
-    assert page([], ["a note"], 200) == ["a note", SERVER_HINT]
-
-
 def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):
     """All but what is to be typed, which is one line, and whole."""
     by_path = "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"
@@ -228,3 +225,80 @@ def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):
     assert f"  --source slcan:{by_path}" in lines and by_path in lines
     assert [line for line in lines if len(line) > 40 and by_path not in line] == []
     assert "  ! " in "".join(lines) and SERVER_HINT in " ".join(lines)
+
+
+ELSE = "bytes came, and no CAN frame in them: "
+CAN = (b"t1238AABBCCDDEEFF0011\r", b"t4008AABBCCDDEEFF0011\r")
+
+
+def gps(port, over):
+    while not over.wait(0.01):
+        os.write(port, b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+
+
+def another_speed(port, over):
+    while not over.wait(0.01):
+        os.write(port, bytes(range(0, 256, 5)) + b"\r")
+
+
+def line_feeds(port, over):
+    while not over.wait(0.01):
+        os.write(port, b"12.25\t-3.25\t41.25\t0.25\t-17.25\n")
+
+
+def motors(port, over):
+    while not over.wait(0.01):
+        os.write(port, CAN[0])
+
+
+@pytest.mark.parametrize(
+    ("speaks", "words"),
+    [
+        (gps, f"{ELSE}text of another device"),
+        (line_feeds, f"{ELSE}no line that ends as an adapter's: another device, such as one whose lines end with LF"),
+        (another_speed, f"{ELSE}no text: another line speed"),
+        (motors, "CAN frames came, and "),
+    ],
+)
+def test_what_is_wrong_is_read_from_what_came(speaks, words):
+    leader, follower = pty.openpty()
+    tty.setraw(follower)
+    over, name = threading.Event(), os.ttyname(follower)
+    speaker = threading.Thread(target=speaks, args=(leader, over))
+    speaker.start()
+    try:
+        link = SlcanSerialLink(name)
+        for _ in range(2):  # as a run does while no scan comes
+            with link:
+                for _ in range(4):
+                    assert link.read(0.01) == []
+        hint = silence_hint([f"slcan:{name}"], link.counters)
+    finally:
+        over.set()
+        os.write(follower, b"\r")
+        speaker.join()
+        os.close(leader), os.close(follower)
+    assert words in hint
+    assert f"edge-sr doctor --source slcan:{name}" in hint or "edge-sr devices" in hint
+
+
+@pytest.mark.parametrize(
+    ("counters", "words"),
+    [
+        (
+            {"messages": 30, "without_readings": 29, "welcomes": 1},
+            "30 messages came from the server, and no reading in them: they name no sensor",
+        ),
+        ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
+        ({"messages": 9, "bad_json": 9, "received_bytes": 99}, "they are no JSON: another server"),
+        ({"messages": 1, "welcomes": 1}, "the server only greets"),
+        ({"messages": 5}, "no whole scan in them"),
+        ({"received_bytes": 12, "replies": 4}, "12 bytes came, the adapter's answers alone: is the sensor powered"),
+        ({"received_bytes": 12, "refusals": 3}, "the adapter refused 3 commands"),
+        ({"frames": 0, "error_frames": 7}, "7 error frames .* another bitrate"),
+        ({"frames": 90, "foreign": 90}, "90 CAN frames came, and none of a taxel"),
+    ],
+)
+def test_what_came_goes_before_advice(counters, words):
+    hint = silence_hint(["xela-server:robot"], lambda: counters)
+    assert re.search(words, hint) and "edge-sr doctor --source xela-server:robot" in hint

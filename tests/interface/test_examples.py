@@ -197,12 +197,6 @@ def test_the_gripper_neither_begins_nor_goes_on_by_a_reading_that_is_no_ground(a
     assert gripper.done == ["close", "stop"] and words in grip.why and not grip.reached
 
 
-def test_a_pad_that_is_touched_already_is_not_closed_further(at_once):
-    grip, gripper = grip_of(at_once)
-    grip.follow(reading("contact", area_mm2=50.0))
-    assert gripper.done == [] and not grip.reached
-
-
 def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     grip, gripper = grip_of(stop_on_area, oldest_ms=20_000)
     grip.follow(reading(sensor="left", age_ms=1000))
@@ -219,15 +213,16 @@ def test_it_begins_when_every_sensor_is_free_and_any_one_stops_it(stop_on_area):
     assert gripper.done == ["close", "stop"] and grip.reached
 
 
-def test_a_sensor_that_falls_silent_stops_it_though_the_other_is_heard(at_once):
+def test_a_sensor_that_falls_silent_stops_it_though_the_other_is_heard(at_once, monkeypatch):
     grip, gripper = grip_of(at_once, oldest_ms=2000)
     for age_ms in (1000, 900):
         for sensor in ("left", "right"):
             grip.follow(reading(sensor=sensor, age_ms=age_ms))
     assert gripper.done == ["close"]
-    grip._oldest_ms = 500
+    later_ns = time.monotonic_ns() + 3 * 10**9
+    monkeypatch.setattr(time, "monotonic_ns", lambda: later_ns)
     grip.follow(reading(sensor="left"))
-    assert gripper.done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 9")
+    assert gripper.done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 3")
 
 
 def test_of_several_sensors_one_alone_may_be_gone_by(at_once):
@@ -244,12 +239,6 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
     with Source(Live([[make_scan(n)] for n in range(10)]), sensor_file=SensorFile(sensors=known)) as source:
         grip.run(source, FakeModel(), 60)
     assert set(gripper.done) == {"stop"} and grip.why.startswith("it never began: ")
-
-
-def test_while_nothing_was_heard_it_says_so(at_once):
-    grip, gripper = grip_of(at_once)
-    grip._mind_silence()
-    assert gripper.done == [] and grip.why == "it never began: no scan arrived"
 
 
 @pytest.mark.parametrize("limit", ["--area-mm2", "--most-counts", "--oldest-ms", "--duration-s"])
@@ -299,6 +288,7 @@ def test_the_gripper_stands_still_however_it_ends(at_once, settings, words):
     assert gripper.done[0] == "close" and gripper.done[1:] and set(gripper.done[1:]) == {"stop"}
 
 
+@pytest.mark.night
 def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     trimesh.creation.icosphere(radius=6, subdivisions=3).export(tmp_path / "ball.stl")
     tiny = ("--sequences", 4, "--figures", 2, "--steps", 2)

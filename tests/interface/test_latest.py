@@ -1,4 +1,4 @@
-"""The newest result of a stream: never an old one as if it were new, nothing that piles up, nothing that waits."""
+"""The newest result of a stream, never an old one as if it were new, and names of sensors that do not exist."""
 
 import asyncio
 import itertools
@@ -10,18 +10,22 @@ from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_sca
 
 from edge.api import (
     Baseline,
+    Commands,
     Event,
     LinkLostError,
     NoResultError,
+    PadPose,
     Stream,
     UsageError,
     open_runtime,
-    open_source,
+    paired,
     take_baselines,
 )
+from edge.pipeline.commands import Command
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
+from firmware_bridge.poses.timed_pose import TimedPose
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
 
@@ -236,21 +240,6 @@ def test_a_source_has_one_stream_at_a_time():
             assert list(stream_of(source, duration_s=1e-6)) == []
 
 
-def test_a_loop_that_is_closed_while_a_task_waits_ends_nothing():
-    link = StagedLink(scans(0), scans(1))
-    with Source(link) as source:
-        stream = stream_of(source)
-        for _ in range(2):
-            loop = asyncio.new_event_loop()
-            task = loop.create_task(source.wait_async(1000))
-            loop.run_until_complete(asyncio.sleep(0))
-            loop.close()
-            assert not task.done()
-        for stage in range(2):
-            link.let(stage)
-            assert stream.read().result.scan.number == stage
-
-
 def test_a_recording_at_the_speed_of_its_reader_has_no_latest(tmp_path):
     class Patient(FakeLink):
         patient = True
@@ -325,20 +314,6 @@ def test_a_task_that_is_cancelled_loses_no_result(way, when):
     assert asyncio.run(main()) == [0, 1]
 
 
-def test_a_task_wakes_as_soon_as_scans_wait():
-    async def main():
-        link = StagedLink(scans(0), endless=True)
-        with Source(link) as source:
-            waiting = asyncio.create_task(source.wait_async(1000))
-            await asyncio.sleep(0)
-            link.gates[0].set()
-            await asyncio.wait_for(waiting, 10)
-            await asyncio.wait_for(source.wait_async(1000), 10)  # they still wait
-            assert [scan.number for scan in source.take(0)] == [0]
-
-    asyncio.run(main())
-
-
 def test_asyncio_is_told_of_errors_and_of_time():
     async def main():
         with Source(FakeLink([scans(0)], error=LinkLostError("gone"))) as source:
@@ -355,14 +330,42 @@ def test_asyncio_is_told_of_errors_and_of_time():
     assert asyncio.run(main()) == threading.active_count()
 
 
-def test_the_demo_is_followed_beside_other_tasks():
-    async def main():
-        source = open_source("demo", rate_hz=1000).open()
-        try:
-            stream = Stream(source, open_runtime(FakeModel(), source))
-            return [(await stream.read_async()).result.scan.number for _ in range(5)]
-        finally:
-            source.close()
+def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
+    """A sensor may still come before; one of another link, or with a baseline, at any time."""
+    left = StagedLink(scans(0), scans(*range(1, 20)), endless=True)
+    right = StagedLink(scans(0), endless=True)
+    with Source(LastingLink(left, None, name="a"), LastingLink(right, None, name="b")) as source:
+        stream = Stream(source, open_runtime(FakeModel(), source, baselines={"a/8": BASELINE}))
+        with pytest.raises(UsageError, match=r"^no sensor '4': the names begin with a/, b/$"):
+            stream.latest("4")
+        left.let(0)
+        assert stream.latest("a/5").result is stream.latest("b/5").result is None
+        left.let(1)
+        for call in (stream.latest, stream.read, lambda name: stream.pose(0, 0, sensor=name)):
+            with pytest.raises(UsageError, match=r"^no sensor 'a/5': sensors are a/4$"):
+                call("a/5")
+        for name in ("a/8", "b/4", "b/5"):
+            assert stream.latest(name).result is None
+        right.let(0)
+        with pytest.raises(UsageError, match="no sensor 'a/5'"):
+            next(paired(stream, ["a/4", "a/5"]))
 
-    numbers = asyncio.run(main())
-    assert numbers == sorted(set(numbers))
+
+def test_a_command_for_a_sensor_waits_until_it_is_known_whether_there_is_one():
+    link, commands, sink = StagedLink(scans(0), scans(*range(1, 20)), scans(20), endless=True), Commands(), ListSink()
+    with Source(link) as source:
+        stream = stream_of(source, commands=commands, sinks=[sink])
+        commands.put(Command("zero", "9"))
+        commands.refuse("a line is refused")
+        texts = []
+        for stage in range(3):
+            commands.poses.put(TimedPose(PadPose(0, 0), 10**9 + stage, "9"))
+            stream.latest()
+            link.let(stage)
+            stream.latest()
+            texts.append([event.text for event in sink.events])
+            texts[-1] += [event.text for result in sink.results for event in result.events]
+    assert "a line is refused" in texts[0] and not [text for text in texts[0] if "no sensor" in text]
+    assert {"zeroing refused: no sensor 9, there are 4", "a pose is refused: no sensor '9': sensors are 4"} < {
+        *texts[-1]
+    }

@@ -4,6 +4,9 @@ import importlib
 import importlib.util
 import json
 import os
+import re
+import runpy
+import shlex
 import subprocess
 import sys
 import time
@@ -16,6 +19,7 @@ from edge_samples import ROOT, make_contract, make_wrench_result
 
 from edge.api import demo_recording, load_model
 
+README = ROOT / "README.md"
 PACKAGE = ROOT / "examples/lerobot_camera_tactile_sr"
 REAL = importlib.util.find_spec("lerobot") is not None
 
@@ -47,11 +51,6 @@ def camera_of(plugin, **settings):
     config = plugin.TactileSrCameraConfig(**settings)
     assert config.type == "tactile_sr"
     return make_cameras_from_configs({"tactile": config})["tactile"]
-
-
-def test_the_package_is_called_as_the_discovery_wants(plugin):
-    text = (PACKAGE / "pyproject.toml").read_text()
-    assert 'name = "lerobot_camera_tactile_sr"' in text and importlib.util.find_spec(plugin.__name__) is not None
 
 
 def test_it_reads_an_emulated_sensor_as_a_robot_reads_its_cameras(plugin):
@@ -180,3 +179,12 @@ def test_lerobot_loads_the_dataset_that_it_was_given(plugin, tmp_path):
     assert images.shape[1:] == (3, 40, 40) and images[:, 0].max() > 0.4
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["features"]["observation.state"]["dtype"] == "float32"
+
+
+def test_the_example_observes_by_the_command_of_the_readme(plugin, monkeypatch, capsys):
+    (line,) = re.findall(r"^ *(python examples/lerobot_camera_tactile_sr/observe\.py .*)$", README.read_text(), re.M)
+    words = shlex.split(line, comments=True)[1:]
+    monkeypatch.setattr(sys, "argv", words)
+    runpy.run_path(str(ROOT / words[0]), run_name="__main__")
+    image = r"observation\.images\.tactile: \(40, 40, 3\) uint8, .*"
+    assert re.match(image + r"\nobservation\.state: \d+ numbers, .*", capsys.readouterr().out)

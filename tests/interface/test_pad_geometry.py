@@ -12,11 +12,8 @@ from edge import api
 from edge.doctor.link_checks import check_id_map
 from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders
 from edge.errors import ModelError, UsageError
-from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, widening
 from edge.perception.runtime import Runtime
-from edge.perception.tap_tracker import TapTracker
 from edge.pipeline.result_stream import Stream
-from edge.view.frames import hello
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
@@ -121,19 +118,6 @@ def test_a_recording_is_played_as_the_pad_it_is_of(folder, model, form):
     assert "\n" not in line and "a uSPa44 of 4 x 4 taxels, the sensor is a uSPa46 of 4 x 6" in line
 
 
-def test_shared_memory_and_page_follow(model, folder):
-    from edge.sinks.shm import Layout, SharedMemorySink
-
-    layout = Layout(4, 6, 40, 60, (3, 8, 12))
-    assert layout.maps["counts"][1] == (3, 4, 6) and layout.maps["pattern"][1] == (40, 60)
-    name = f"pad46-test-{id(layout)}"
-    sink = SharedMemorySink(name, CONTRACT)
-    try:
-        sink.write(folder[1][-1], {})
-    finally:
-        sink.close()
-
-
 def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
     """Six by six, which no release knows: a geometry, its id map, a model."""
     pad = SensorGeometry("mine", rows=6, cols=6, pitch_mm=3.0, width_mm=18.0, height_mm=18.0)
@@ -221,28 +205,3 @@ def test_the_larger_pad_is_what_speaks_where_the_smaller_ones_ids_are_among_its_
     assert finding is not None and finding.verdict == "wrong" and finding.remedy == "--id-map uSPa46"
     finding = check_id_map(ids, USPA46_MAP, half_silent=False)
     assert finding is not None and finding.verdict == "ok"
-
-
-def test_dead_taxels_are_filled_in_on_any_grid_and_doubted_by_their_share():
-    estimator = TaxelEstimator(np.eye(72)[None] + 0.5, (4, 6))
-    dead = np.zeros((4, 6), dtype=bool)
-    dead[1, 2] = True
-    filled = estimator.filler(dead)(np.full((3, 4, 6), 100, dtype=np.float32))
-    assert np.isfinite(filled.counts).all() and 50 < filled.counts[2, 1, 2] < 110
-    assert [widening(count / 16) for count in range(9)] == list(WIDENING)
-    assert widening(12 / 24) == WIDENING[8] and widening(1 / 24) == WIDENING[1]
-
-
-def test_taps_are_tracked_on_any_grid():
-    tracker = TapTracker(2, grid_shape=(4, 6))
-    assert tracker.push(np.full((3, 4, 6), 200, dtype=np.float32), 0).window.shape == (2, 3, 4, 6)
-
-
-def test_the_page_is_told_the_grid():
-    from types import SimpleNamespace
-
-    run = SimpleNamespace(contract=CONTRACT, id="1", name="a", kind="device", model="m")
-    frame = hello(run, None)
-    told = json.loads(frame[frame.index(b"{") :])
-    assert (told["rows"], told["cols"], told["height"], told["width"]) == (4, 6, 40, 60)
-    assert told["pixel_pitch_mm"] == 0.725

@@ -1,26 +1,27 @@
-"""Poses on stdin: lines, the bounded queue, the way into a real runtime, and a whole `edge-sr`."""
+"""Poses on stdin: lines, the bounded queue, the way into a real runtime and a whole `edge-sr`; and maps of them."""
 
 import json
 import os
+import signal
 import subprocess
 import threading
 import time
 
+import numpy as np
 import pytest
-from cli_samples import base_options, files, records, start, wait_for, write_recording
+from cli_samples import base_options, files, records, run, start, wait_for, write_recording
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from pose_samples import make_posed_contract
 
+from edge.api import MapSink, ObjectMap, Stream, open_recording, open_runtime
+from edge.mapping.map_files import check_npz
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
-from edge.pipeline.loop import Loop
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
 from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
 from edge.pipeline.pump import pump
-from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
-from firmware_bridge.links.base import Link
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS
@@ -92,10 +93,9 @@ class TestLines:
         lines = CommandLines(commands, read_end)
         before_ns = time.monotonic_ns()
         os.write(write_end, b'{"cmd": "pose", "x_mm": 1, "y_mm": 2}\n')
-        wait_for(lambda: len(commands.poses._waiting) == 1)  # nobody polls: its own thread reads
-        after_ns = time.monotonic_ns()
-        (pose,) = commands.poses.take()
-        assert before_ns <= pose.time_ns <= after_ns
+        poses = []
+        wait_for(lambda: poses.extend(commands.poses.take()) or poses)  # nobody polls: its own thread reads
+        assert before_ns <= poses[0].time_ns <= time.monotonic_ns()
         lines.close()
         os.close(write_end)
         os.close(read_end)
@@ -115,25 +115,6 @@ class TestQueue:
         assert [one.time_ns for one in queue.take()] == list(range(10, WAITING_POSES + 10))
         assert queue.dropped == 10 and queue.take() == []
 
-    def test_poses_of_many_threads_are_each_taken_or_counted(self):
-        queue, taken = PoseQueue(), []
-
-        def put(name):
-            for number in range(2000):
-                queue.put(TimedPose(PadPose(0, 0), number, name))
-                queue.put_fields({}, 0)
-
-        threads = [threading.Thread(target=put, args=(name,)) for name in "abc"]
-        for thread in threads:
-            thread.start()
-        while any(thread.is_alive() for thread in threads):
-            taken += queue.take()
-        taken += queue.take()
-        assert len(taken) + queue.dropped == queue.refused == 6000
-        for name in "abc":
-            mine = [one.time_ns for one in taken if one.sensor == name]
-            assert mine == sorted(mine)
-
 
 def make_runtime():
     return Runtime(FakeModel(make_posed_contract()), source="device", baselines={"4": BASELINE})
@@ -144,19 +125,6 @@ def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
 
 
 class TestIntake:
-    def test_the_runtime_gets_them_and_the_first_scan_after_them_is_kept(self):
-        runtime, queue = make_runtime(), PoseQueue()
-        intake = PoseIntake(runtime, queue)
-        for one in (pose(5, 1.0), pose(7, 2.0, "4")):
-            queue.put(one)
-        assert [one.used_from_ns for one in intake.take([pose(6, 3.0, "6")], 20, 30)] == [20, 20, 20]
-        queue.put(pose(8, 4.0))
-        assert [one.used_from_ns for one in intake.take([], None, 40)] == [40]
-        tracks = runtime._tracks
-        assert {name: len(track) for name, track in tracks.items()} == {None: 2, "4": 1, "6": 1}
-        assert tracks["4"].at(7).x_mm == 2.0
-        assert (intake.used, intake.refused, intake.dropped) == (4, 0, 0)
-
     def test_a_pose_out_of_order_is_refused_with_one_line_for_many(self):
         queue = PoseQueue()
         intake = PoseIntake(make_runtime(), queue)
@@ -242,15 +210,6 @@ def test_poses_come_to_the_sinks_before_the_scans_that_they_serve():
     assert "poses: 1 received, 1 used, 0 refused, 0 dropped" in statistics.summary(source="fake")
 
 
-def test_a_run_without_poses_asks_for_none(monkeypatch):
-    asked = []
-    monkeypatch.setattr(Loop, "_take_poses", lambda self, taken: asked.append(taken))
-    monkeypatch.setattr(Link, "poses", lambda self: asked.append(self) or [])
-    with Source(FakeLink([[make_scan(0)], [make_scan(1)]])) as source:
-        results = list(Stream(source, make_runtime(), commands=Commands()))
-    assert len(results) == 2 and asked == []
-
-
 def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
     """A robot at 1000 poses/s that dies: every scan gets its record all the same, and one event reports it."""
     recording = write_recording(files / "long.npz", ([0] * 5 + [3000] * 5) * 30)
@@ -281,3 +240,79 @@ def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
     assert f"poses: {sent + 50} received, {sent} used, 50 refused, 0 dropped" in err
     assert err.count("x_mm is 'left'") == err.count("takes none, so that each pattern is of one tap: give --model") == 1
     assert [one["counters"] for one in scans if "counters" in one][-1]["poses"] <= sent
+
+
+HELD = json.dumps({"cmd": "pose", "x_mm": 5, "y_mm": -3, "turn_deg": 0, "holds": True}) + "\n"
+
+
+@pytest.fixture
+def long(files, tmp_path):
+    return write_recording(tmp_path / "long.npz", ([0] * 5 + [3000] * 5) * 300)
+
+
+def centre_of(path):
+    """Return the middle of what a map covers, in [mm], and how many patterns it holds."""
+    with np.load(path) as data:
+        rows, cols = np.nonzero(data["coverage"])
+        half = (len(data["coverage"]) - 1) / 2
+        places = [
+            (at.mean() - half) / float(data["px_per_mm"]) + c
+            for at, c in zip((cols, rows), data["centre_mm"], strict=True)
+        ]
+        return [round(place, 2) for place in places], int(data["fused_patterns"])
+
+
+def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, long, tmp_path):
+    out, picture, lines = tmp_path / "m.npz", tmp_path / "m.png", tmp_path / "lines"
+    options = [*base_options(files), "--source", f"replay:{long}", "--sink", f"jsonl:{lines}"]
+    files_of_map = ["--out", out, "--png", picture, "--size-mm", "40", "--px-per-mm", "2"]
+    with start("map", *options, *files_of_map, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        process.stdin.write(HELD)
+        process.stdin.flush()
+        wait_for(lambda: lines.exists() and lines.read_text().count('"state":"contact"') > 30)
+        assert not out.exists()
+        process.send_signal(signal.SIGINT)
+        err = process.stderr.read()
+        assert process.wait() == 0, err
+    check_npz(out)
+    place, fused = centre_of(out)
+    assert place == [5, -3] and fused > 3
+    assert f"map: {fused} patterns fused" in err and f"; {out} and {picture} written" in err
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "takes none" not in err, "a map uses the poses, whatever the model takes"
+
+
+def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
+    done = run("map", *base_options(files), "--source", f"replay:{files / 'taps.npz'}", "--out", tmp_path / "m.npz")
+    assert done.returncode == 0 and list(tmp_path.iterdir()) == []
+    assert "patterns came without a pose, so the map is empty: send poses of the pad" in done.stderr
+    assert "without a pose; no file written" in done.stderr
+
+
+def test_a_recording_with_poses_becomes_a_map(files, tmp_path):
+    posed = tmp_path / "posed.mcap"
+    with start("record", posed, *base_options(files), "--source", f"replay:{files / 'taps.npz'}",
+               stdin=subprocess.PIPE) as process:  # fmt: skip
+        assert process.stdin is not None
+        process.stdin.write(HELD)
+        process.stdin.flush()
+        assert process.wait() == 0, process.stderr.read()
+    out = tmp_path / "m.npz"
+    done = run("map", *base_options(files), "--source", f"replay:{posed}", "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert centre_of(out)[0] == [5, -3]
+
+
+def test_a_map_is_made_by_hand_and_from_a_stream(files):
+    with open_recording(files / "taps.npz") as source:
+        runtime = open_runtime(files / "tiny.onnx", source, baselines=files / "zero.json")
+        by_hand, sink = ObjectMap(), MapSink(ObjectMap())
+        for result in Stream(source, runtime, sinks=[sink]):
+            by_hand.add(result, PadPose(1.0, 2.0))
+            if result.scan.number == 9:  # after the first of four taps
+                runtime.pose(PadPose(3.0, 0.0), result.scan.time_ns + 1, "4", holds=True)
+    by_hand.finish()
+    sink.close()
+    assert by_hand.fused == 4 and np.isfinite(by_hand.layers().contact).any()
+    assert sink.without_pose == 5 and sink.whole.fused == 3, "a pose that the runtime was given itself counts"

@@ -108,27 +108,6 @@ def test_a_refusal_is_one_line_and_the_run_goes_on(monkeypatch, call, words):
         assert word in told[0]
 
 
-@linux_only
-def test_the_only_processor_is_not_pinned(monkeypatch):
-    calls = []
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cpus: calls.append(cpus))
-    module._pin((0,))
-    assert calls == []
-
-
-@linux_only
-def test_memory_that_cannot_be_locked_says_why(monkeypatch):
-    class Libc:
-        def mlockall(self, flags):
-            module.ctypes.set_errno(12)
-            return -1
-
-    monkeypatch.setattr(module.ctypes, "CDLL", lambda name, use_errno: Libc())
-    with pytest.raises(OSError, match="Cannot allocate memory"):
-        module._lock_memory()
-
-
 def test_elsewhere_it_says_so_once(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
     told = []

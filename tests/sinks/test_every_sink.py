@@ -1,5 +1,7 @@
 """Contract of every sink: each kind of result and event comes back, it fails alone, and ends cleanly."""
 
+import contextlib
+import io
 import json
 import os
 import subprocess
@@ -8,20 +10,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ROOT, ListSink
+from edge_samples import ROOT, ListSink, make_scan
 from mcap_samples import messages_of
 from sink_readers import CONTRACT, EVENTS, KINDS, PERIOD_NS, Jsonl, Mcap, Ros2, every_kind, told
-from sink_samples import RUN, make_sure_results
+from sink_samples import RUN, Terminal, make_results, make_sure_results
 
 from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.perception.event import Event
+from edge.perception.result import Result
 from edge.pipeline.sink import Sink
+from edge.sinks.event_printer import MessageSink
 from edge.sinks.fan_out import Fan
 from edge.sinks.json_encoding import COUNTED_NS
 from edge.sinks.jsonl import JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
 from edge.sinks.ros2.cdr_messages import RESULT
-from edge.sinks.status_line import StatusSink
+from firmware_bridge.errors import LinkLostError
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 
@@ -205,5 +209,77 @@ def test_metres_need_a_model_whose_unit_is_known(form, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_status_is_a_sink_without_a_target():
-    assert isinstance(open_sink("status", CONTRACT), StatusSink)
+class TestFan:
+    class Failing(ListSink):
+        def __init__(self, error):
+            super().__init__(on_write=self.fail)
+            self.error = error
+
+        def fail(self, result):
+            if self.error is not None:
+                raise self.error
+
+    def test_trouble_that_lasts_is_told_once_and_again_when_it_comes_back(self):
+        class Troubled(ListSink):
+            trouble = None
+
+        now_ns, told = [0], []
+        fan, bad, good = Fan(told.append, lambda: now_ns[0]), Troubled(), ListSink()
+        fan.add(bad)
+        fan.add(good)
+        for time_ms, trouble in ((100, "nobody"), (600, "nobody"), (1200, "nobody"), (1800, None), (2400, "nobody")):
+            now_ns[0], bad.trouble = time_ms * 1_000_000, trouble
+            fan.write(make_results(1)[0], RUN)
+            assert fan.trouble == trouble
+        assert [(event.time_ns, event.kind, event.text) for event in told] == [
+            (time_ns, "sink", "nobody") for time_ns in (600_000_000, 2_400_000_000)
+        ]
+        assert good.events == told
+
+    def test_one_that_fails_while_nothing_comes_is_given_up_too(self):
+        fan, good, bad = Fan(lambda event: None), ListSink(), ListSink()
+        bad.wait = lambda: self.Failing(SinkError("disk full")).fail(None)
+        fan.add(bad)
+        fan.add(good)
+        fan.write(make_results(1)[0], RUN)
+        fan.wait()
+        fan.wait()
+        assert good.waits == 2 and bad.closed and [event.kind for event in good.events] == ["sink"]
+        assert good.told_counters == [RUN]  # and of what was counted nothing is forgotten
+
+    def test_what_ended_the_run_is_told_rather_than_a_sink_that_failed_before(self):
+        fan = Fan(lambda event: None)
+        for sink in (self.Failing(SinkError("disk full")), ListSink()):
+            fan.add(sink)
+        fan.write(make_results(1)[0], RUN)
+        with pytest.raises(LinkLostError, match="gone"), contextlib.ExitStack() as closing:
+            closing.callback(fan.close)
+            raise LinkLostError("gone")
+
+    def test_one_that_cannot_be_finished_hinders_no_other(self):
+        class Unfinished(ListSink):
+            def close(self):
+                raise SinkError("no room")
+
+        fan, good = Fan(lambda event: None), ListSink()
+        for sink in (Unfinished(), good):
+            fan.add(sink)
+        with pytest.raises(SinkError, match="no room"):
+            fan.close()
+        assert good.closed
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_events_are_lines_on_stderr(terminal):
+    stream = Terminal() if terminal else io.StringIO()
+    MessageSink(stream).tell(Event(0, "lost", None, "the cable is out"), {})
+    assert stream.getvalue() == ("\r\x1b[K" if terminal else "") + "edge-sr: the cable is out\n"
+
+
+def test_the_events_of_a_result_are_lines():
+    stream = io.StringIO()
+    messages = MessageSink(stream)
+    for number, texts in enumerate([[], ["zeroing refused", "zeroed; again"]]):
+        events = tuple(Event(number, "refused", None, text) for text in texts)
+        messages.write(Result(make_scan(number), "device", "tiny", "idle", events=events), {})
+    assert stream.getvalue() == "edge-sr: zeroing refused\nedge-sr: zeroed; again\n"

@@ -70,8 +70,7 @@ def test_a_running_demo_can_be_reached_by_nobody():
 
 
 @pytest.mark.parametrize(
-    ("listener", "count"),
-    [(("tcp", "0.0.0.0"), 1), (("tcp", "127.0.0.1"), 0), (("udp", "0.0.0.0"), 1)],
+    ("listener", "count"), [(("tcp", "0.0.0.0"), 1), (("tcp", "127.0.0.1"), 0), (("udp", "0.0.0.0"), 1)]
 )
 def test_and_one_that_could_would_be_seen(listener, count):
     assert len(reachable_of_a_demo(*listener)) == count

@@ -1,21 +1,25 @@
-"""Poses over zenoh and ROS 2, from publishers in processes of their own, up to the tracks of a real runtime."""
+"""Poses over zenoh and ROS 2, from publishers in processes of their own, and their geometry and time."""
 
 import json
+import math
 import os
 import subprocess
 import sys
 import time
+from math import cos, radians, sin
 
+import numpy as np
 import pytest
 from cli_samples import base_options, files, records, start
-from edge_samples import BASELINE, ROOT, FakeModel
+from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
 from edge.errors import UsageError
 from edge.perception.runtime import Runtime
 from edge.pipeline.pose_intake import PoseIntake
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses
-from firmware_bridge.poses.pad_pose import PadPose
+from edge.pose_sources.stamped_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
+from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
 __all__ = ["files"]
 PATIENCE_S = 20
@@ -36,20 +40,11 @@ class TestForms:
     def test_what_exists(self, text, expected):
         assert check_poses(text) == expected
 
-    @pytest.mark.parametrize(
-        "text",
-        ["", "ros2", "ros2:", "ros2:/9x", "tf:a:b", "zenoh:a*", "mqtt:x"],
-    )
+    @pytest.mark.parametrize("text", ["", "ros2", "ros2:", "ros2:/9x", "tf:a:b", "zenoh:a*", "mqtt:x"])
     def test_what_does_not(self, text):
         with pytest.raises(UsageError) as caught:
             check_poses(text)
         assert "\n" not in str(caught.value)
-
-    def test_a_program_refuses_it_in_one_line(self):
-        done = subprocess.run(
-            [sys.executable, "-m", "edge.cli.main", "--poses", "mqtt:x"], cwd=ROOT, capture_output=True, text=True
-        )
-        assert done.returncode == 2 and "no source of poses 'mqtt:x'" in done.stderr and done.stderr.count("\n") == 1
 
 
 def until(queue, satisfied, act=lambda: None):
@@ -63,14 +58,14 @@ def until(queue, satisfied, act=lambda: None):
     return poses
 
 
-def used(poses):
-    """Return the tracks of a runtime that took these poses."""
+def used(poses, sensor, time_ns):
+    """Return the pose of a scan of a runtime that took these poses."""
     queue, runtime = PoseQueue(), Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
     intake = PoseIntake(runtime, queue)
     for one in poses:
         queue.put(one)
     assert len(intake.take([], None, time.monotonic_ns())) == len(poses)
-    return runtime._tracks
+    return runtime.push(make_scan(sensor=sensor, time_ns=time_ns)).pose
 
 
 class TestZenoh:
@@ -120,7 +115,7 @@ with zenoh.open(config) as session:
         after_ns = time.monotonic_ns()
         assert all(before_ns < one.time_ns < after_ns for one in poses)
         assert {one.sensor for one in poses} == {"4"}
-        assert used(poses)["4"].at(poses[-1].time_ns) == PadPose(poses[-1].pose.x_mm, -2, 3)
+        assert used(poses, "4", poses[-1].time_ns) == PadPose(poses[-1].pose.x_mm, -2, 3)
         put("arm/pose", json.dumps({"cmd": "pose", "sensor": "left/6", "x_mm": -1, "y_mm": 0, "holds": True}))
         own = until(queue, lambda poses: any(one.sensor == "left/6" for one in poses))[-1]
         assert own.holds and own.pose == PadPose(-1, 0)
@@ -151,10 +146,7 @@ class TestRos2:
         pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
         from ros2_samples import ENVIRONMENT, LISTENERS_CONFIGURATION, PYTHONPATH
 
-        environment = os.environ | {
-            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION,
-            "PYTHONPATH": PYTHONPATH,
-        }
+        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION, "PYTHONPATH": PYTHONPATH}
         command = [sys.executable, str(ROOT / "tests/support/ros2_pose_writer.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
         topics = [["arm/pose", kind] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -218,7 +210,7 @@ class TestRos2:
 
         # The first ones may have waited for their writer, and then count as those of a clock that is behind.
         last = until(queue, lambda poses: poses and in_time(poses[-1]), act)[-1]
-        pose = used([last])["4"].at(last.time_ns)
+        pose = used([last], "4", last.time_ns)
         assert (pose.y_mm, pose.error_mm, pose.error_deg) == (-500.0, 0.2, 1.0)
 
     def test_the_covariance_comes_as_errors_and_a_transform_on_the_same_topic(self, opened, publish):
@@ -267,3 +259,128 @@ class TestRos2:
         # The first ones may have waited for the program, and then be refused as out of order.
         assert [one["counters"] for line in lines for one in records(line) if "counters" in one][-1]["poses"] > 10
         assert " 0 dropped" in err and "takes none" in err
+
+
+FLIPPED = (1.0, 0.0, 0.0, 0.0)
+"""Half a turn about x: the tool's z against that of the frame, as of a gripper above a table."""
+
+
+def times(one, other):
+    """Return the product of two quaternions (x, y, z, w): the second rotation first."""
+    x, y, z, w = one
+    a, b, c, d = other
+    return (
+        w * a + x * d + y * c - z * b,
+        w * b - x * c + y * d + z * a,
+        w * c + x * b - y * a + z * d,
+        w * d - x * a - y * b - z * c,
+    )
+
+
+def about(axis, angle_deg):
+    half = radians(angle_deg) / 2
+    return (*(sin(half) * np.array(axis, float)).tolist(), cos(half))
+
+
+def named(numbers):
+    return dict(zip("xyzw", numbers, strict=False))
+
+
+def read(place, quaternion, covariance=()):
+    return pad_pose(placed(named(place), named(quaternion)), covariance)
+
+
+class TestToolFrame:
+    def test_above_a_table_x_and_y_are_those_of_the_table_in_mm(self):
+        pose = read((0.25, -0.125, 0.4), FLIPPED)
+        assert (pose.x_mm, pose.y_mm, pose.turn_deg) == (250.0, -125.0, pytest.approx(0))
+        assert (pose.error_mm, pose.error_deg) == (PLACE_ERROR_MM, TURN_ERROR_DEG)
+
+    @pytest.mark.parametrize("turn_deg", [-170, -30, 5, 90, 179])
+    def test_a_turn_about_the_tables_z_is_the_turn(self, turn_deg):
+        assert read((0, 0, 0), times(about((0, 0, 1), turn_deg), FLIPPED)).turn_deg == pytest.approx(turn_deg)
+
+    def test_a_frame_that_points_into_the_object_has_its_y_and_turns_the_other_way(self):
+        pose = read((0.01, 0.02, 0), about((0, 0, 1), 30))
+        assert (pose.x_mm, pose.y_mm, pose.turn_deg) == (pytest.approx(10), pytest.approx(-20), pytest.approx(-30))
+
+    @pytest.mark.parametrize("up", [FLIPPED, (0.0, 0.0, 0.0, 1.0)])
+    def test_a_feature_of_the_object_keeps_its_place_however_the_pad_lies_on_it(self, up):
+        """A point of the object, seen from two poses of the pad, in the axes of a pattern: x right, y down."""
+        rng, point = np.random.default_rng(3), np.array([0.003, -0.002, 0.0])
+        seen = []
+        for turn_deg in (0.0, 40.0):
+            place = np.array([*rng.uniform(-0.005, 0.005, 2), 0.0])
+            quaternion = times(about((0, 0, 1), turn_deg), up)
+            tool = placed(named(place), named(quaternion))
+            in_tool = tool.rotation.T @ (point - place)
+            seen.append((pad_pose(tool), 1e3 * np.array([in_tool[0], -in_tool[1]])))  # y of the tool is up
+        (first, at_first), (second, at_second) = seen
+        earlier = first.seen_from(second)
+        turn = radians(earlier.turn_deg)
+        to = np.array([[cos(turn), sin(turn)], [-sin(turn), cos(turn)]])
+        assert to @ (at_second - np.array([earlier.x_mm, earlier.y_mm])) == pytest.approx(at_first)
+
+    @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0)])
+    def test_a_tilt_is_allowed_up_to_a_limit(self, axis):
+        read((0, 0, 0), times(about(axis, MOST_TILT_DEG - 0.1), FLIPPED))
+        with pytest.raises(PoseError, match="tilted by 12 degrees") as caught:
+            read((0, 0, 0), times(about(axis, 12), FLIPPED))
+        assert caught.value.reason == "tilt"
+
+    @pytest.mark.parametrize(
+        ("place", "quaternion", "reason"),
+        [
+            ((math.nan, 0, 0), FLIPPED, "finite"),
+            ((0, 0, 0), (math.inf, 0, 0, 0), "finite"),
+            ((0, 0, 0), (0, 0, 0, 0), "quaternion"),
+            ((0, 0, 0), (2, 0, 0, 0), "quaternion"),
+            ((1e9, 0, 0), FLIPPED, "range"),
+        ],
+    )
+    def test_what_is_no_pose_is_refused(self, place, quaternion, reason):
+        with pytest.raises(PoseError) as caught:
+            read(place, quaternion)
+        assert caught.value.reason == reason
+
+    def test_the_covariance_gives_the_errors(self):
+        covariance = np.zeros(36)
+        covariance[[0, 7, 35]] = 0.001**2, 0.002**2, radians(3) ** 2
+        pose = read((0, 0, 0), FLIPPED, covariance)
+        assert (pose.error_mm, pose.error_deg) == (pytest.approx(2), pytest.approx(3))
+
+
+class TestStampClock:
+    OFFSET_NS = 1_700_000_000 * 10**9
+
+    def clock(self):
+        lines = []
+        return StampClock(lines.append, lambda: self.OFFSET_NS), lines
+
+    @pytest.mark.parametrize("delay_ns", [-EARLY_NS, 0, 30_000_000, LATE_NS])
+    def test_where_clocks_agree_a_stamp_is_the_time_and_a_delay_stays(self, delay_ns):
+        clock, lines = self.clock()
+        arrival_ns = 10**12
+        assert clock.monotonic_ns(self.OFFSET_NS + arrival_ns - delay_ns, arrival_ns) == arrival_ns - max(delay_ns, 0)
+        assert lines == []
+
+    @pytest.mark.parametrize("off_ns", [-5 * 10**9, 10**8, 10**15, -(10**15)])
+    def test_where_they_do_not_the_smallest_delay_counts_as_none(self, off_ns):
+        clock, lines = self.clock()
+        rng = np.random.default_rng(1)
+        delays_ns = [2_000_000, *rng.integers(0, 8_000_000, 50).tolist(), 0]
+        got = [
+            clock.monotonic_ns(self.OFFSET_NS + off_ns + time_ns, time_ns + delay_ns) - time_ns
+            for number, delay_ns in enumerate(delays_ns)
+            for time_ns in [10**12 + 20_000_000 * number]
+        ]
+        assert got[0] == 2_000_000 and got[-1] == 0
+        smallest = np.minimum.accumulate(delays_ns)
+        # Where none was as small for a quarter of a second, the sender's clock may be slower by a little.
+        assert (got >= smallest).all() and (got - smallest).max() < 3_000_000
+        assert lines and all(word in lines[0] for word in ("time stamps of poses", "clock"))
+
+    @pytest.mark.parametrize("stamp", [None, 0])
+    def test_without_a_stamp_it_is_the_arrival(self, stamp):
+        clock, lines = self.clock()
+        assert clock.monotonic_ns(stamp, 123) == 123 and lines == []

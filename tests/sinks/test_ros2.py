@@ -264,14 +264,6 @@ def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back()
     assert commands.poll() == [], "asked of a sink that is closed"
 
 
-def test_what_nobody_subscribes_to_is_not_made(sink):
-    published = []
-    sink._publish = lambda writer, message: published.append(writer.topic.name)
-    sink.write(contact(1), {})
-    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
-    assert set(published) == {"rt/skin/events"}
-
-
 def test_commands_are_taken_only_where_that_was_asked_for(sink):
     commands = Commands()
     with pytest.MonkeyPatch.context() as patch:
@@ -299,24 +291,6 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
             np.testing.assert_allclose(pixels(message), talker.wrote["4", stamp_ns(message)].pattern / 1e3, rtol=1e-6)
     finally:
         sink.close()
-
-
-def test_two_sinks_share_the_domain_and_one_outlives_the_other(sink):
-    other = open_sink_in(ENVIRONMENT, "ros2:other/skin")
-    other.write(contact(1), {})
-    other.close()
-    with Listener({"skin/s4/pattern": IMAGE}) as listener:
-        listener.until(lambda: listener.of("skin/s4/pattern"), Talker(sink))
-    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) in ros2_domain._OPEN
-    sink.close()
-    assert int(ENVIRONMENT["ROS_DOMAIN_ID"]) not in ros2_domain._OPEN, "threads and sockets are left behind"
-
-
-def open_sink_in(environment, text):
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in environment.items():
-            patch.setenv(name, value)
-        return open_sink(text, make_contract())
 
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():

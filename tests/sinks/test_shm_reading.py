@@ -14,10 +14,7 @@ from struct import unpack_from
 
 import numpy as np
 import pytest
-from edge_samples import (
-    ROOT,
-    ended,
-)
+from edge_samples import ROOT, ended
 from shm_samples import (
     CONTRACT,
     ENVIRONMENT,
@@ -91,15 +88,6 @@ class TestReading:
             file.write(b"\xff")
         assert latest(attach(name), "4") is None
 
-    def test_a_half_that_is_being_written_hides_nothing(self, sink, name):
-        """A writer killed half-way leaves the newest whole value."""
-        sink.write(make_result(5), {})
-        with Path("/dev/shm", name).open("r+b") as file:  # of sequence 2
-            file.seek(192 + 64)
-            file.write(b"\xff" * 5000)
-        half = latest(attach(name), "4")
-        assert half is not None and fields(half)["scan"] == 5
-
     def test_only_what_is_young_and_of_a_device_is_acted_on(self, sink, name):
         memory, now_ns = attach(name), time.monotonic_ns()
         result = replace(make_result(7, press_counts=3000, time_ns=now_ns), source="device")
@@ -158,12 +146,6 @@ class TestReading:
             _, errors = reader.communicate()
         assert reader.returncode == 1
         assert re.fullmatch(rf".*No such file .*: expected what edge-sr --sink shm:{name} writes\n", errors)
-
-    def test_the_example_says_how_it_is_called(self):
-        command = [sys.executable, str(ROOT / "examples" / "shm_read.py")]
-        for words in ([], ["skin"], ["skin", "4", "--now"]):
-            done = subprocess.run([*command, *words], env=ENVIRONMENT, capture_output=True, text=True)
-            assert done.returncode == 1 and done.stderr == f"{shm_read.USAGE}\n"
 
 
 class TestWriters:

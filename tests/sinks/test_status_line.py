@@ -125,10 +125,7 @@ class TestStatus:
                 {"next_tap": NextTap(-2.35, 2.35, 0.0)},
                 "4 contact not checked tap 1 3.00 N 22 mm2 next tap 2.4 mm left 2.4 mm down ",
             ),
-            (
-                {"next_tap": NextTap(2.35, 0.0, 0.0)},
-                "4 contact not checked tap 1 3.00 N 22 mm2 next tap 2.4 mm right ",
-            ),
+            ({"next_tap": NextTap(2.35, 0.0, 0.0)}, "4 contact not checked tap 1 3.00 N 22 mm2 next tap 2.4 mm right "),
             ({"source": "replay"}, "REPLAY | 4 contact "),
             ({"state": "zeroing", "notes": (Note("zeroing", "9 scans left"),)}, "4 9 scans left"),
         ],
@@ -171,23 +168,6 @@ class TestStatus:
         self.now_s = 3.2
         sink.wait()
         assert self.shown()[-1].startswith("EMULATED | no scan for 3 s | 4 idle")
-
-    @pytest.mark.parametrize("columns", [1, 2, 10, 40, 80])
-    def test_it_never_wraps(self, columns):
-        sink = self.make(columns)
-        for result in make_results(8):
-            sink.write(result, RUN)
-            self.now_s += 1
-        assert self.shown() and max(len(line) for line in self.shown()) <= max(columns - 1, 0)
-
-    def test_the_last_line_stands_at_the_end(self):
-        sink = self.make()
-        first, last = make_results(1)
-        sink.write(first, {})
-        sink.write(last, {})
-        sink.close()
-        assert "| 6 no stored" in self.stream.getvalue().rsplit("\r", 1)[1]
-        assert self.stream.getvalue().endswith("\n")
 
     def test_a_window_that_was_closed_ends_nothing(self):
         self.now_s = 0.0

@@ -1,15 +1,21 @@
-"""Runs of `edge-sr` in a process of their own, and files for them."""
+"""Runs of `edge-sr`, in this process or in one of their own, and files for them."""
 
+import contextlib
 import json
+import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
 
+from edge.cli import main as cli
+from edge.inference.timed_loading import unfinished_load
 from firmware_bridge.zeroing.baseline import save_baselines
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
@@ -46,11 +52,23 @@ def base_options(files):
     return ["--model", str(files / "tiny.onnx"), "--baseline", str(files / "zero.json")]
 
 
-def run(*arguments, **settings):
-    settings.setdefault("stdin", subprocess.DEVNULL)
-    return subprocess.run(
-        [*EDGE_SR, *map(str, arguments)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, **settings
-    )
+def run(*arguments, **environment):
+    """Run `edge-sr` in this process to its end; its streams are files, since records go past `sys.stdout`."""
+    with (
+        tempfile.TemporaryFile("w+", encoding="utf-8") as out,
+        tempfile.TemporaryFile("w+", encoding="utf-8") as err,
+        mock.patch.dict(os.environ, environment),
+        mock.patch.object(cli, "unfinished_load", lambda: False),  # which would end this process
+    ):
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            try:
+                code = cli.main([*map(str, arguments)])
+            except SystemExit as end:
+                code = end.code
+        wait_for(lambda: not unfinished_load())
+        for file in (out, err):
+            file.seek(0)
+        return subprocess.CompletedProcess(arguments, code or 0, out.read(), err.read())
 
 
 def start(*arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **settings):

@@ -1,20 +1,31 @@
-"""Diagnostics of the ROS 2 sink: once a second, and true about silence and recordings."""
-
-import time
-from dataclasses import replace
+"""Around the ROS 2 sink: diagnostics, names of topics, environments, and files for ROS itself."""
 
 import pytest
-from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
-from edge_samples import BASELINE, make_contract, make_scan
+import re
+import shlex
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
+import yaml
+from edge_samples import BASELINE, ROOT, make_contract, make_scan, make_wrench_result
+from hypothesis import given
+from hypothesis import strategies as st
+from ros2_samples import ENVIRONMENT, contact, keep_published, sink
+
+from edge.cli.run_options import parser
+from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
-from edge.sinks.registry import open_sink
+from edge.sinks.registry import check_sink, open_sink
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
+from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.base import Notice
 
@@ -114,11 +125,91 @@ def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another(sink):
     assert left.trouble.keys() == {"lost", "trouble"}
 
 
-def test_what_a_link_said_of_an_outage_holds_until_the_next_scan(sink):
-    sink.write(contact(1), {})
-    sink.tell(Event(time.monotonic_ns(), "lost", None, "the plug is out"), {})
-    assert sink._sensors["4"].trouble == {"lost": "the plug is out"}
-    sink.write(contact(2), {})
-    assert not sink._sensors["4"].trouble
-    sink.tell(Event(time.monotonic_ns(), "silent", "5", "another one is silent"), {})
-    assert not sink._sensors["4"].trouble and sink._sensors["4"].shown, "what 4 shows is as true as before"
+ROS_TOPIC = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+NAMES = st.text(st.sampled_from("s4x_/é a0Z"), min_size=1, max_size=8)
+
+
+@given(NAMES, NAMES)
+def test_every_sensor_has_topics_of_its_own_that_ros_can_hold(one, other):
+    topics = [sensor_topic("skin", name, "pattern") for name in (one, other)]
+    assert all(map(ROS_TOPIC.fullmatch, topics)) and "__" not in "".join(topics)
+    assert (topics[0] == topics[1]) == (one == other)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "topic"),
+    [("4", "s4"), ("left/4", "left/s4"), ("left_1", "left_1"), ("s4", "x_7334"), ("x_1", "x_785f31"), ("/", "x_0/x_0")],
+)
+def test_sensors_names_as_topics(sensor, topic):
+    assert sensor_topic("skin", sensor, "pattern") == f"skin/{topic}/pattern"
+
+
+def test_names_that_ros_cannot_hold_are_refused():
+    assert base_topic("/gripper/skin_1") == "gripper/skin_1"
+    with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
+        sensor_topic("skin", "ä" * 64, "pattern")
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"),
+    [
+        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, which hides edge-sr from other nodes"),
+    ],
+)
+def test_an_environment_that_ros_would_not_take_is_refused(environment, said):
+    with pytest.raises(UsageError, match=said):
+        Ros2Sink("skin", environment)
+
+
+def test_a_configuration_that_is_none_is_told(capfd):
+    with pytest.raises(SinkError, match=r"cannot join DDS domain 7 .*CYCLONEDDS_URI"):
+        Ros2Sink(
+            "skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"}
+        )
+
+
+def test_without_the_package_one_line_says_how_to_get_it():
+    script = (
+        "import sys; sys.modules['cyclonedds'] = None\n"
+        "from edge.sinks.registry import open_sink\n"
+        "try: open_sink('ros2:skin', None)\n"
+        "except ValueError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == f"ros2:skin needs Cyclone DDS: pip install '{ROOT}[ros2]'\n", done.stderr
+
+
+FILES = ROOT / "examples/ros2"
+
+
+def test_the_launch_file_starts_a_command_that_edge_sr_takes():
+    launch = ElementTree.parse(FILES / "skin.launch.xml").getroot()
+    values = {one.get("name"): one.get("default") for one in launch.iter("arg")}
+    (executable,) = launch.iter("executable")
+    command = executable.get("cmd")
+    for name, value in (values | {"options": "--sensor s.toml"}).items():
+        command = command.replace(f"$(var {name})", value)
+    assert "$(" not in command and values["options"] == ""
+    program, *words = shlex.split(command)
+    options = parser().parse_args(words)
+    assert (program, str(options.sensor)) == ("edge-sr", "s.toml")
+    assert [check_sink(one) for one in options.sink] == [("ros2", "skin?commands")]
+    (node,) = launch.iter("node")
+    assert (FILES / node.get("args").removeprefix("-d $(dirname)/")).is_file()
+
+
+def test_rviz_shows_topics_that_are_published(sink):
+    shown = yaml.safe_load((FILES / "skin.rviz").read_text())["Visualization Manager"]
+    published = set()
+    sink._publish = lambda writer, message: published.add(writer.topic.name.removeprefix("rt"))
+    sink._is_read = lambda writer: True
+    result = make_wrench_result()
+    sink.write(result, {})
+    sink.close()  # which withdraws the points
+    topics = {one["Topic"]["Value"] for one in shown["Displays"] if "Topic" in one}
+    assert topics == {"/skin/s4/points", "/skin/s4/wrench", "/skin/s4/pattern"} and topics <= published
+    assert shown["Global Options"]["Fixed Frame"] == result.scan.sensor
+    qos = yaml.safe_load((FILES / "play_qos.yaml").read_text())["/tf_static"]
+    assert (qos["durability"], qos["reliability"]) == ("transient_local", "reliable")

@@ -1,4 +1,4 @@
-"""Bars on a real pseudo-terminal, read as a terminal would show them; none anywhere else."""
+"""Bars on a real pseudo-terminal, none anywhere else, and patterns drawn as text."""
 
 import contextlib
 import fcntl
@@ -11,18 +11,20 @@ import subprocess
 import sys
 import termios
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, make_contract, write_model
+from edge_samples import ROOT, write_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
+from edge.terminal.heatmap import HALF_BLOCK, SHADES, Panel, choose_palette, draw, resample
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
-from train.learning import expected_error_table as confidence
 
 CLEARED = re.compile(r"\r *\r$")
 RATE = re.compile(r"scan/s|s/scan")
@@ -101,15 +103,6 @@ def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal):
         assert re.search(r"^\r?poses  10%\|.+\| 20\.0pose/s 00:18 left\s*$", shown), shown
         assert "\n" not in shown
     assert CLEARED.search(terminal.said())
-
-
-def test_what_has_ended_shows_no_bar_any_more(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
-        pass
-    clock.now_s += 3
-    bar.advance()
-    assert terminal.said() == ""
 
 
 def test_units_that_were_there_before_took_no_time_now(terminal):
@@ -198,15 +191,6 @@ def test_what_is_tracked_comes_whole_and_must_tell_how_much_it_is():
         next(tracked(iter([1]), "counting", "thing"))
 
 
-def test_what_takes_a_command_long_is_counted_in_steps_even_of_one_model(monkeypatch):
-    """These steps take most of the time of `python -m export.to_onnx`."""
-    reached = []
-    monkeypatch.setattr(Progress, "advance", lambda bar: reached.append((bar._what, bar._total)))
-    monkeypatch.setattr(confidence, "doubts_and_errors", lambda *_: np.ones((3, 40)))
-    assert set(confidence.fit_confidence(SimpleNamespace(contract=make_contract(taps=2)), [None] * 3)) == {"1", "2"}
-    assert reached == [("confidence", 3)] * 3
-
-
 AT_ONCE = """
 import sys
 from edge.cli import main as cli
@@ -246,3 +230,112 @@ def test_a_command_shows_its_bar_on_a_terminal_and_leaves_no_trace_when_it_is_st
         assert said.startswith(b"edge-sr: ") and b"\r" not in said and b"\x1b" not in said
     assert process.returncode == 3
     terminal.close()
+
+
+ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
+PALETTES = ["truecolor", "256", "plain"]
+
+
+def visible(text):
+    return [ESCAPE.sub("", line) for line in text.splitlines()]
+
+
+def panel(values=None, title="title", low=0.0, high=1.0):
+    return Panel(title, np.eye(4) if values is None else values, low, high, "mm")
+
+
+sizes = st.integers(1, 9)
+digits = st.integers(-9, 9).map(float)
+images = st.tuples(sizes, sizes).flatmap(lambda shape: arrays(np.float64, shape, elements=digits))
+
+
+@settings(deadline=None)
+@given(images, sizes, sizes)
+def test_resampling_is_the_mean_over_each_new_cell(image, height, width):
+    fine = np.kron(image, np.ones((height, width)))
+    exact = fine.reshape(height, image.shape[0], width, image.shape[1]).mean(axis=(1, 3))
+    np.testing.assert_allclose(resample(image, height, width), exact, atol=1e-12)
+
+
+def test_finer_cells_repeat_values():
+    np.testing.assert_allclose(resample(np.arange(4.0).reshape(2, 2), 4, 6), np.kron([[0, 1], [2, 3]], np.ones((2, 3))))
+
+
+@pytest.mark.parametrize("palette", PALETTES)
+@pytest.mark.parametrize("columns", [1, 5, 6, 7, 8, 19, 20, 39, 40, 63, 64, 79, 80, 123, 124, 300])
+def test_no_line_is_wider_than_the_terminal(palette, columns):
+    panels = [panel(title="a title longer than some of these terminals"), panel(np.eye(40)), panel(high=1e-7)]
+    lines = visible(draw(panels, columns, palette))
+    assert max(map(len, lines)) <= min(columns, 124)
+
+
+def test_side_by_side_where_there_is_room_else_below_each_other():
+    panels = [panel(title=name) for name in ("one", "two", "three")]
+    wide, narrow = visible(draw(panels, 76, "plain")), visible(draw(panels, 75, "plain"))
+    assert [line.split() for line in (wide[0],)] == [["one", "two", "three"]]
+    assert len(wide) == 1 + 12 + 1
+    assert [line.strip() for line in narrow if line.strip() in ("one", "two", "three")] == ["one", "two", "three"]
+    assert len(narrow) == 3 * (1 + 20 + 1) + 2
+
+
+@pytest.mark.parametrize("columns", range(76, 130))
+def test_taxels_side_by_side_have_sharp_borders(columns):
+    lines = draw([panel(np.eye(4)), panel(), panel()], columns, "plain").splitlines()[1:-1]
+    assert set("".join(lines)) == {SHADES[0], SHADES[-1]}
+
+
+def test_plain_is_ascii_denser_where_larger():
+    values = np.array([[0.0, 0.25], [0.5, 1.0]])
+    lines = draw([panel(values)], 40, "plain").splitlines()
+    assert "".join(lines).isascii() and "\x1b" not in "".join(lines)
+    body = [line.ljust(40) for line in lines[1:-1]]
+    assert len(body) == 20
+    corners = [body[0][0], body[0][-1], body[-1][0], body[-1][-1]]
+    assert corners == [SHADES[0], SHADES[2], SHADES[5], SHADES[-1]]
+
+
+@pytest.mark.parametrize("palette", ["truecolor", "256"])
+def test_a_cell_shows_the_upper_pixel_over_the_lower(palette):
+    values = np.zeros((40, 40))
+    values[0] = 1.0
+    line = draw([panel(values)], 40, palette).splitlines()[1]
+    low, high = ("2;68;1;84", "2;253;231;37") if palette == "truecolor" else ("5;53", "5;220")
+    assert line == f"\x1b[38;{high};48;{low}m{HALF_BLOCK * 40}\x1b[0m"
+
+
+def test_values_beyond_the_scale_are_clipped_and_a_flat_scale_is_dark():
+    line = draw([panel(np.array([[-5.0, 5.0]]))], 40, "plain").splitlines()[1]
+    assert line == " " * 20 + "@" * 20
+    assert set(draw([panel(np.zeros((2, 2)), high=0.0)], 40, "plain").splitlines()[1]) <= {" "}
+
+
+def test_the_scale_names_both_ends_and_the_unit():
+    last = draw([panel(high=1.234)], 40, "plain").splitlines()[-1]
+    assert last.startswith("0 ") and last.endswith(f"{SHADES[-1]} 1.23 mm") and len(last) == 40
+
+
+@pytest.mark.parametrize(("high", "text"), [(0.0123, "0.0123"), (99.96, "100"), (1613.4, "1613"), (12345.6, "12346")])
+def test_the_scales_numbers_are_short(high, text):
+    assert draw([panel(high=high)], 40, "plain").endswith(f" {text} mm")
+
+
+@pytest.mark.parametrize(
+    ("environment", "terminal", "encoding", "palette"),
+    [
+        ({"TERM": "xterm", "COLORTERM": "truecolor"}, True, "utf-8", "truecolor"),
+        ({"TERM": "xterm", "COLORTERM": "24bit"}, True, "utf-8", "truecolor"),
+        ({"TERM": "xterm"}, True, "utf-8", "256"),
+        ({"TERM": "xterm", "COLORTERM": "yes"}, True, "utf-8", "256"),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, True, "utf-8", "plain"),
+        ({"TERM": "xterm", "NO_COLOR": ""}, True, "utf-8", "256"),
+        ({"TERM": "dumb", "COLORTERM": "truecolor"}, True, "utf-8", "plain"),
+        ({"COLORTERM": "truecolor"}, True, "utf-8", "plain"),
+        ({"TERM": "xterm"}, False, "utf-8", "plain"),
+        ({"TERM": "xterm"}, True, "ascii", "plain"),
+        ({"TERM": "xterm"}, True, "latin-1", "plain"),
+        ({"TERM": "xterm"}, True, None, "plain"),
+        ({"TERM": "xterm"}, True, "no such encoding", "plain"),
+    ],
+)
+def test_the_palette_is_what_the_output_can_show(environment, terminal, encoding, palette):
+    assert choose_palette(environment, terminal=terminal, encoding=encoding) == palette
