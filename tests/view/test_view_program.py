@@ -7,104 +7,68 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import pytest
+from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT
 from view_samples import TIMEOUT_S, frame
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from edge.cli.main import main
-from edge.pipeline import replay_setup as recordings
-from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording.formats import load_recording
 
 DEMO = (sys.executable, "-m", "edge.cli.main", "--source", "demo")
 
 
-@pytest.fixture(scope="module")
-def watched_run(tmp_path_factory):
-    """The demo with two viewers, ended by Ctrl-C while they look: what everybody got."""
-    folder, recorded = tmp_path_factory.mktemp("recorded"), []
+def hear_interrupts():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def test_the_demo_serves_two_viewers_until_ctrl_c(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [*DEMO, "--view", "0", "--sink", "jsonl:-", "--view-record-dir", str(folder)]
+    command = [*DEMO, "--view", "0", "--sink", "jsonl:-", "--view-record-dir", str(tmp_path)]
     # Signals as from a terminal: who started the tests may have SIGINT ignored.
-    with subprocess.Popen(command, env=environment, text=True, preexec_fn=_hear_interrupts, **pipes) as process:
+    with subprocess.Popen(command, env=environment, text=True, preexec_fn=hear_interrupts, **pipes) as process:
         try:
             assert process.stdout is not None and process.stderr is not None
             lines = iter(process.stderr.readline, "")
             url = next(line for line in lines if line.startswith("live page: ")).split()[2]
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url), "of this machine alone"
             settings = {"origin": url.rstrip("/"), "compression": None}
             with connect(f"ws{url[4:]}ws", **settings) as first, connect(f"ws{url[4:]}ws", **settings) as second:
                 hello, result = frame(first)[0], frame(first, "result")[0]
+                assert (hello["kind"], hello["name"], hello["source"]) == ("hello", "demo", "emulated")
+                assert result["source"] == "emulated"
                 while frame(second, "result")[0]["scan"] < 20:
                     pass
                 first.send('{"cmd": "record", "on": true}')
                 first.send('{"cmd": "zero", "sensor": "9"}')
-                notes = []
-                while not all(any(note.startswith(told) for note in notes) for told in ("recording", "zeroing")):
-                    notes.append(frame(first, "event")[0]["note"])
-                while len(recorded) < 2:
-                    recorded.append(frame(first, "result")[0]["scan"])
+                notes = {}  # either may come first, as the file is opened in a thread of its own
+                while not {"recording", "zeroing"} <= notes.keys():
+                    note = frame(first, "event")[0]["note"]
+                    notes[note.split()[0]] = note
+                assert notes["zeroing"] == "zeroing refused: no sensor 9, there are 4"
+                for _ in range(2):
+                    frame(first, "result")
                 process.send_signal(signal.SIGINT)
                 output, errors = process.communicate(timeout=TIMEOUT_S)
-                closed = []
                 for viewer in (first, second):
                     with pytest.raises(ConnectionClosed) as caught:
                         while True:
                             viewer.recv(TIMEOUT_S)
-                    closed.append(caught.value.rcvd)
+                    close = caught.value.rcvd
+                    assert close is not None and (close.code, close.reason) == (1001, "the run has ended")
         finally:
             process.kill()
-    return {
-        "url": url,
-        "hello": hello,
-        "result": result,
-        "output": output,
-        "errors": errors,
-        "closed": closed,
-        "code": process.returncode,
-        "notes": notes,
-        "recordings": [load_recording(path) for path in folder.iterdir()],
-    }
-
-
-def _hear_interrupts():
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def test_the_address_is_told_and_is_this_machines_alone(watched_run):
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", watched_run["url"])
-
-
-def test_an_emulated_run_is_told_as_such(watched_run):
-    assert watched_run["hello"]["source"] == "emulated" and watched_run["hello"]["name"] == "demo"
-    assert watched_run["result"]["source"] == "emulated"
-
-
-def test_ctrl_c_ends_it_cleanly_with_viewers_attached(watched_run):
-    assert watched_run["code"] == 0
-    assert [(close.code, close.reason) for close in watched_run["closed"]] == [(1001, "the run has ended")] * 2
-    assert "EMULATED demo:" in watched_run["errors"] and "Traceback" not in watched_run["errors"]
-
-
-def test_what_viewers_ask_is_done(watched_run):
-    """Either may come first, as the file is opened in a thread of its own."""
-    told = [note for note in watched_run["notes"] if note.startswith(("recording", "zeroing"))]
-    begun, refused = sorted(told)
-    assert begun.startswith("recording into ")
-    assert refused == "zeroing refused: no sensor 9, there are 4"
-
-
-def test_the_end_of_the_run_ends_the_recording_well(watched_run):
-    [recording] = watched_run["recordings"]
-    assert [track.sensor for track in recording.tracks] == ["4"] and len(recording.tracks[0].counts) > 2
-
-
-def test_records_on_stdout_are_records_alone(watched_run):
-    scans = [json.loads(line)["scan"] for line in watched_run["output"].splitlines()]
-    assert len(scans) > 10 and scans == list(range(len(scans)))
+    assert process.returncode == 0 and "EMULATED demo:" in errors and "Traceback" not in errors
+    [path] = tmp_path.iterdir()
+    [track] = load_recording(path).tracks
+    assert track.sensor == "4" and len(track.counts) > 2
+    scans = [json.loads(line)["scan"] for line in output.splitlines()]
+    assert len(scans) > 10 and scans == list(range(len(scans))), "records on stdout are records alone"
 
 
 def test_a_port_in_use_is_one_line_and_5(capsys):
@@ -118,23 +82,21 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("code", "arguments", "words"),
     [
-        (["--view-host", "0.0.0.0"], "--view-host requires --view"),
-        (["--view-token", "x" * 20], "--view-token requires --view"),
-        (["--view-record-dir", "."], "--view-record-dir requires --view"),
-        (
-            ["--view", "0", "--view-record-dir", "/dev/null"],
-            "--view-record-dir /dev/null: expected a folder that may be",
-        ),
-        (["--view", "0", "--view-record-dir", "/no/such"], "--view-record-dir /no/such: expected a folder that may be"),
-        (["--view", "0", "--view-token", "short"], "a token of 5 characters for the live page: expected at least 12"),
+        (2, ["--view-host", "0.0.0.0"], "--view-host requires --view"),
+        (2, ["--view-token", "x" * 20], "--view-token requires --view"),
+        (2, ["--view-record-dir", "."], "--view-record-dir requires --view"),
+        (2, ["--view", "0", "--view-record-dir", "/dev/null"], "--view-record-dir /dev/null: expected a folder"),
+        (2, ["--view", "0", "--view-record-dir", "/no/such"], "--view-record-dir /no/such: expected a folder"),
+        (2, ["--view", "0", "--view-token", "short"], "a token of 5 characters for the live page: expected at least"),
+        (5, ["--view", "0", "--view-host", "192.0.2.1"], "192.0.2.1 is not an address of this machine; name one with"),
+        (5, ["--view", "0", "--view-host", "no.invalid"], "no.invalid is not an address of this machine; name one"),
     ],
 )
-def test_what_makes_no_sense_is_one_line_and_2(capsys, arguments, words):
-    assert main(["--source", "demo", *arguments]) == 2
-    errors = capsys.readouterr().err.splitlines()
-    assert words in errors[-1]
+def test_what_makes_no_sense_is_one_line(capsys, code, arguments, words):
+    assert main(["--source", "demo", *arguments]) == code
+    assert words in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("port", ["65536", "-1", "http"])
@@ -144,14 +106,10 @@ def test_what_is_no_port_is_usage(capsys, port):
     assert caught.value.code == 2 and "argument --view" in capsys.readouterr().err
 
 
-def test_a_recording_is_played_at_its_speed_where_somebody_is_to_look(monkeypatch):
-    paced = []
-
-    def refuse(path, **settings):
-        paced.append(settings["paced"])
-        raise RecordingError(f"{path} is only asked for")
-
-    monkeypatch.setattr(recordings, "open_recording", refuse)
-    for options in ([], ["--paced"], ["--view"]):
-        assert main(["replay", "press.mcap", *options]) == 2
-    assert paced == [False, True, True]
+def test_a_recording_is_played_as_if_live_where_somebody_is_to_look(tmp_path):
+    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
+    for number, (options, live) in enumerate((([], False), (["--paced"], True), (["--view", "0"], True))):
+        records, begun_ns = tmp_path / f"{number}.jsonl", time.monotonic_ns()
+        assert main(["replay", str(path), "--sink", f"jsonl:{records}", *options]) == 0
+        first = json.loads(records.read_text().splitlines()[0])
+        assert (first["time_ns"] >= begun_ns) == live, options
