@@ -25,6 +25,7 @@ from edge.pipeline.commands import Command
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
+from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.poses.timed_pose import TimedPose
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
