@@ -10,10 +10,10 @@ from argparse_manpage.manpage import Manpage
 
 from edge import __version__
 from edge.bench.options import bench_parser
+from edge.cli.main import COMMANDS
 from edge.cli.run_options import parser
 from edge.inference.bundled import bundled_models
 
-COMMANDS: Final = ("demo", "record", "replay", "map", "models", "baseline", "bench", "devices", "doctor")
 SHELLS: Final = {
     "bash": "bash-completion/completions/edge-sr",
     "zsh": "zsh/site-functions/_edge-sr",

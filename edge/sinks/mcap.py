@@ -147,7 +147,9 @@ class McapScans:
         if sensor in self._frames:
             self.add("", "/tf_static", TF_MESSAGE, unix_ns, transforms({frame: self._frames.pop(sensor)}, unix_ns))
         masks = mask_bits(scan.fresh), mask_bits(scan.renewed)
-        self.add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, frame, scan.on_bus_ns + self.offset_ns, *masks))
+        # Scans name where they came from themselves, however often they were played: a tool may copy them alone.
+        own = f"emulated/{sensor}" if kind == "emulated" else frame
+        self.add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, own, scan.on_bus_ns + self.offset_ns, *masks))
 
     def add_poses(self, poses: Sequence[TimedPose]) -> None:
         """Add poses."""

@@ -66,8 +66,13 @@ def test_what_a_tool_left_out_is_named(turned, tmp_path):
     assert "the mounting of sensor 4 is not in the file" in note and "--sensor FILE" in note
 
 
+def scans_alone(path, to):
+    return messages_alone(path, to, topics="/s4/scan")
+
+
 @pytest.mark.parametrize(
-    ("kind", "copy"), [("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone)]
+    ("kind", "copy"),
+    [("device", Path.rename), ("emulated", Path.rename), ("emulated", messages_alone), ("emulated", scans_alone)],
 )
 def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
     path = record_into(tmp_path / "first.mcap", make_results([make_scan()], source=kind))

@@ -48,8 +48,9 @@ def run(folder, name, *options, again=False):
     return report
 
 
-NAMES = [pytest.param(name, marks=pytest.mark.night) if name == "table3" else name for name in COLUMNS]
-"""Networks of the paper's size take half a minute."""
+AT_NIGHT = ("table3", "table4", "angle", "taps")
+"""Networks of the paper's size, and a training for each row, take half a minute."""
+NAMES = [pytest.param(name, marks=pytest.mark.night) if name in AT_NIGHT else name for name in COLUMNS]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -74,6 +75,7 @@ def test_table3_has_every_method_and_the_papers_figures(folder):
     assert float(rows["stsr"]["MMAC"]) == pytest.approx(7321, abs=1)
 
 
+@pytest.mark.night
 def test_networks_and_data_are_made_once(folder, capsys):
     run(folder, "taps", again=True)
     assert "steps in" not in capsys.readouterr().out

@@ -68,7 +68,7 @@ def run(*arguments, **environment):
         wait_for(lambda: not unfinished_load())
         for file in (out, err):
             file.seek(0)
-        return subprocess.CompletedProcess(arguments, code or 0, out.read(), err.read())
+        return subprocess.CompletedProcess(arguments, code if isinstance(code, int) else 0, out.read(), err.read())
 
 
 def start(*arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **settings):
