@@ -11,7 +11,6 @@ from browser_samples import (
     PAINTED,
     PHONE,
     RGBA,
-    SIZES,
     TOKEN,
     browser,
     colours_of,
@@ -42,7 +41,6 @@ from firmware_bridge.recording.formats import load_recording
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
-HAND = ("4", "6", "8", "10")
 RECONNECTS = 50
 FIRST_RECONNECTS = 15
 """Reconnects after which all that is made once exists."""
@@ -91,9 +89,6 @@ INKED = """canvas => {
   return Array.from({ length: width }, (_, x) =>
     Array.from({ length: height }, (_, y) => 4 * (y * width + x)).some(near));
 }"""
-INSIDE = """() => [...document.querySelectorAll(".pad")].map(one => one.getBoundingClientRect())
-  .every(({left, top, right, bottom, width}) =>
-    width >= 72 && left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight)"""
 SIDES = """all => all.map(one => one.getBoundingClientRect())
   .map(({left, top, right, bottom}) => [left, top, right, bottom])"""
 
@@ -392,49 +387,3 @@ def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
         playwright.expect(page.locator("#link")).to_contain_text("; no scan from ")
         playwright.expect(page.locator("#link")).to_have_attribute("data-up", "part")
         logged(page, "link lost")
-
-
-def test_four_pads_of_a_hand_are_opened_one_at_a_time(demo, folder, open_page):
-    rest = demo["counts"][:1] + noise(200, seed=2)
-    quiet = np.concatenate([rest[:150], np.full_like(rest[:1], -1).repeat(400, axis=0)])
-    broken = rest.copy()
-    broken[:, :, 1, 2] = 65_535
-    with emulated(folder, then_held(demo, pressed(demo)[0]), broken, rest, quiet) as run:
-        page = open_page(run.url)
-
-        def pad(sensor):
-            return page.locator(f'[data-pad="{sensor}"]')
-
-        def opened():
-            return page.eval_on_selector_all(".sensor:not([hidden])", "all => all.map(one => one.dataset.sensor)")
-
-        def reads(sensor, yes):
-            playwright.expect(pad(sensor).locator(".link")).to_have_attribute("data-up", yes)
-
-        playwright.expect(pad("4")).to_have_attribute("data-state", "contact")
-        playwright.expect(page.locator("#hand .pad")).to_have_count(4)
-        assert page.eval_on_selector_all("#hand .pad", "all => all.map(one => one.dataset.pad)") == list(HAND)
-        assert opened() == []
-        for width, height in (PHONE, *SIZES):
-            resize(page, width, height)
-            page.wait_for_function(INSIDE)
-        colours = colours_of(pad("4").locator("canvas").evaluate(RGBA)).reshape(-1, 4)
-        assert len(np.unique(colours, axis=0)) > 20, "a pattern"
-        pad("4").click()
-        live(page)
-        playwright.expect(part(page, "dead", "4")).to_be_hidden()
-        assert opened() == ["4"]
-        page.keyboard.press("]")
-        assert opened() == ["6"] and pad("6").get_attribute("aria-pressed") == "true"
-        playwright.expect(part(page, "dead", "6").filter(has_text="taxel 6 saturated")).to_be_visible()
-        page.keyboard.press("[")
-        page.keyboard.press("[")
-        assert opened() == ["10"]
-        playwright.expect(pad("10")).to_have_attribute("data-state", "silent")
-        reads("10", "no")
-        reads("8", "yes")
-        page.keyboard.press("Escape")
-        assert opened() == []
-        run.emulator.hang_up()
-        for sensor in HAND:
-            reads(sensor, "no")
