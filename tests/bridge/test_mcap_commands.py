@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bridge_samples import write_recording
-from cli_samples import run, start
+from cli_samples import start
 from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
@@ -188,14 +188,15 @@ class TestRecord:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
         path = tmp_path / "full.mcap"
-        done = run("record", path, *source_of(made, 100), preexec_fn=small_disk)
-        assert done.returncode == 5
+        process = start("record", path, *source_of(made, 60), preexec_fn=small_disk)
+        _, said = process.communicate()
+        assert process.returncode == 5
         recording = load_recording(path)
         scans = len(recording.tracks[0].counts)
-        assert done.stderr.splitlines()[-1] == (
+        assert said.splitlines()[-1] == (
             f"edge-sr: recording into {path} stopped: File too large; its {scans} scans can be played"
         )
-        assert f"recorded {path}: at most " in done.stderr
+        assert f"recorded {path}: at most " in said
         assert 0 < len(recording.tracks[0].counts) < 160 and path.stat().st_size <= limit
         assert recording.notes == (recording.notes[0],) and "without an end" in recording.notes[0]
 

@@ -10,6 +10,7 @@ from math import cos, radians, sin
 
 import numpy as np
 import pytest
+from bridge_samples import make_recording
 from cli_samples import base_options, files, records, start
 from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
@@ -19,6 +20,7 @@ from edge.pipeline.pose_intake import PoseIntake
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses
 from edge.pose_sources.stamped_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
+from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
 __all__ = ["files"]
@@ -246,8 +248,11 @@ class TestRos2:
     def test_a_program_counts_them(self, opened, publish, files, monkeypatch):
         pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
         opened("ros2:unused")  # sets the environment
-        options = [*base_options(files), "--source", "demo:loop", "--duration-s", "2", "--poses", "4=ros2:/arm/pose"]
-        with start(*options, "--sink", "jsonl:-") as process:
+        options = [*base_options(files), "--duration-s", "2", "--poses", "4=ros2:/arm/pose", "--sink", "jsonl:-"]
+        with (
+            Emulator([make_recording(300)], loop=True) as emulator,  # the demo's robot states poses of its own
+            start(*options, "--source", f"slcan:{emulator.port}") as process,
+        ):
             assert process.stdout is not None and process.stderr is not None
             lines = []
             for line in process.stdout:
@@ -258,7 +263,7 @@ class TestRos2:
             assert process.wait() == 0, err
         # The first ones may have waited for the program, and then be refused as out of order.
         assert [one["counters"] for line in lines for one in records(line) if "counters" in one][-1]["poses"] > 10
-        assert " 0 dropped" in err and "takes none" in err
+        assert "takes none" in err
 
 
 FLIPPED = (1.0, 0.0, 0.0, 0.0)
