@@ -6,7 +6,7 @@ PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --dis
 
 NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt checkpoints/mtsr7.pt
 
-.PHONY: run test lint docs wheels models reports reports-stale clean
+.PHONY: run test night lint docs wheels models reports reports-stale clean
 
 run: $(VENV)/.runtime  ## environment, runtime alone, demo on the live page
 	$(BIN)/edge-sr demo --view
@@ -15,6 +15,9 @@ test: $(VENV)/.dev  ## everything else, all tests; three at a time on two cores,
 	@$(BIN)/python -m pytest -q -m soak -p no:cacheprovider tests/system/test_chaos.py & soak=$$!; \
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not soak and not night"; tests=$$?; \
 	wait $$soak && test $$tests = 0
+
+night: $(VENV)/.dev  ## the tests that train and export for minutes
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m night
 
 lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
 	$(BIN)/ruff format --check .

@@ -88,6 +88,15 @@ class TestReading:
             file.write(b"\xff")
         assert latest(attach(name), "4") is None
 
+    def test_a_half_that_is_being_written_hides_nothing(self, sink, name):
+        """A writer killed half-way leaves the newest whole value."""
+        sink.write(make_result(5), {})
+        with Path("/dev/shm", name).open("r+b") as file:  # of sequence 2
+            file.seek(192 + 64)
+            file.write(b"\xff" * 5000)
+        half = latest(attach(name), "4")
+        assert half is not None and fields(half)["scan"] == 5
+
     def test_only_what_is_young_and_of_a_device_is_acted_on(self, sink, name):
         memory, now_ns = attach(name), time.monotonic_ns()
         result = replace(make_result(7, press_counts=3000, time_ns=now_ns), source="device")
