@@ -192,7 +192,7 @@ def test_a_short_file_by_hand_is_enough(tmp_path):
     [(None, 0.04, 0.04), (0.03, None, 0.03), (0.03, 0.04, 0.03), (0.04, 0.03, 0.03), (0.03, 0.03, 0.03)],
 )
 def test_of_gains_by_hand_and_learned_the_surer_are_used(by_hand, by_itself, used, tmp_path):
-    """Of constants those by hand."""
+    """The constants are those that were entered by hand."""
 
     def pad(width, gain, **constants):
         gains = {} if width is None else {"gains": (gain,) * 48, "gain_half_widths": (width,) * 48}

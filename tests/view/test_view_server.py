@@ -163,7 +163,7 @@ class TestFrames:
         assert (whole[(letter(x_mm, y_mm) == 0) & (np.abs(y_mm) < 8) & (np.abs(x_mm + 12) < 3)] > 0.9).all()
 
     def test_viewers_are_told_when_the_run_ends(self, tmp_path, monkeypatch):
-        """Whoever else is there, and says nothing, holds up no end."""
+        """A client that says nothing does not delay the end."""
         monkeypatch.setattr(server, "OPEN_S", 600.0)
         threads = threading.active_count()
         with ExitStack() as run:
