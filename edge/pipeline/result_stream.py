@@ -292,8 +292,8 @@ class Stream:
             try:
                 loop.step(wait_s)
             except Exception as error:
-                loop.finish()
                 self._error = self._error or error
+                loop.finish()
                 if len(loop.made) == seen:
                     raise
             finally:

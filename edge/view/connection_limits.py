@@ -34,14 +34,6 @@ class Connections:
         self._all: dict[Connection, None] = {}  # in order of arrival
         self._granted: set[Connection] = set()
 
-    def __len__(self) -> int:
-        return len(self._all)
-
-    @property
-    def granted(self) -> int:
-        """Number of viewers' places that are taken."""
-        return len(self._granted)
-
     def grant(self, connection: "Connection") -> bool:
         """Give a connection a viewer's place, if one is free."""
         if len(self._granted) >= MOST_VIEWERS or connection not in self._all:

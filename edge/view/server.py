@@ -116,11 +116,6 @@ class Server:
             with contextlib.suppress(RuntimeError):  # it has ended at that moment
                 loop.call_soon_threadsafe(self._news.set)
 
-    @property
-    def viewers(self) -> int:
-        """Number of viewers."""
-        return len(self._viewers)
-
     def _serve(self, run: Run, ready: threading.Event) -> None:
         try:
             asyncio.run(self._show(run, ready))
