@@ -37,13 +37,17 @@ PRESSED_SHARE: Final = 3
 """In contact, one sensor in so many is pressed, rounded up."""
 PARTS: Final = ("at rest", "in contact")
 COLUMNS: Final = ("what", "CPU %", "last byte to record p50 us", "p99 us", "lost", "MB")
+LOST: Final = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")
+"""Counters of scans without a pattern or a record, and of frames; those of the start do not count."""
+UNMATCHED: Final = ("missing_taxels", "missed", "resynchronised", "abandoned")
+"""Counters of what makes the numbers of scans differ from those of the emulator."""
 _SCANS: Final = 500
 _TEXT: Final = """\
 edge-sr in a process of its own reads emulated sensors, a process too, over pseudo-terminals, by buses of four. CPU is
 of all its threads, by the scheduler, in % of one core. At rest there is the status line alone; in contact a third of
 the sensors, at least one, is pressed, each scan gets a pattern, and records of some 25 kB go to a pipe that is read at
-once. Lost: scans without a pattern or a record, and frames that did not arrive; where there are any, records cannot be
-matched with scans. Medians of {} rounds of {:g} s, least to most in brackets."""
+once. Lost: scans without a pattern or a record, and frames that did not arrive, which leave records without their scan.
+Medians of {} rounds of {:g} s, least to most in brackets."""
 
 
 class Cost(NamedTuple):
@@ -141,7 +145,7 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
 def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost:
     """Measure one round of the program as it is in a tree; raises as `show_system`."""
     with tempfile.TemporaryDirectory() as name, edge_sr(Path(name), part, sensors, tree) as program:
-        program.records(SETTLE_S)
+        settled = program.records(SETTLE_S)
         before_s, start_s = program.cpu_s(), time.monotonic()
         records = program.records(seconds)
         cpu_percent = 100 * (program.cpu_s() - before_s) / (time.monotonic() - start_s)
@@ -150,14 +154,17 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
     for one in stamps.splitlines():
         sensor, _, time_ns = one.partition(" ")
         times_ns[sensor].append(int(time_ns))
-    counters = [record["counters"] for _, record in records if record.get("counters")]
-    names = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")
-    lost = sum(counters[-1].get(name, 0) for name in names) if counters else 0
-    if not records or lost:
+    first, last = _newest_counters(settled), _newest_counters([*settled, *records])
+    lost = sum(last.get(name, 0) - first.get(name, 0) for name in LOST)
+    if not records or any(last.get(name, 0) for name in UNMATCHED):
         return Cost(cpu_percent, None, None, lost, resident_mb)
     took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
     p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
     return Cost(cpu_percent, p50_us, p99_us, lost, resident_mb)
+
+
+def _newest_counters(records: Sequence[tuple[int, dict[str, Any]]]) -> dict[str, int]:
+    return next((record["counters"] for _, record in reversed(records) if record.get("counters")), {})
 
 
 @contextmanager

@@ -23,6 +23,7 @@ def scans(sequences):
     return force.scans_between(sequences, (0.2, 0.4), 3, [1])
 
 
+@pytest.mark.night
 def test_the_report_has_every_range_and_method(bench, tmp_path):
     page = force.run(bench, tmp_path)
     with page.with_suffix(".csv").open() as file:

@@ -42,6 +42,7 @@ def z_of(scans):
     return scans.windows[:, 0, 2].sum(axis=(1, 2))
 
 
+@pytest.mark.night
 def test_the_report_has_every_gauge_under_both_conditions(bench, tmp_path):
     page = force_recovery.run(bench, tmp_path)
     with page.with_suffix(".csv").open() as file:

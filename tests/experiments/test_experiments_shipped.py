@@ -78,6 +78,7 @@ def test_losses_are_press_by_press():
     assert row["model, up"] == "1.00 (1.00..1.00)" and row["model, down"] is None
 
 
+@pytest.mark.night
 def test_the_families_in_miniature(bench, tmp_path):
     page = families.run(bench, tmp_path).read_text()
     assert page.startswith("# families\n") and "quick run" in page
@@ -92,6 +93,7 @@ def test_the_families_in_miniature(bench, tmp_path):
     assert (tmp_path / "families.png").exists()
 
 
+@pytest.mark.night
 def test_the_pads_in_miniature(bench, tmp_path):
     pads.run(bench, tmp_path)
     rows = rows_of(tmp_path / "pads.csv")
@@ -99,6 +101,7 @@ def test_the_pads_in_miniature(bench, tmp_path):
     assert all(row["model, down"] and row["model, all known, up"] for row in rows)
 
 
+@pytest.mark.night
 def test_the_taps_in_miniature(tmp_path, tmp_path_factory):
     posed_taps.run(quick_bench(tmp_path_factory), tmp_path)
     parts = ("schedules", "known", "families", "wrong-poses", "paper")

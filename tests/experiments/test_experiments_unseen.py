@@ -74,6 +74,7 @@ def test_a_network_without_deviations_is_refused():
         intervals(build("srcnn", 10).eval(), frozen_of(truth, np.ones(2)))
 
 
+@pytest.mark.night
 def test_training_sets_keep_to_their_names(bench):
     surfaces = {name: set(data.family.tolist()) for name, data in unseen.training_sets(bench).items()}
     held_out = set(unseen.HELD_OUT)
@@ -108,6 +109,7 @@ def test_the_bound_is_on_the_mean_change_and_another_on_seen_surfaces(lift_db, m
     assert rows["3 held out"]["PSNR change dB"] == f"{lift_db:.2f} ({lift_db:.2f}..{lift_db:.2f})"
 
 
+@pytest.mark.night
 def test_the_report_has_every_training_set_on_every_test_set(page):
     rows = rows_of(page.with_suffix(".csv"))
     assert len({(row["trained on"], row["tested on"], row["taps"]) for row in rows}) == len(rows) == 5 * 4 * 2
