@@ -122,6 +122,8 @@ POSED = {"takes_poses": "true"}
         ({"traction_scale": "147"}, {"traction_scale": "148"}, "tractions of at most 1048576 numbers"),
         ({"contact_level": "0.999"}, {"contact_level": "1"}, "a number below 1"),
         ({"pad_inputs": '[["poisson", 0, 1e-6]]'}, {"pad_inputs": '[["poisson", 0, 9e-7]]'}, "spread from 1e-06"),
+        ({"pad_inputs": '[["poisson", 0.4999, 1]]'}, {"pad_inputs": '[["poisson", 0.5, 1]]'}, "a list of"),
+        ({"output_unit": '"m"'}, {"output_unit": '""'}, "a printable text of 1 to 100"),
         ({"pitch_mm": "1e-6"}, {"pitch_mm": "9e-7"}, "a positive number from 1e-06"),
         ({"counts_per_unit": "[1, 1, 1e-6]"}, {"counts_per_unit": "[1, 1, 9e-7]"}, "three positive numbers from"),
         (POSED | {"reach_mm": "1e-6"}, {"reach_mm": "0"}, "a number from 1e-06 for a model that takes poses"),
@@ -134,6 +136,12 @@ def test_a_contract_is_taken_up_to_its_limits(lawful, one_more, match):
     read(make_contract(), **lawful)
     with pytest.raises(ModelError, match=match):
         read(make_contract(), **lawful | one_more)
+
+
+def test_a_model_takes_no_gains_and_no_poses_unless_it_says_so():
+    contract = make_contract()
+    assert not contract.takes_gains and not contract.takes_poses and contract.pad_width == 0
+    assert len(replace(contract, takes_gains=True).pad_row(Pad(gains=(1.0,) * 48))) == 1
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"rows": 5}, {"cols": 5}, {"pitch_mm": 4.8}])
