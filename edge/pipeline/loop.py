@@ -2,7 +2,6 @@
 
 import math
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import Final
@@ -51,7 +50,7 @@ class Loop:
     Sinks get each result and event as soon as it is made.
 
     Attributes:
-        made: results and events that were made, in their order, until the stream takes them.
+        made: results and events of the step under way, in their order; the stream takes them at its end.
         statistics: of the results so far.
         poses: queue of the poses from outside.
         sinks: get results, events and poses.
@@ -73,7 +72,7 @@ class Loop:
         clock_s: Callable[[], float],
         clock_ns: Callable[[], int],
     ) -> None:
-        self.made: deque[Result | Event] = deque()
+        self.made: list[Result | Event] = []
         self.statistics = Statistics() if statistics is None else statistics
         self.poses = PoseQueue() if commands is None else commands.poses
         self.sinks = tuple(sinks)

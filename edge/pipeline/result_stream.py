@@ -2,9 +2,9 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 
 from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
@@ -77,6 +77,7 @@ class Stream:
             check_positive("duration_s", duration_s)
         self._source = source
         self._newest = NewestResults()
+        self._made: deque[Result | Event] = deque()
         self._on_event = on_event
         self._loop = Loop(
             source,
@@ -153,7 +154,7 @@ class Stream:
             raise UsageError(f"a pose: {error}") from error
 
     def __iter__(self) -> Iterator[Result]:
-        """Yield every result as soon as it is made, from the next one on.
+        """Yield every result from the next one on; those of scans that waited together come once all are made.
 
         Raises:
             LinkLostError: after every scan before it got its result.
@@ -161,7 +162,7 @@ class Stream:
             SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         """
         while True:
-            while self._loop.made:
+            while self._made:
                 result = self._next_made()
                 if result is not None:
                     self._newest.see(result)
@@ -173,7 +174,7 @@ class Stream:
     async def __aiter__(self) -> AsyncIterator[Result]:
         """Yield every result as `__iter__` does, beside other tasks; nothing is lost where one of them cancels it."""
         while True:
-            while self._loop.made:
+            while self._made:
                 result = self._next_made()
                 if result is not None:
                     self._newest.see(result)
@@ -261,7 +262,7 @@ class Stream:
 
     def _next_made(self) -> Result | None:
         """Return the next result; None after an event, which is told instead."""
-        made = self._loop.made.popleft()
+        made = self._made.popleft()
         if isinstance(made, Event):
             self._on_event(made)
             return None
@@ -269,7 +270,7 @@ class Stream:
 
     def _pass_over(self) -> None:
         """Tell what happened, and leave the results out that were made."""
-        while self._loop.made:
+        while self._made:
             self._next_made()
 
     def _round(self, wait_s: float) -> None:
@@ -288,18 +289,24 @@ class Stream:
         with self._turn:
             if self._error is not None:
                 raise self._error.with_traceback(None)  # else every call would lengthen it
-            loop, seen = self._loop, len(self._loop.made)
+            loop = self._loop
             try:
                 loop.step(wait_s)
             except Exception as error:
                 self._error = self._error or error
                 loop.finish()
-                if len(loop.made) == seen:
+                if not loop.made:
                     raise
             finally:
-                for one in islice(loop.made, seen, None):
-                    self._newest.tell(one) if isinstance(one, Event) else self._newest.add(one)
+                self._take_made()
                 self._newest.ended = loop.ended and self._error is None
+
+    def _take_made(self) -> None:
+        """Take what a step has made: from here on another task, or another thread, may have it."""
+        made, self._loop.made = self._loop.made, []
+        for one in made:
+            self._newest.tell(one) if isinstance(one, Event) else self._newest.add(one)
+        self._made += made
 
     async def _step_beside(self, wait_s: float = POLL_S) -> None:
         """Make the next results in a thread, once scans wait; they stay here if the task is cancelled."""
@@ -318,6 +325,7 @@ class Stream:
         self._loop.sinks = ()
         with self._turn:  # unless this is a callback of a step
             self._loop.finish()
+            self._take_made()
             self._pass_over()
             self._error = UsageError(
                 f"the stream of source {self._source.name} is closed: results that were left are old"

@@ -315,6 +315,27 @@ def test_a_task_that_is_cancelled_loses_no_result(way, when):
     assert asyncio.run(main()) == [0, 1]
 
 
+def test_a_task_gets_what_a_cancelled_one_began():
+    """A sensor at rest has its result while the model still runs for the other one."""
+
+    async def main():
+        with Source(FakeLink([[*scans(0, sensor="6", press=0), *scans(0)]])) as source:
+            model = SlowModel()
+            stream = stream_of(source, model=model)
+            task = asyncio.create_task(anext(aiter(stream)))
+            await until(model.begun)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            results = aiter(stream)
+            following = asyncio.create_task(anext(results))
+            await asyncio.sleep(0.01)
+            model.let.set()
+            return [(await following).scan.sensor, (await anext(results)).scan.sensor]
+
+    assert asyncio.run(main()) == ["6", "4"]
+
+
 def test_asyncio_is_told_of_errors_and_of_time():
     async def main():
         with Source(FakeLink([scans(0)], error=LinkLostError("gone"))) as source:
