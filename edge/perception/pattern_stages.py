@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
 from edge.inference.expected_error import expect
+from edge.inference.trust import Trust
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
@@ -15,7 +16,7 @@ from edge.perception.pattern_check import SAME_STRENGTH, PatternCheck, strangers
 from edge.perception.step import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
-from edge.perception.wrench import wrench_of
+from edge.perception.wrench import Balance, wrench_of
 from firmware_bridge.pad_geometry import SensorGeometry
 
 
@@ -95,12 +96,13 @@ def _which(number: int, *, alone: bool) -> str:
 class Describe:
     """Stage: everything that follows from a pattern: area, interval, expected error, wrench."""
 
-    def __init__(self, contract: Contract, geometry: SensorGeometry, pad: SensorPad) -> None:
+    def __init__(self, contract: Contract, trust: Trust | None, geometry: SensorGeometry, pad: SensorPad) -> None:
         self._contract, self._geometry, self._pad = contract, geometry, pad
+        self._balance = None if trust is None else Balance(trust.forward, geometry)
         self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
 
-    def __call__(self, made: Estimate) -> None:
-        """Add to an estimate what follows from its pattern."""
+    def __call__(self, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
+        """Add to an estimate what follows from its pattern; tap and newest readings as `Check` takes them."""
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")
@@ -113,5 +115,7 @@ class Describe:
             if contract.interval_factor is not None and touching.any():
                 made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
         if (traction := made.traction) is not None:
+            if self._balance is not None:
+                made.traction = traction = self._balance(traction, pattern, newest, tap, self._pad.row)
             made.wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
             made.wrench_origin = self._pad.wrench_origin

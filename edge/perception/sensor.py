@@ -84,7 +84,7 @@ class Sensor:
         self._doubt = BaselineDoubt(common.options, geometry.taxel_count, self.report)
         self._taps = Taps(self._tracker, self._watch, contract, common.options, self.report)
         self._check = Check(check, self._tracker, self._watch, self.report)
-        self._describe = Describe(contract, geometry, self.pad)
+        self._describe = Describe(contract, common.trust, geometry, self.pad)
         self._last = LastReading(geometry.scan_shape)
         self._learn: Learn | None = None
         if common.contacts is not None:
@@ -182,7 +182,7 @@ class Sensor:
             made.traction = None
             return
         self._check(step, made, due.tap, newest)
-        self._describe(made)
+        self._describe(made, due.tap, newest)
         if self._taps.advice is not None:
             self._taps.advice.see(step, due.tap)
         if self._learn is not None and self._learn(step, made, due.counts[0], self._watch.dead):

@@ -12,9 +12,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.inference.forward_model import GRID, KPA, ForwardModel, pooling
+from firmware_bridge.pad_geometry import SensorGeometry
+
 LEAST_FORCE_N: Final = 0.1
 """Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
 _N_OF_KPA_MM2: Final = 1e-3
+_LEVEL_SCANS: Final = 200
+"""Scans over which the level of a contact is taken, two seconds at 100 Hz: one that rolls on gets a new one."""
+_SHEAR_PRIOR_N2: Final = 5.0
+"""Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
 
 
 class Wrench(NamedTuple):
@@ -64,3 +71,88 @@ def _sums(height: int, width: int, pixel_mm: float) -> NDArray[np.float64]:
         *((none, none, y_mm), (none, none, -x_mm), (-y_mm, x_mm, none)),
     )
     return np.array([np.concatenate(row) for row in rows]) * (_N_OF_KPA_MM2 * pixel_mm**2)
+
+
+class Balance:
+    """Force of one sensor's contacts by the sums of its readings, over which the network's traction is distributed.
+
+    A network weighs each scan anew: the two pads of a gripper, which carry equal and opposite forces, disagree by it
+    where their plain sums agree. So changes of a force are those of the sums, and the network tells what the sums mean:
+    newtons for a count of z and counts of x and y that pressing alone makes, by the contact so far, and newtons for a
+    count of shear, by all contacts of the sensor.
+
+    Args:
+        forward: linear model of the readings.
+        geometry: of the sensor.
+    """
+
+    def __init__(self, forward: ForwardModel, geometry: SensorGeometry) -> None:
+        self._forward = forward
+        self._area_mm2 = geometry.rows * geometry.cols * geometry.pitch_mm**2
+        self._tap: int | None = None
+        self._pad_row: NDArray[np.float32] | None = None
+        self._pressing = np.zeros((2, 0))
+        self._counts_per_n: tuple[float, float] = (0.0, 0.0)
+        self._shear = (0.0, 0.0)
+        self._level = (0.0,) * 4
+
+    def __call__(
+        self,
+        traction_kpa: NDArray[np.float32],
+        pattern: NDArray[np.float32],
+        readings: NDArray[np.float32],
+        tap: int,
+        pad_row: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Return the traction whose force is that of the readings.
+
+        Args:
+            traction_kpa: (3, h, w), the network's.
+            pattern: (H, W) in [mm].
+            readings: (3, rows, cols) in network units, which both were made from.
+            tap: number of the contact.
+            pad_row: constants of the pad as model input.
+        """
+        if pad_row is not self._pad_row:
+            self._use_pad(pad_row, pattern.shape)
+        flat = traction_kpa.reshape(3, -1)
+        n_per_kpa = self._area_mm2 / flat.shape[1] * _N_OF_KPA_MM2
+        x_n, y_n, z_n = (flat.sum(axis=1) * n_per_kpa).tolist()
+        x, y, z = readings.reshape(3, -1).sum(axis=1).tolist()
+        if not (z > 0 and z_n >= LEAST_FORCE_N and min(self._counts_per_n) > 0):
+            return traction_kpa
+        if tap != self._tap:
+            self._tap, self._level = tap, (0.0,) * 4
+        # Least squares over the contact, whose strong scans count most: of the network's z force, and of what pressing
+        # adds to x and y, over the sum of z.
+        newest = (z * z, z * z_n, *(z * (self._pressing @ pattern.ravel())).tolist())
+        keep = 1 - 1 / _LEVEL_SCANS
+        squares, by_force, by_x, by_y = self._level = tuple(
+            keep * before + one for before, one in zip(self._level, newest, strict=True)
+        )
+        # The same over all contacts: of the network's shear, over that by nominal counts per newton.
+        shear_x, shear_y = (
+            (summed - z * by_axis / squares) / per_n
+            for summed, by_axis, per_n in zip((x, y), (by_x, by_y), self._counts_per_n, strict=True)
+        )
+        nominal, found = self._shear
+        nominal += shear_x * shear_x + shear_y * shear_y
+        found += shear_x * x_n + shear_y * y_n
+        self._shear = nominal, found
+        scale = max(found / nominal, 0.0)
+        # Shear that the network has not found, or too much of it, lies where the pad is pressed.
+        more_x, more_y = (scale * shear_x - x_n) / z_n, (scale * shear_y - y_n) / z_n
+        mixed = np.array([(1, 0, more_x), (0, 1, more_y), (0, 0, z * by_force / squares / z_n)], dtype=np.float32)
+        return (mixed @ flat).reshape(traction_kpa.shape)
+
+    def _use_pad(self, pad_row: NDArray[np.float32], pattern_shape: tuple[int, ...]) -> None:
+        """Sum a pad's operator over the taxels: readings of x and y that a pattern makes, and those of 1 N of drag."""
+        operator = self._forward.of_pad(pad_row[: len(self._forward.operator) - 1])
+        summed = operator.reshape(3, -1, operator.shape[1])[:2].sum(axis=1)
+        pattern, drag = summed[:, : GRID**2].reshape(2, GRID, GRID), summed[:, GRID**2 :].reshape(2, 2, -1)
+        height, width = pattern_shape
+        self._pressing = (pooling(height).T @ pattern @ pooling(width)).reshape(2, -1)
+        dragged_n = KPA * self._area_mm2 * _N_OF_KPA_MM2
+        self._counts_per_n = (float(drag[0, 0].sum()) / dragged_n, float(drag[1, 1].sum()) / dragged_n)
+        self._shear = _SHEAR_PRIOR_N2, _SHEAR_PRIOR_N2
+        self._pad_row = pad_row

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from edge.api import infer
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
@@ -13,6 +14,9 @@ PATHS = recording_paths(RECORDINGS)
 LEAST_SHARE, MOST_UNEVEN, MOST_DOUBTED = 0.9, 0.3, 0.02
 DENTED = "data_sample_2022-02-22-08-10-01"
 """The weakest grip, a documented fault: on both fingers the pattern has a dent below half (docs/decisions.md)."""
+
+HELD_COUNTS = 6000
+"""Summed z of a pad that holds something for sure."""
 
 pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECORDINGS} (TACTILE_RECORDINGS)")
 
@@ -64,3 +68,21 @@ def test_patterns_of_real_grips_are_believed(played):
     assert model.contract.read_trust() is not None, "the default model has no checks"
     believed = np.concatenate([one.believed for one in played.values()])
     assert len(believed) > 1000 and believed.mean() >= 1 - MOST_DOUBTED
+
+
+def test_two_pads_of_one_grip_carry_equal_and_opposite_forces():
+    """By the wrench as nearly as by the plain sums of counts, which know nothing of patterns."""
+    grips = recorded_grips(RECORDINGS)
+    for trial in dict.fromkeys(grip.trial for grip in grips):
+        pads = [(infer(DEFAULT_MODEL, grip.counts, grip.free), grip) for grip in grips if grip.trial == trial]
+        scans = min(len(results) for results, _ in pads)
+        sums = np.array([(grip.counts - grip.free.counts).sum(axis=(2, 3))[:scans] for _, grip in pads])
+        none = (np.nan,) * 3
+        forces = np.array(
+            [[none if one.wrench is None else one.wrench.force_n for one in results[:scans]] for results, _ in pads]
+        )
+        held = (sums[:, :, 2] > HELD_COUNTS).all(axis=0) & np.isfinite(forces).all(axis=(0, 2))
+        assert held.sum() > 100, trial
+        mirrored, mirrored_counts = (np.corrcoef(*one[:, held, 1])[0, 1] for one in (forces, sums))
+        scatter, scatter_counts = (np.divide(*one[:, held, 2]).std() for one in (forces, sums))
+        assert mirrored < mirrored_counts + 0.15 and scatter < 1.2 * scatter_counts, trial

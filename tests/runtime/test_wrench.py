@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
-from edge.perception.wrench import LEAST_FORCE_N, wrench_of
+from edge.api import find_model, load_model
+from edge.inference.forward_model import features
+from edge.perception.wrench import LEAST_FORCE_N, Balance, wrench_of
 from edge.sinks.jsonl import record_line
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import force_and_torque
@@ -65,6 +67,44 @@ def test_of_a_light_touch_no_centre_is_told(share, told):
 @pytest.mark.parametrize(("traction_kpa", "ratio"), [((3, -4, 10), 0.5), ((0, 0, 10), 0), ((1, 0, -10), None)])
 def test_the_ratio_of_shear_is_that_of_the_forces(traction_kpa, ratio):
     assert wrench_of(even(*traction_kpa), PIXEL_MM).shear_ratio == pytest.approx(ratio)
+
+
+@pytest.fixture(scope="module")
+def press():
+    """Readings of a press to the right of the middle under 4 N of drag, by the bundled model's own operator."""
+    contract = load_model(find_model("stsr-int8")).contract
+    forward, row = contract.read_trust().forward, np.zeros(contract.pad_width, np.float32)
+    pattern = np.zeros(contract.pattern_shape, np.float32)
+    pattern[10:30, 24:36] = 0.3
+    drag_n = np.array([4.0, -2.0], np.float32)
+    traction = even(*drag_n * 1000 / AREA_MM2, z=20.0)
+    operator = forward.of_pad(row[: len(contract.pad_inputs)])
+    readings = (operator @ features(pattern, traction)).reshape(3, 4, 4)
+    return Balance(forward, USPA44), pattern, traction, readings, row, drag_n
+
+
+def test_force_in_a_contact_changes_as_its_readings_do_whatever_the_network_finds(press):
+    balance, pattern, traction, readings, row, drag_n = press
+    level_n = wrench_of(traction, PIXEL_MM).force_n[2]
+    for number, (strength, off) in enumerate([(1.0, 1.0)] * 40 + [(1.0, 1.1), (1.2, 0.8), (0.8, 1.3)]):
+        found = traction * np.array([off, 2 - off, off], np.float32)[:, None, None] * np.float32(strength)
+        balanced = balance(found, pattern * np.float32(strength), readings * np.float32(strength), 7, row)
+        force_n = wrench_of(balanced, PIXEL_MM).force_n
+        assert force_n[2] == pytest.approx(strength * level_n, rel=0.02), number
+        assert force_n[:2] == pytest.approx(strength * drag_n, abs=0.05 if strength == 1 else 0.4), number
+
+
+def test_each_contact_has_a_level_of_its_own(press):
+    balance, pattern, traction, readings, row, _ = press
+    for tap, off in enumerate([1.0, 0.7, 1.3]):
+        force_n = wrench_of(balance(traction * np.float32(off), pattern, readings, tap, row), PIXEL_MM).force_n
+        assert force_n[2] == pytest.approx(off * wrench_of(traction, PIXEL_MM).force_n[2])
+
+
+def test_where_nothing_presses_the_traction_stays(press):
+    balance, pattern, traction, readings, row, _ = press
+    assert balance(traction, pattern, -readings, 0, row) is traction
+    assert balance(traction * np.float32(0.001), pattern, readings, 0, row).max() == traction.max() * np.float32(0.001)
 
 
 def test_a_record_has_the_traction_summed_up():
