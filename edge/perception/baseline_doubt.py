@@ -67,16 +67,10 @@ def doubt_text(doubt: Doubt, counts: tuple[float, float, float], age_s: float | 
 class BaselineDoubt:
     """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends.
 
-    Args:
-        options: thresholds of taps.
-        taxels: number of the sensor's taxels.
-        report: takes the events.
-
     Attributes:
         doubt: why the newest readings are in doubt; None if they are not.
         counts: medians of all taxels on x, y, z when that began.
-        reported: the doubt of the newest step that was judged; None without.
-        notes: the same for the user.
+        reported: the doubt of the newest step that was judged; `notes` state it for the user.
     """
 
     def __init__(self, options: RuntimeOptions, taxels: int, report: Report) -> None:
@@ -125,13 +119,7 @@ class BaselineDoubt:
         step.doubted = doubt is not None
 
     def weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
-        """Return why a scan's readings are in doubt, or None.
-
-        Args:
-            zeroed: (3, rows, cols) in counts over the baseline.
-            z_counts: their summed z.
-            time_ns: of the scan, in [ns].
-        """
+        """Return why readings (3, rows, cols) over the baseline, of a summed z, are in doubt; None if they are not."""
         self._newest = zeroed
         if self._held:
             return "held"

@@ -24,11 +24,9 @@ MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 
 
 class LastReading:
-    """Readings that a sensor's last pattern was made from; allocates nothing after construction.
+    """Readings, scan number and estimate of a sensor's last pattern; allocates nothing after construction.
 
-    Attributes:
-        estimate: what was made of them; None before the first, and where it must not be used again.
-        scan_number: of their scan.
+    The estimate is None before the first, and where it must not be used again.
     """
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
@@ -40,12 +38,10 @@ class LastReading:
         self._poses: NDArray[np.float32] | None = None
 
     def holds(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> bool:
-        """Return whether nothing has changed: zeroed readings and poses beyond noise, and the pattern's maker.
+        """Return whether readings (3, rows, cols) and poses (taps, 5) have not changed beyond noise, nor the maker.
 
-        Args:
-            counts: (3, rows, cols).
-            made_by: what distinguishes the pattern from others; it includes the number of taps.
-            poses: (taps, 5) of the taps, for a model that takes them.
+        The maker is what distinguishes the pattern from others, with its number of taps; poses are None for a model
+        without.
         """
         if made_by != self._made_by:
             return False

@@ -13,16 +13,9 @@ def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
 def touched_patch(
     pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
 ) -> tuple[float, tuple[float, float] | None]:
-    """Return area and centroid of the touched pixels.
+    """Return area in [mm2] and pattern-weighted centroid of the touched pixels of a pattern (H, W), above zero there.
 
-    Args:
-        pattern: (H, W).
-        touching: (H, W), the touched pixels; the pattern is above zero there.
-        pixel_pitch_mm: distance of neighbouring pixels, in [mm].
-
-    Returns:
-        Area in [mm2]; pattern-weighted centroid x, y in [mm] from the pattern's centre, x to the
-        right and y down, or None if no pixel is touched.
+    The centroid is x, y in [mm] from the pattern's centre, x to the right and y down; None if no pixel is touched.
     """
     rows, cols = np.nonzero(touching)
     if rows.size == 0:

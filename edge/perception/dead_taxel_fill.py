@@ -30,13 +30,7 @@ _Z: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Readings with estimates in the place of dead taxels.
-
-    Attributes:
-        counts: (3, rows, cols) float32, for the network; finite.
-        z_counts: summed z.
-        filled: kind of the estimates.
-    """
+    """Readings (3, rows, cols) with estimates in the place of dead taxels, their summed z, and the kind of estimate."""
 
     counts: NDArray[np.float32]
     z_counts: float

@@ -23,17 +23,11 @@ from firmware_bridge.scans.pad_constants import Pad
 class SensorPad:
     """Constants and gains of a sensor, which may be learned while it runs.
 
-    Args:
-        contract: of the model.
-        pad: what is known of it; None for nothing.
-        counts_per_newton: of the sensor, which stands for those that the pad lacks.
-        check: of its patterns, which takes the same pad; None without checks.
-
     Attributes:
-        counts_per_newton: summed z per [N], if that is known.
+        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
         row: the constants as model input.
         gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
-        gains_certainty: of the gains that are available, see firmware_bridge.scans.pad_constants.Pad; None without.
+        gains_certainty: of these gains; None without.
         wrench_origin: whether the model gets the sensor's counts per newton.
     """
 
@@ -86,13 +80,7 @@ class GainFollower:
     """
 
     def __init__(self, model: ContactModel, measured: Pad | None, used: Pad | None = None) -> None:
-        """Begin.
-
-        Args:
-            model: distribution of contacts.
-            measured: pad as it was measured or entered by hand; None without.
-            used: pad in use, also by what was learned before; None for the measured one.
-        """
+        """Begin with the pad as measured, and the one in use, also by what was learned before."""
         self.waiting = False
         self._learner = GainLearner(model, measured)
         self._from_file = measured is not None and measured.gains is not None
@@ -150,12 +138,6 @@ class GainFollower:
 
 class Learn:
     """Stage: brings what contacts teach of a sensor into use, and reports it.
-
-    Args:
-        follower: of the sensor's gains.
-        pad: of the sensor.
-        check: of its patterns; None without checks.
-        report: takes the events.
 
     Attributes:
         waiting: a contact is there to be learned from, once the pad is free.

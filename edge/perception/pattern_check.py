@@ -93,12 +93,7 @@ class Verdict:
 
 
 class PatternCheck:
-    """Checks of one sensor's patterns, with what its contacts have shown so far.
-
-    Args:
-        trust: of the model.
-        contract: of the model.
-    """
+    """Checks of one sensor's patterns, with what its contacts have shown so far."""
 
     def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
@@ -116,12 +111,7 @@ class PatternCheck:
         self.suspected = self._wrong_file = True
 
     def use_pad(self, pad_row: NDArray[np.float32], *, outside: bool = False) -> None:
-        """Check from now on with a pad as model input; what contacts have shown so far stays.
-
-        Args:
-            pad_row: see `Contract.pad_row`.
-            outside: the pad is far outside those of the training.
-        """
+        """Check from now on with a pad as model input, maybe far outside those of the training; the evidence stays."""
         self._pad_row, self._outside = pad_row, outside
         self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
         certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
@@ -130,12 +120,9 @@ class PatternCheck:
     def belonging(
         self, window: NDArray[np.float32], taps: int, poses: NDArray[np.float32] | None = None
     ) -> list[float]:
-        """Return how little each earlier tap belongs to the newest one: 0 to 1, and from .5 it does not.
+        """Return how little each earlier tap belongs to the newest one: 0 to 1, and from 0.5 it does not.
 
-        Args:
-            window: (K, 3, rows, cols) in network units, newest tap first.
-            taps: taps in it; the rest is empty.
-            poses: (K, 5) as edge.inference.pose_input makes them, for a model that takes poses.
+        The window is (K, 3, rows, cols) in network units, newest first, of so many taps; poses (K, 5) as model input.
         """
         check = self._trust.tap
         if taps < 2:
@@ -152,15 +139,10 @@ class PatternCheck:
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> Verdict:
-        """Return the verdict on a pattern, and remember what its contact shows of the sensor.
+        """Return the verdict on a contact's pattern, and remember what the contact shows of the sensor.
 
-        Args:
-            tap: number of the contact.
-            newest: (3, rows, cols) in network units, the readings that it was made from.
-            pattern: (H, W) in [mm].
-            deviation: (H, W) in [mm], if the model gives one.
-            traction: (3, h, w) in [kPa], if the model gives one.
-            repeats: scans for which some taxel has repeated itself while most others were new.
+        Readings (3, rows, cols) are in network units, pattern and deviation (H, W) in [mm], traction (3, h, w) in
+        [kPa]; repeats are scans for which some taxel has repeated itself while most others were new.
         """
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
@@ -203,13 +185,9 @@ class PatternCheck:
 
 
 def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
-    """Return the numbers, from 1, of the earlier taps that a pattern is made without.
+    """Return the numbers, from 1, of the earlier taps that a pattern is made without, by `PatternCheck.belonging`.
 
     A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.
-
-    Args:
-        belonging: of the earlier taps, newest first, see `PatternCheck.belonging`.
-        posed: each has a pose of its own.
     """
     found = [number for number, share in enumerate(belonging, 1) if share >= NOT_OF_IT]
     return found if posed or not found else list(range(found[0], len(belonging) + 1))

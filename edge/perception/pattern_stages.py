@@ -21,14 +21,7 @@ from firmware_bridge.pad_geometry import SensorGeometry
 
 
 class Check:
-    """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from.
-
-    Args:
-        check: decides, and remembers what contacts have shown; None where the model has no checks.
-        taps: of the sensor; a tap that belongs to another contact is forgotten there.
-        watch: over its taxels.
-        report: takes the events.
-    """
+    """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from."""
 
     def __init__(self, check: PatternCheck | None, taps: TapTracker, watch: TaxelWatch, report: Report) -> None:
         self._check, self._taps, self._watch, self._report = check, taps, watch, report
@@ -36,15 +29,10 @@ class Check:
     def belonging(
         self, step: Step, window: Window, scaled: NDArray[np.float32]
     ) -> tuple[list[int], tuple[float, ...] | None]:
-        """Return the numbers of the taps that belong to the contact, and the mismatch of each earlier one.
+        """Return the numbers of the taps of a window that belong to the contact, and the mismatch of each earlier one.
 
         A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
-        Which taps go with it is stated by edge.perception.pattern_check.strangers.
-
-        Args:
-            step: that the window is of.
-            window: the taps.
-            scaled: (K, 3, rows, cols), the same in network units.
+        `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
         if self._check is None or window.taps < 2 or step.doubted:
@@ -67,14 +55,7 @@ class Check:
         return [number for number in every if number not in dropped], belonging
 
     def __call__(self, step: Step, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
-        """Give the verdict on an estimate.
-
-        Args:
-            step: that it is of.
-            made: with the model's pattern.
-            tap: number of the contact.
-            newest: (3, rows, cols) in network units, the readings that the pattern was made from.
-        """
+        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units."""
         if made.deviation is not None and step.dead:
             made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
         check = self._check

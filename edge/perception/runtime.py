@@ -1,6 +1,5 @@
 """Scan in, result out: all state between scans is kept here, per sensor."""
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
@@ -25,8 +24,8 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.stillness import STILL_COUNTS
 from firmware_bridge.zeroing.baseline import Baseline
 
-_SMOOTHING: Final = 0.1
-"""Share of the newest call in the time that a pattern is expected to take."""
+MOST_TOGETHER: Final = 4
+"""Sensors whose patterns are made in one call: scans that come meanwhile wait for its end."""
 
 
 class Runtime:
@@ -101,7 +100,8 @@ class Runtime:
         self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
-        self._queue = WaitingSteps()
+        # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
+        self._waiting: dict[str, tuple[Sensor, Step]] = {}
         self._tracks: dict[str | None, PoseTrack] = {}
 
     def __repr__(self) -> str:
@@ -126,11 +126,9 @@ class Runtime:
         self._report("reset")
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero again from the next scans; the old baselines stay in use until then, and an event reports the outcome.
+        """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome.
 
-        Args:
-            name: of the sensor; None for all.
-            force: also in contact.
+        The old baselines stay in use until then.
         """
         if not self._sensors:
             self._report("refused", "zeroing refused: no scan has arrived yet")
@@ -141,13 +139,9 @@ class Runtime:
             sensor.zero_again(force=force)
 
     def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
-        """Take a pose of a pad; False if one at the same time or later was taken before.
+        """Take a pose of a pad at a monotonic time in [ns]; False unless it is later than the one before.
 
-        Args:
-            pose: of the pad in the object's plane.
-            time_ns: monotonic time of the pose, in [ns].
-            sensor: name of the sensor; None for every sensor without poses of its own.
-            holds: the pad rests there until the next pose.
+        Without a sensor it is of every sensor without poses of its own; a pose that holds is one until the next.
         """
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
 
@@ -158,11 +152,9 @@ class Runtime:
         return result.state == "idle" and counts is not None and counts < seen_counts
 
     def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
-        """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.
+        """Forget readings and taps of sensors whose names begin so, after their link broke; zeroing stays.
 
-        Args:
-            sensors: prefix of the names of the sensors concerned; all by default.
-            same_pad: it cannot be another one since, as in a recording that goes on from another place.
+        Contacts may have been missed, but a recording that goes on from another place is of the `same_pad`.
         """
         for name, sensor in self._sensors.items():
             if name.startswith(sensors):
@@ -185,39 +177,40 @@ class Runtime:
         """Take a scan and return the results that are ready, in the order of their scans.
 
         A scan that needs a pattern waits for `infer`. If the next one of its sensor comes first, its result is ready
-        without a pattern, and the newer scan takes its place: no sensor waits longer because it sends more.
-
-        Args:
-            scan: next one of its sensor.
-            clock_ns: clock of the scans, by which results state their latency, in [ns]; None leaves it out.
+        without a pattern, and the newer scan takes its place. Results state their latency by the clock of the scans.
 
         Raises:
             WindowError: the scan is not of this sensor geometry.
         """
         sensor, step = self._follow(scan)
+        overtaken = self._waiting.get(scan.sensor) if self._waiting else None
+        ready: list[Result] = []
+        if overtaken is not None:
+            overtaken[1].overtake()
+            ready.append(overtaken[1].freeze())
         if step.due is not None and not sensor.reuse(step, step.due):
-            return [overtaken.freeze() for overtaken in self._queue.join(sensor, step)]
+            self._waiting[scan.sensor] = sensor, step
+            return ready
+        if overtaken is not None:
+            del self._waiting[scan.sensor]
         if step.estimate is not None and clock_ns is not None:
             step.ready(clock_ns())
-        return [*(overtaken.freeze() for overtaken in self._queue.leave(scan.sensor)), step.freeze()]
+        ready.append(step.freeze())
+        return ready
 
     @property
     def waiting(self) -> int:
         """Number of sensors whose newest scan waits for its pattern."""
-        return len(self._queue)
+        return len(self._waiting)
 
-    def infer(self, longest_us: float | None = None, clock_ns: Callable[[], int] | None = None) -> list[Result]:
-        """Infer the patterns of the sensors that have waited longest, in one call, and return their results.
-
-        Args:
-            longest_us: time that the call may take, in [us], None for no limit; those that do not fit wait on.
-            clock_ns: as in `take`.
+    def infer(self, clock_ns: Callable[[], int] | None = None) -> list[Result]:
+        """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call.
 
         Raises:
             ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
                 above zero.
         """
-        due = self._queue.take(longest_us)
+        due = [self._waiting.pop(sensor) for sensor in list(self._waiting)[:MOST_TOGETHER]]
         if not due:
             return []
         self._infer(due)
@@ -247,7 +240,6 @@ class Runtime:
         pads = [sensor.pad.row for sensor, _, _ in due]
         patterns = model.run_together([given for _, given in begun], pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
-        self._queue.took(run_time_us / len(due))
         deviations, tractions = model.deviation, model.traction
         for row, ((sensor, step, window), (made, given)) in enumerate(zip(due, begun, strict=True)):
             made.pattern, step.run_time_us = patterns[row].copy(), run_time_us
@@ -269,46 +261,3 @@ class Runtime:
         )
         self._sensors[name] = sensor = Sensor(name, self._common, settings, scan.time_ns)
         return sensor
-
-
-class WaitingSteps:
-    """Queue of one step a sensor, that of its newest scan: no sensor waits longer because another sends more."""
-
-    def __init__(self) -> None:
-        # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
-        self._waiting: dict[str, tuple[Sensor, Step]] = {}
-        self._pattern_us = 0.0
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def join(self, sensor: Sensor, step: Step) -> list[Step]:
-        """Let a step wait for its pattern in its sensor's place; return the one that it overtakes, if any."""
-        overtaken = self._waiting.get(step.scan.sensor)
-        self._waiting[step.scan.sensor] = sensor, step
-        return _overtaken(overtaken)
-
-    def leave(self, sensor: str) -> list[Step]:
-        """Give up a sensor's place, since its newest scan needs none; return the step that waited, if any."""
-        return _overtaken(self._waiting.pop(sensor, None)) if self._waiting else []
-
-    def take(self, longest_us: float | None) -> list[tuple[Sensor, Step]]:
-        """Return those that have waited longest, one at least, as many as are inferred in so long, in [us].
-
-        Of calls that are needed for all of them, each takes as many.
-        """
-        count = len(self._waiting)
-        if longest_us is not None and count:
-            count = math.ceil(count / max(1, math.ceil(count * self._pattern_us / longest_us)))
-        return [self._waiting.pop(sensor) for sensor in list(self._waiting)[:count]]
-
-    def took(self, pattern_us: float) -> None:
-        """Learn the time that each pattern of a call took, in [us]."""
-        self._pattern_us += (_SMOOTHING if self._pattern_us else 1.0) * (pattern_us - self._pattern_us)
-
-
-def _overtaken(waited: tuple[Sensor, Step] | None) -> list[Step]:
-    if waited is None:
-        return []
-    waited[1].overtake()
-    return [waited[1]]

@@ -56,12 +56,7 @@ class Settings:
 
 
 class Sensor:
-    """Stages of one sensor, in their order: `follow` before the model, `finish` after it.
-
-    Attributes:
-        pad: what the model is told of it.
-        events: what has happened since the last scan; the next one takes them.
-    """
+    """Stages of one sensor, in their order: `follow` before the model, `finish` after it."""
 
     def __init__(self, name: str, common: Common, settings: Settings, time_ns: int) -> None:
         """Begin with the sensor's first scan, at a time in [ns]."""
@@ -97,12 +92,9 @@ class Sensor:
             self._doubt.begin(settings.baseline.origin)
 
     def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
-        """Pass a step through the stages before the model; where a pattern is due it has a window then.
+        """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
 
-        Args:
-            step: of this sensor's next scan.
-            track: poses of its pad; None where there are none.
-            events: of all sensors, which the step takes with those of its own.
+        It takes the events of all sensors with those of its own; `track` has the poses of its pad, None without.
         """
         scan = step.scan
         if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
@@ -167,14 +159,7 @@ class Sensor:
         return made, scaled
 
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
-        """Pass a step through the stages after the model.
-
-        Args:
-            step: of this sensor.
-            due: taps that its pattern was due of.
-            made: the pattern, and what the model gives with it.
-            newest: (3, rows, cols) in network units, the readings that it was made from.
-        """
+        """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
         step.estimate = made
         self._last.keep(due.counts[0], due.made_by, due.poses)
         self._last.estimate, self._last.scan_number = made, step.scan.number

@@ -79,7 +79,6 @@ class Step:
         readings: (3, rows, cols) in counts over the baseline, with estimates for dead taxels.
         doubted: drift or an old baseline explains the readings as well as a touch.
         due: taps of which a pattern is due; None where none is.
-        estimate: the pattern and what follows from it, once there is one.
     """
 
     readings: NDArray[np.float32] | None = None

@@ -21,24 +21,16 @@ many holes as one alone (docs/decisions.md)."""
 
 
 class PosedTaps(NamedTuple):
-    """Taps that a pattern can be made from.
-
-    Attributes:
-        slots: their places in the tracker's window, newest first.
-        rows: (taps, 5), their poses as model input.
-    """
+    """Taps that a pattern can be made from: places in the tracker's window, newest first, and poses as model input."""
 
     slots: Sequence[int]
     rows: NDArray[np.float32]
 
 
 class TapPoses:
-    """Poses of one sensor's taps: each earlier tap has that of its peak.
+    """Poses of one sensor's taps: each earlier tap has that of its peak, and each that is left out an event.
 
-    Args:
-        contract: of a model that takes poses.
-        scheduled: most taps while the sensor has no poses, which then follow the paper's schedule.
-        report: takes an event for each tap that is left out, once.
+    While the sensor has no poses, so many `scheduled` taps at most follow the paper's schedule.
     """
 
     def __init__(self, contract: Contract, scheduled: int, report: Callable[[EventKind, str], object]) -> None:
@@ -65,13 +57,7 @@ class TapPoses:
             self._reported &= remembered | {tap.tap}
 
     def choose(self, tap: TapState, pose: PadPose | None, *, scheduled: bool) -> PosedTaps:
-        """Return the taps to use during contact.
-
-        Args:
-            tap: state of the tracker.
-            pose: of the newest tap's pad at this scan; None if it is not available.
-            scheduled: the sensor has no poses, so its taps follow the paper's schedule.
-        """
+        """Return the taps to use during contact; the pose is that of the newest tap's pad at this scan."""
         if scheduled:
             taps = min(tap.taps_used, self._scheduled)
             return PosedTaps(range(taps), scheduled_rows(taps, self._step_deg))

@@ -22,12 +22,7 @@ MIN_TAP_SCANS: Final = 2
 
 
 class TapPeak(NamedTuple):
-    """Peak of an earlier tap.
-
-    Attributes:
-        tap: number of the tap.
-        time_ns: when the readings of its peak were taken, in [ns].
-    """
+    """Peak of an earlier tap: the tap's number, and when its readings were taken, in [ns]."""
 
     tap: int
     time_ns: int
@@ -62,12 +57,7 @@ class TapTracker:
         options: RuntimeOptions = DEFAULTS,
         grid_shape: tuple[int, int] = (USPA44.rows, USPA44.cols),
     ) -> None:
-        """Start without contact.
-
-        Args:
-            taps: K, the length of the window.
-            options: thresholds of taps, and when earlier ones are forgotten.
-            grid_shape: (rows, cols) of the sensor.
+        """Start without contact, with a window of K taps of a grid (rows, cols).
 
         Raises:
             UsageError: `taps` is less than 1.
@@ -117,17 +107,10 @@ class TapTracker:
         *,
         doubted: bool = False,
     ) -> TapState:
-        """Take one scan and return the new state.
+        """Take one scan of zeroed counts (3, rows, cols) and return the new state.
 
-        The idle time is measured between scans, from the last one in contact. Time that runs
-        backwards counts as no time; a gap within a tap does not end the tap.
-
-        Args:
-            deformation: (3, rows, cols) float32, zeroed counts.
-            time_ns: of the scan, in [ns].
-            z_counts: its summed z, if available more exactly than from `deformation`.
-            taken_ns: when its readings were taken, in [ns]; by default `time_ns`.
-            doubted: it is no contact, whatever its z.
+        The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
+        time; a gap within a tap does not end the tap. A doubted scan is no contact, whatever its z.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
         if self._contact:

@@ -27,12 +27,7 @@ _SHIFTS_MM: Final = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if 
 
 
 class TapAdvice:
-    """Proposal for one sensor: made once, when a tap ends, and kept until the next one begins.
-
-    Args:
-        reach_mm: distance beyond which the model takes no tap, in [mm].
-        taps: most taps of a pattern.
-    """
+    """Proposal for one sensor: made once, when a tap ends, and kept until the next one begins."""
 
     def __init__(self, reach_mm: float, taps: int) -> None:
         self._reach_mm, self._taps = reach_mm, taps
@@ -72,14 +67,10 @@ class TapAdvice:
 
 
 def next_shift_mm(places_mm: NDArray[np.floating], reach_mm: float) -> tuple[float, float] | None:
-    """Return the shift from the newest tap, of half a pitch along x, y or both, at which the pad touches next.
+    """Return the shift dx, dy in [mm] from the newest tap, of half a pitch along x, y or both, to touch next.
 
-    Args:
-        places_mm: (K, 2) of the taps so far in the newest one's axes.
-        reach_mm: distance from every tap that the next one must not exceed.
-
-    Returns:
-        dx, dy in [mm]; None where each place was touched or is out of reach.
+    Places (K, 2) of the taps so far are in the newest one's axes, and the next one must not be further than the reach
+    from any of them; None where each place was touched or is out of reach.
     """
     apart_mm = np.hypot(*(_SHIFTS_MM[:, None] - places_mm).transpose(2, 0, 1))
     free = (apart_mm > _HALF_PITCH_MM / 2).all(axis=1) & (apart_mm <= reach_mm).all(axis=1)
@@ -109,13 +100,6 @@ NO_TAP = -1
 
 class Taps:
     """Stage: contact, the window of taps, their poses, and where to touch next.
-
-    Args:
-        tracker: of the sensor's taps.
-        watch: over its taxels.
-        contract: of the model.
-        options: thresholds of taps, and how many a pattern is made from at most.
-        report: takes an event for each tap that is left out.
 
     Attributes:
         advice: proposes where to touch next; None for models that take no poses.

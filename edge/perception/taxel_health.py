@@ -221,12 +221,7 @@ class TaxelWatch:
         return False
 
     def _may_be_far(self, zeroed: NDArray[np.float32], largest: float) -> bool:
-        """Return quickly whether a taxel may be far, if all taxels live; only then the full check is made.
-
-        Args:
-            zeroed: (3, rows, cols), its sizes being in `_size`.
-            largest: of those sizes.
-        """
+        """Return quickly whether a taxel may be far, if all taxels live; only then the full check is made."""
         if largest <= LONE_COUNTS:
             return False
         second, first = np.partition(self._size.max(axis=0), -2, axis=None)[-2:]

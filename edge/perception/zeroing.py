@@ -30,13 +30,7 @@ class Rezeroing:
     """
 
     def __init__(self, old: Baseline | None, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
-        """Start with the next scan.
-
-        Args:
-            old: the baseline so far; a load shows as a difference from it. None zeroes away a load.
-            force: zero away a contact.
-            unix_time_s: dates the new one, in [s] since 1970.
-        """
+        """Start with the next scan; without an old baseline, or by force, a load is zeroed away."""
         self.note = Note("zeroing", "zeroing: keep the pad still and free")
         self._old = old
         self._force = force
@@ -48,10 +42,7 @@ class Rezeroing:
     def push(self, scan: Scan, contact: bool, silent: NDArray[np.bool_] | None) -> Baseline | None:
         """Take one more scan; return the new baseline once there are enough.
 
-        Args:
-            scan: the sensor's next one.
-            contact: True while a tap goes on, which starts the zeroing over unless it is forced.
-            silent: taxels (rows, cols) to zero without, as in `BaselineEstimator.push`.
+        A tap that goes on starts the zeroing over unless it is forced; `silent` taxels (rows, cols) are left unzeroed.
 
         Raises:
             BaselineRefusedError: the tries have taken too long; the message gives the last reason. The old baseline
@@ -114,13 +105,7 @@ class Zeroing:
         self._tracker: DriftTracker | None = None
 
     def use(self, baseline: Baseline, age_s: float | None, time_ns: int) -> None:
-        """Subtract a baseline from now on.
-
-        Args:
-            baseline: of this sensor.
-            age_s: its age at `time_ns`, in [s]; None if unknown.
-            time_ns: on the clock of the scans, in [ns]; ages follow it, since a wall clock may be set.
-        """
+        """Subtract a baseline, so many [s] old if that is known, from a time in [ns] on; it ages with the scans."""
         self.baseline = self._taken = baseline
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
         self._tracker = DriftTracker(baseline)
@@ -165,9 +150,7 @@ class Zeroing:
     def zero_again(self, *, force: bool, doubted: bool) -> None:
         """Take a new baseline from the next scans, with an event for the outcome; the old one stays in use until then.
 
-        Args:
-            force: also in contact.
-            doubted: the old one is in doubt, and says nothing of a load.
+        It is forced also in contact; one in doubt says nothing of a load.
         """
         if self.baseline is None:
             self._report("zeroing")

@@ -28,6 +28,7 @@ SETTLING_SCANS: Final = 5
 PACED_SCANS: Final = 32
 """Scans without a gap from which on their mean period is more exact than the median of the newest: with that, 1 % off,
 a stall of a second would seem to have swallowed a scan."""
+SMOOTHING: Final = 0.05
 SHORTEST_PERIOD_NS: Final = 500_000
 """Shortest period of a sensor, half of that of the fastest: scans nearer to each other waited somewhere, and give no
 period."""
@@ -167,13 +168,7 @@ class Cadences:
     """
 
     def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False, rate_hz: float | None = None) -> None:
-        """Begin without a scan.
-
-        Args:
-            expected: names of sensors that should be there.
-            recorded: True if the scans are of a recording, which has no cable to check.
-            rate_hz: rate of each sensor, in [Hz]; None if unknown.
-        """
+        """Begin without a scan, with the sensors that should be there; a recording has no cable to check."""
         self.missed = 0
         self._recorded = recorded
         self._rate_hz = rate_hz
@@ -250,3 +245,22 @@ class Cadences:
     def _received_ns(self, sensor: str, time_ns: int) -> int:
         since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
         return max([time_ns, *since_ns])
+
+
+class Rate:
+    """Rate of scans in [Hz], smoothed over about twenty scans; None before the second one."""
+
+    def __init__(self) -> None:
+        self.rate_hz: float | None = None
+        self._period_ns: float | None = None
+        self._last_ns: int | None = None
+
+    def add(self, time_ns: int) -> None:
+        """Take the time of the next scan, in [ns]."""
+        if self._last_ns is not None and time_ns > self._last_ns:
+            period_ns = time_ns - self._last_ns
+            if self._period_ns is None:
+                self._period_ns = period_ns
+            self._period_ns += SMOOTHING * (period_ns - self._period_ns)
+            self.rate_hz = 1e9 / self._period_ns
+        self._last_ns = time_ns

@@ -21,12 +21,7 @@ class GainKeeper:
     """
 
     def __init__(self, path: Path, *, emulated: bool) -> None:
-        """Prepare.
-
-        Args:
-            path: sensor file.
-            emulated: the sensors are; the file of a real one is then left alone.
-        """
+        """Prepare to keep gains in a sensor file; emulated sensors leave that of a real one alone."""
         self.trouble: str | None = None
         self._path = path
         self._emulated = emulated

@@ -42,11 +42,7 @@ class _Newest:
 
 
 class NewestResults:
-    """Newest results of all sensors, and the state of their links.
-
-    Attributes:
-        ended: True once the stream has no more results.
-    """
+    """Newest results of all sensors, the state of their links, and whether the stream has ended."""
 
     def __init__(self) -> None:
         """Begin without a result, with links that are up."""

@@ -24,8 +24,6 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
-CALLS_A_PERIOD: Final = 4
-"""Calls of inference for which there is time in a period: a scan waits for one that has begun."""
 TOGETHER_SENSORS: Final = 4
 """Fewest sensors whose scans are read together."""
 READS_A_PERIOD: Final = 4
@@ -105,25 +103,12 @@ class Loop:
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        statistics = self.statistics
         if self._received is None:
             self._received = self._source.counters()
-        counters = self._received.copy()
-        counters["dropped"] = statistics.dropped
-        counters["overruns"] = statistics.overruns
-        counters["late"] = statistics.late
-        counters["missed"] = statistics.missed
-        counters["poses"] = statistics.poses
-        counters["poses_refused"] = statistics.poses_refused
-        counters["poses_dropped"] = statistics.poses_dropped
-        counters["unwritten"] = statistics.unwritten
-        return counters
+        return self._received | self.statistics.counters()
 
     def step(self, wait_s: float) -> None:
-        """Make the results of all that waits, after waiting at most `wait_s` [s] for it.
-
-        Patterns are made in one call of inference: of several sensors, the others get theirs in the next steps. Of a
-        patient source every scan gets its own.
+        """Make the results of all that waits, after waiting at most `wait_s` [s]; of a patient source, of every scan.
 
         Raises:
             BridgeError: the source is lost; what was taken before has its results.
@@ -251,23 +236,16 @@ class Loop:
             self._infer()
 
     def _infer(self) -> int:
-        """Make the results of those that have waited longest, as many as one call has time for; return their number."""
+        """Make the results of those that have waited longest, in one call; return their number."""
         if not self._runtime.waiting:
             return 0
-        results = self._runtime.infer(self._longest_call_us(), self._latency_clock)
+        results = self._runtime.infer(self._latency_clock)
         if self._keeper is not None:
             for name, pad in self._runtime.take_learned().items():
                 self._keeper.keep(name, pad)
         for result in results:
             self._follow(result)
         return len(results)
-
-    def _longest_call_us(self) -> float | None:
-        """Return the time that one inference may take, in [us]: scans that come meanwhile wait for its end."""
-        if self._runtime.waiting < 2:  # the rule, for which it need not be known
-            return None
-        period_s = self._cadences.shortest_period_s
-        return None if period_s == math.inf else 1e6 * period_s / CALLS_A_PERIOD
 
     def _watch_rest(self, result: Result) -> None:
         """Keep which sensors have been near contact of late."""

@@ -50,14 +50,9 @@ class PoseIntake:
         unused_by: str | None = None,
         no_sensor: Callable[[str], str | None] = lambda name: None,
     ) -> None:
-        """Begin without a pose.
+        """Begin without a pose; to recorded scans no pose of now belongs.
 
-        Args:
-            runtime: takes the poses.
-            queue: of the poses that come from outside.
-            recorded: scans are of another time than now, so that no pose of now belongs to them.
-            unused_by: name of the model, where neither it nor any sink uses poses.
-            no_sensor: returns why no sensor has a name.
+        `unused_by` names the model where neither it nor any sink uses poses; `no_sensor` returns why none has a name.
         """
         self.used = 0
         self._runtime = runtime
@@ -79,12 +74,9 @@ class PoseIntake:
         return self._queue.dropped
 
     def take(self, recorded: Sequence[TimedPose], first_scan_ns: int | None, now_ns: int) -> list[TimedPose]:
-        """Pass on the poses that wait, and return those that the runtime has taken.
+        """Pass on the poses that wait and those of the source, and return those that the runtime has taken.
 
-        Args:
-            recorded: poses of the source of the scans.
-            first_scan_ns: time of the first scan that comes after them; None if none has come yet.
-            now_ns: time now, or of the newest scan of a recording.
+        They hold from the first scan after them, or else from now, the time of a recording's newest scan.
         """
         waiting = self._queue.take()
         if recorded:

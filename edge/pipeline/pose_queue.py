@@ -17,11 +17,7 @@ _FIELDS: Final = ("cmd", "x_mm", "y_mm", "turn_deg", "error_mm", "error_deg", "s
 
 
 class PoseError(ValueError):
-    """A pose that cannot be taken; the message is one line for the user.
-
-    Attributes:
-        reason: short name of the reason, the same for all poses that are refused for it.
-    """
+    """A pose that cannot be taken, with a line for the user and a short name of the reason."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -29,11 +25,7 @@ class PoseError(ValueError):
 
 
 def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
-    """Return the pose in parsed JSON such as {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
-
-    Args:
-        fields: x_mm and y_mm; as wanted turn_deg, error_mm, error_deg, sensor, time_ns and holds.
-        now_ns: monotonic time of its arrival, which is its time if it has none, in [ns].
+    """Return the pose in parsed JSON such as {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}, of its arrival if it has no time.
 
     Raises:
         PoseError: a field is missing, unknown, of another kind or out of range.
@@ -64,11 +56,7 @@ def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
 
 
 def in_time(timed: TimedPose, now_ns: int) -> TimedPose:
-    """Return a pose that does not lie far ahead of now.
-
-    Raises:
-        PoseError: it does.
-    """
+    """Return a pose that does not lie far ahead of now, or raise a PoseError."""
     ahead_ns = timed.time_ns - now_ns
     if ahead_ns > FURTHEST_AHEAD_NS:
         raise PoseError(

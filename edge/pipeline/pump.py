@@ -32,19 +32,9 @@ def uncollected() -> Iterator[None]:
 
 
 def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: Statistics, **settings: Any) -> None:
-    """Run a stream into its sinks until it ends, without pauses for garbage collection.
+    """Run a stream into its sinks until it ends, without pauses for garbage collection; it takes the same settings.
 
-    Args:
-        source: open.
-        runtime: makes the results.
-        sinks: their counters are the stream's and `unwritten`, the records that sinks left out.
-        statistics: filled on the way, so that they are available however the run ends.
-        settings: of the stream.
-
-    Raises:
-        LinkLostError: after every scan before it got its record.
-        SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
-        ModelError: the model gave a pattern that is not finite, or a deviation that is not finite and above zero.
+    Statistics are filled on the way, so that they are available however the run ends; errors are those of the stream.
     """
     settings = {"patience_s": min((sink.patience_s for sink in sinks), default=0.0), **settings}
     stream = Stream(source, runtime, sinks=sinks, statistics=statistics, **settings)

@@ -34,21 +34,9 @@ def open_recording(
     bar: bool = False,
     player: Player | None = None,
 ) -> Source:
-    """Return the source that plays recordings, as edge.api.open_recording does.
+    """Return the source that plays recordings, each FILE[,FILE], as edge.api.open_recording does; raises the same.
 
-    Args:
-        files: each FILE[,FILE].
-        sensor: sensor file, used instead of the recorded settings.
-        zero: zero as a live run does, instead of using recorded baselines, or those of free stretches.
-        paced: play at the recorded speed, as if live.
-        rate_hz: scans a second of each sensor.
-        bar: show the progress.
-        player: controls it, endless.
-
-    Raises:
-        RecordingError: a recording cannot be used.
-        SourceError: its rate is unknown or out of range.
-        SensorFileError: the sensor file cannot be used.
+    It may show its progress in a bar, or be controlled by a player, without an end.
     """
     paths = [path for file in files for path in recording_paths(str(file))]
     if player is not None:

@@ -27,7 +27,7 @@ class Stream:
 
     A loop over it gets every result in order; `latest` and `read` return the newest, and leave out those before it.
     Of the scans that wait, the newest of each sensor gets a pattern; the older ones get their result without one.
-    Patterns of several sensors are made in one call, or in several that are short enough, the sensor that has waited
+    Patterns of up to four sensors are made in one call, those of more in several, the sensor that has waited
     longest first. Results of one sensor stay in the order of its scans.
     A result is made in the thread that asks for it: between two calls the runtime may be asked to zero or to reset.
     Any thread may state poses. A sensor that has a baseline or counts per newton, and of which no scan arrives, is

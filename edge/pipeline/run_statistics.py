@@ -2,7 +2,9 @@
 
 import math
 from bisect import bisect_left
+from dataclasses import dataclass, field
 from itertools import accumulate
+from operator import attrgetter
 from typing import Final
 
 from edge.perception.event import Event, EventKind
@@ -19,6 +21,11 @@ STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped"
 LONGEST_US: Final = 2.0**26
 """Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
 NO_CONTACT: Final = "no contact: its readings never reached --contact-on-counts over the baseline"
+_COUNTERS: Final = (
+    *("dropped", "overruns", "late", "missed"),
+    *("poses", "poses_refused", "poses_dropped", "unwritten"),
+)
+_COUNTS: Final = attrgetter(*_COUNTERS)
 
 
 class Histogram:
@@ -44,58 +51,38 @@ class Histogram:
         return min(2.0 ** (index / BUCKETS_PER_OCTAVE), self.max)
 
 
+@dataclass
 class Statistics:
-    """Statistics of a run, for its summary.
+    """Statistics of a run, for its summary; there is a result for every scan."""
 
-    Attributes:
-        source: kind of source of the last scan; empty before the first.
-        scans: results made, one for every scan.
-        patterns: results with a pattern.
-        reused: results with the last pattern, since nothing had changed.
-        dropped: results in contact, but overtaken by a newer scan before the inference.
-        late: patterns that were ready later than one period after their scan.
-        overruns: scans discarded unread because nobody took them in time.
-        missed: scans that never arrived, as far as gaps show.
-        unwritten: records left out for readers that were too slow.
-        events: number of events by kind.
-        torn_wire: scans with taxels missing.
-        torn_source: complete scans that were only partly renewed.
-        repeated: complete scans with nothing renewed.
-        run_time_us: histogram of the inference's run time.
-        latency_us: histogram of the time from scan to pattern.
-        commands_refused: lines on stdin, and messages of viewers, that were not commands.
-        poses: poses that the runtime has taken.
-        poses_refused: poses that could not be taken.
-        poses_dropped: poses that came faster than the loop took them.
-        model_patterns: number of patterns made by each model.
-        sink_trouble: trouble of the sinks at the end; None while all is well.
-    """
+    source: str = ""  # kind of source of the last scan; empty before the first
+    scans: int = 0
+    patterns: int = 0
+    reused: int = 0  # results with the last pattern, since nothing had changed
+    dropped: int = 0  # results in contact, but overtaken by a newer scan before the inference
+    late: int = 0  # patterns that were ready later than one period after their scan
+    overruns: int = 0  # scans discarded unread because nobody took them in time
+    missed: int = 0  # scans that never arrived, as far as gaps show
+    unwritten: int = 0  # records left out for readers that were too slow
+    torn_wire: int = 0  # scans with taxels missing
+    torn_source: int = 0  # complete scans that were only partly renewed
+    repeated: int = 0  # complete scans with nothing renewed
+    commands_refused: int = 0  # lines on stdin, and messages of viewers, that were not commands
+    poses: int = 0
+    poses_refused: int = 0
+    poses_dropped: int = 0
+    sink_trouble: str | None = None  # trouble of the sinks at the end; None while all is well
+    events: dict[EventKind, int] = field(default_factory=dict)
+    model_patterns: dict[str, int] = field(default_factory=dict)
+    run_time_us: Histogram = field(default_factory=Histogram)
+    latency_us: Histogram = field(default_factory=Histogram)
+    _spans: "dict[str, _Span]" = field(default_factory=dict)
+    _zeroed: dict[str, Result] = field(default_factory=dict)
+    _farthest: dict[str, Result] = field(default_factory=dict)
 
-    def __init__(self) -> None:
-        self.source = ""
-        self.scans = 0
-        self.patterns = 0
-        self.reused = 0
-        self.dropped = 0
-        self.late = 0
-        self.overruns = 0
-        self.missed = 0
-        self.unwritten = 0
-        self.events: dict[EventKind, int] = {}
-        self.torn_wire = 0
-        self.torn_source = 0
-        self.repeated = 0
-        self.run_time_us = Histogram()
-        self.latency_us = Histogram()
-        self.commands_refused = 0
-        self.poses = 0
-        self.poses_refused = 0
-        self.poses_dropped = 0
-        self.model_patterns: dict[str, int] = {}
-        self.sink_trouble: str | None = None
-        self._spans: dict[str, _Span] = {}
-        self._zeroed: dict[str, Result] = {}
-        self._farthest: dict[str, Result] = {}
+    def counters(self) -> dict[str, int]:
+        """Return the counts of which records have counters."""
+        return dict(zip(_COUNTERS, _COUNTS(self), strict=True))
 
     def add(self, result: Result) -> None:
         """Count one result."""
@@ -142,12 +129,7 @@ class Statistics:
         return max((span.duration_ns for span in self._spans.values()), default=0) / 1e9
 
     def summary(self, *, source: str, wanted_rate_hz: float | None = None) -> str:
-        """Return the run in a few lines of text.
-
-        Args:
-            source: the source as the user names it.
-            wanted_rate_hz: the requested rate, shown for comparison.
-        """
+        """Return the run in a few lines, with the source as the user names it, and the requested rate."""
         lines = [
             f"{source}: {self.scans} scans, {self.patterns} patterns ({self.reused} reused), {self.dropped} dropped, "
             f"{self.overruns} overrun, {self.missed} missed",

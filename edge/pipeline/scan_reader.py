@@ -160,7 +160,7 @@ class Source:
         """Let a stream take the scans from now on; None only asks whether one could.
 
         Raises:
-            SourceTakenError: another stream does, which is in use and has not ended.
+            SourceTakenError: another stream does.
         """
         before = self._stream()
         if before is not None and not before.ended:
@@ -220,7 +220,7 @@ class Source:
 
         Raises:
             LinkLostError: or another error that ended the reading, after all scans before it were taken.
-            UsageError: it is not open: scans that waited when it was closed are old.
+            UsageError: it is not open.
         """
         if not self._opened or self._closed:
             raise self._not_open()

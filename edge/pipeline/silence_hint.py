@@ -22,12 +22,7 @@ _MESSAGES: Final = {
 
 
 def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
-    """Return what came, what may be wrong, and what to do.
-
-    Args:
-        sources: as the user named them.
-        counters: returns those of the open source.
-    """
+    """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
     doctor = f"edge-sr doctor{source} shows what is wrong"
     arrived = counters()

@@ -36,28 +36,14 @@ class Sink(Protocol):
         ...
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
-        """Take an event, with the counters up to then.
-
-        Raises:
-            SinkError: it cannot be written.
-            SinkClosedError: its reader has gone.
-        """
+        """Take an event, with the counters up to then; raises as `write` does."""
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
-        """Take poses of pads, before the results that are made with them at hand.
-
-        Raises:
-            SinkError: they cannot be written.
-            SinkClosedError: its reader has gone.
-        """
+        """Take poses of pads, before the results that are made with them at hand; raises as `write` does."""
 
     def wait(self) -> None:
         """Do what is due, several times a second while no scan comes; raises as `write` does."""
 
     def close(self) -> None:
-        """Finish the written records.
-
-        Raises:
-            SinkError: it cannot be finished.
-        """
+        """Finish the written records, or raise a SinkError."""
         ...

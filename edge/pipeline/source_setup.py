@@ -16,11 +16,7 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 
 def settled(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
-    """Return the settings of the sensors.
-
-    Args:
-        sensor: file that edge-sr doctor wrote, if there is one.
-        id_map: name of an id map, or a map of a program's own, if one was requested.
+    """Return the settings of the sensors, by a sensor file and an id map as requested.
 
     Raises:
         SensorFileError: the sensor file cannot be used.
@@ -48,13 +44,7 @@ def links_to(
     rate_hz: float | None = None,
     give_up_s: float = math.inf,
 ) -> list[Link]:
-    """Return the links to the requested sources, not yet entered.
-
-    Args:
-        texts: as in firmware_bridge.links.registry; without any, the adapter of the sensor file or the only one.
-        known: settings of the sensors.
-        rate_hz: rate at which recordings are played, in [Hz].
-        give_up_s: longest time that a lost source may be away, in [s]; 0: its first loss is raised.
+    """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
 
     Raises:
         SourceError: as in open_sources; NoDeviceError and RecordingError as well.
@@ -77,12 +67,7 @@ def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:
 
 
 def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
-    """Refuse to use settings of an emulated sensor on a device.
-
-    Args:
-        known: settings of the sensors.
-        kind: of the opened source.
-        force: use them all the same.
+    """Refuse to use settings of an emulated sensor on a device unless forced.
 
     Raises:
         SensorFileError: the sensor file is of an emulated sensor, in part or whole.
@@ -99,23 +84,14 @@ def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
 
 
 def references(baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile) -> Mapping[str, Baseline]:
-    """Return the baselines of free pads: stored ones, or their file, take precedence over those of the sensor file.
-
-    Raises:
-        RecordingError: the baseline file cannot be used, or is of another taxel order.
-    """
+    """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, known.orders)
     return known.baselines if baselines is None else baselines
 
 
 def of_single_csv(baselines: Mapping[str, Baseline], played: str) -> Mapping[str, Baseline]:
-    """Return a single baseline under the name of the single CSV that is played, which states no sensor.
-
-    Args:
-        baselines: of free pads, by sensor.
-        played: name of the source, such as "replay:left.csv".
-    """
+    """Return a single baseline under the name of the single CSV that is played, which states no sensor."""
     file = played.removeprefix("replay:")
     if len(baselines) != 1 or file == played or "," in file or not file.lower().endswith(".csv"):
         return baselines

@@ -9,7 +9,7 @@ from typing import Final, TextIO
 
 from edge.perception.event import Event
 from edge.perception.result import NextTap, Result
-from edge.pipeline.scan_rate import Rate
+from edge.pipeline.cadence import Rate
 from edge.pipeline.sink import Sink
 from edge.terminal.text_wrap import drawn, rewritable
 from firmware_bridge.silence import SHOWN_AT_REST_S, SHOWN_SILENT_S

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.scan_rate import Rate
+from edge.pipeline.cadence import Rate
 
 TRACE_S: Final = 60.0
 TRACE_POINTS: Final = 1200

@@ -35,10 +35,34 @@ def test_one_scan_and_counts_of_the_free_pad_are_enough():
     assert free.state == "idle" and free.pattern is None
 
 
+VENDORS = np.moveaxis(COUNTS, 1, -1).reshape(-1, 16, 3)
+
+
+@pytest.mark.parametrize(
+    ("counts", "baseline"),
+    [
+        (COUNTS.astype(float), COUNTS[:5].mean(axis=0)),
+        (VENDORS, VENDORS[:5].mean(axis=0)),
+        (VENDORS.reshape(-1, 48).astype(np.float32), VENDORS.reshape(-1, 48)[:5]),
+    ],
+)
+def test_arrays_as_numpy_loads_them_and_in_the_vendors_order_are_taken(counts, baseline):
+    expected, results = infer(FakeModel(), COUNTS, REST), infer(FakeModel(), counts, baseline)
+    assert [result.state for result in results] == [result.state for result in expected]
+    for result, other in zip(results, expected, strict=True):
+        np.testing.assert_array_equal(result.scan.counts, other.scan.counts)
+        np.testing.assert_allclose(result.zeroed, other.zeroed, atol=5)
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"counts": COUNTS.astype(float)}, "counts are of type float64, expected whole numbers: raw counts, nothing"),
+        (
+            {"counts": COUNTS + 0.5},
+            "counts are not whole numbers, expected raw counts: no means, and nothing subtracted",
+        ),
+        ({"counts": COUNTS.astype(str)}, "counts are of type <U.*, expected numbers: raw counts, nothing subtracted"),
+        ({"baseline": np.full((3, 4, 4), np.nan)}, "baseline are of type float64, expected numbers"),
         ({"counts": COUNTS[:, :2]}, r"counts have shape \(15, 2, 4, 4\), expected \(3, rows, cols\) or \(n, 3, rows"),
         ({"counts": COUNTS[:0]}, r"counts have shape \(0, 3, 4, 4\), expected"),
         ({"counts": COUNTS - 70_000}, "counts are -.*, expected -1 to 65535"),

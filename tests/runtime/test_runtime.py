@@ -3,7 +3,6 @@
 # pyright: reportOptionalMemberAccess=false
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.result import mask_bits
+from edge.perception.runtime import MOST_TOGETHER
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
@@ -173,22 +173,15 @@ class TestOvertaken:
         assert newest.pattern.max() == pytest.approx(3 * other.pattern.max())
 
     def test_sensors_beyond_one_call_wait_and_none_starves(self):
-        clock_us = itertools.count(0, 3000)  # two looks at it a call: each takes 3 ms
-        names = [str(number) for number in range(6)]
-        runtime = make_runtime(
-            baselines=dict.fromkeys(names, BASELINE),
-            clock_ns=lambda: 1000 * next(clock_us),
-            options=RuntimeOptions(every_scan=True),
-        )
+        names = [str(number) for number in range(2 * MOST_TOGETHER)]
+        runtime = make_runtime(baselines=dict.fromkeys(names, BASELINE), options=RuntimeOptions(every_scan=True))
 
-        def infer(number, longest_us):
+        def infer(number):
             for name in names:
                 runtime.take(make_scan(number, sensor=name, press_counts=PRESS))
-            return [result.scan.sensor for result in runtime.infer(longest_us)]
+            return [result.scan.sensor for result in runtime.infer()]
 
-        assert infer(0, None) == names
-        assert [infer(number, 2000) for number in range(1, 5)] == 2 * [names[:3], names[3:]]
-        assert len(runtime.infer(0.001)) == 1, "one at least, or nothing would ever go on"
+        assert [infer(number) for number in range(4)] == 2 * [names[:MOST_TOGETHER], names[MOST_TOGETHER:]]
 
     @settings(max_examples=30, deadline=None)
     @given(
