@@ -1,14 +1,17 @@
 """Train a network on your own object, and run it: STL, simulated taps, training, ONNX, patterns.
 
-    pip install '.[export]'
-    python train_and_deploy.py bolt.stl --out bolt                    # the real thing, see below
-    python train_and_deploy.py bolt.stl --out bolt --minutes 4        # a first model, to see whether all of it works
+    pip install -e '.[export]'      # in the checkout, in an environment of its own
+    python examples/train_and_deploy.py bolt.stl --out bolt                # the real thing, see below
+    python examples/train_and_deploy.py bolt.stl --out bolt --minutes 4    # to see whether all of it works
 
 The file is an STL, OBJ or PLY in millimetres. Its taps are simulated: presses into the pad at random places and
 turns; training adds the noise, drift and dead taxels of real sensors. The defaults, 9000 presses and 16000 steps, are
 those of the first bundled networks and take about an hour on two cores; before it begins it prints how long they take
 here, by a few presses and steps that it tries. The same command resumes an interrupted run; after --minutes name the
 presses and steps that it printed, as --sequences and --steps.
+
+At the end the model is compared, on presses of the object that it was not trained on, with the bundled model and with
+bilinear interpolation. Only one that is better than both is handed over, as OUT/NAME.onnx: four minutes are too few.
 
 A network that was trained on one object alone draws that object for every contact, and looks right. Unless nothing
 else can be touched, add --figures 9000: random figures as well, as for the bundled networks.
@@ -23,11 +26,32 @@ import tempfile
 import time
 from pathlib import Path
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 
-from edge.api import BridgeError, EdgeError, NoDeviceError, Stream, load_model, open_runtime, open_source
-from export.to_onnx import main as export
+try:
+    import torch
+
+    from export.to_onnx import main as export
+except ModuleNotFoundError as error:
+    sys.exit(f"train_and_deploy: {error}: pip install -e '.[export]' in the checkout")
+
+from edge.api import (
+    DEFAULT_MODEL,
+    BridgeError,
+    EdgeError,
+    NoDeviceError,
+    Stream,
+    find_model,
+    load_model,
+    open_runtime,
+    open_source,
+)
+from edge.evaluation.classical_methods import fitted_methods
+from edge.evaluation.metrics import psnr_db
+from edge.inference.bundled import BUNDLE_DIR
 from train.data.make_presses import main as make_presses
+from train.data.presses import load_presses
 from train.fit import main as fit
 from train.networks.registry import build
 
@@ -37,6 +61,8 @@ TRIED = 8
 """Presses, and steps, that are tried for an estimate."""
 REST_STEPS = 150
 """Steps that take as long as all else: importing, the validation set, the export and its checks."""
+JUDGED = 60
+"""Presses, on pads of their own, by which the model is compared with others."""
 LEAST_SHARE = 0.005
 """Smallest share of presses and steps, whatever minutes are given."""
 
@@ -77,10 +103,35 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
     # python -m train.fit ...
     network = ["--network", NETWORK, "--name", name, "--steps", str(steps), "--seed", str(seed)]
     fit([str(checkpoints), "--data", *data, *network])
-    # python -m export.to_onnx ...; compares ONNX with torch. Its error is on the frozen test set, letters and shapes,
-    # so it shows the network's error on objects that it was not trained for.
-    export([str(checkpoints / f"{name}.pt"), "--out", str(out), "--batch", "any"])
-    return out / f"{name}.onnx"
+    # python -m export.to_onnx ...; compares ONNX with torch. The error in it is on the frozen test set, letters and
+    # shapes, so it is the network's on objects that it was not trained for.
+    export([str(checkpoints / f"{name}.pt"), "--out", str(checkpoints), "--batch", "any"])
+    return checkpoints / f"{name}.onnx"
+
+
+def is_better(model: Path, mesh: Path, out: Path, seed: int) -> bool:
+    """Compare a model with others on presses of the object that none was trained on; print and return the verdict."""
+    presses = load_presses(Path(taps(out / "unseen.npz", ["--families", "none", "--mesh", str(mesh)], JUDGED, seed)))
+    counts, truth = presses.counts[:, 0].astype(np.float32), presses.patterns.astype(np.float32)
+    own, bundled = (load_model(one) for one in (model, find_model(DEFAULT_MODEL)))
+
+    def error_db(patterns: NDArray[np.float32]) -> NDArray[np.float64]:
+        return psnr_db(patterns, truth, own.contract.output_full_scale)
+
+    patterns = {
+        one.name: np.stack([one.run(one.contract.scale_window(scan[None])).copy() for scan in counts])
+        for one in (own, bundled)
+    }
+    patterns["bilinear"] = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"](counts)
+    found = {name: error_db(one) for name, one in patterns.items()}
+    print(f"{len(counts)} presses of {mesh.name} that it was not trained on, PSNR (more is better): ", end="")
+    print(", ".join(f"{name} {values.mean():.1f} dB" for name, values in found.items()))
+    for name, values in found.items():
+        gain_db = found[own.name] - values
+        if name != own.name and gain_db.mean() < 2 * gain_db.std() / np.sqrt(len(gain_db)):
+            print(f"not handed over: it is not better than {name}. Train it for longer, or use {bundled.name}.")
+            return False
+    return True
 
 
 def taps(out: Path, surfaces: list[str], count: int, seed: int) -> str:
@@ -149,7 +200,9 @@ def main() -> None:
         start_s = time.monotonic()
         model = train(options.mesh, options.out, sequences=sequences, figures=figures, steps=steps, seed=options.seed)
         print(f"trained in {(time.monotonic() - start_s) / 60:.1f} minutes")
-        deploy(model, options.source, options.duration_s)
+        if not is_better(model, options.mesh, options.out, options.seed + 1000):
+            sys.exit(1)
+        deploy(model.replace(options.out / model.name), options.source, options.duration_s)
     except BrokenPipeError:  # the reader has closed; point stdout elsewhere, or Python reports an error at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:

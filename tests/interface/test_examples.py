@@ -12,10 +12,10 @@ from dataclasses import replace
 import pytest
 import trimesh
 from cli_samples import write_recording
-from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan, write_model
+from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
 from trust_samples import make_trusted_contract
 
-from edge.api import Result
+from edge.api import Result, find_model
 from edge.perception.event import Note
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.errors import LinkLostError
@@ -304,26 +304,46 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
         "--duration-s",
         3,
     )
-    assert code == 0, errors
-    assert (empty / "ball" / "ball.onnx").is_file() and {path.name for path in empty.iterdir()} == {"ball"}
+    assert code == 1, errors
+    assert {path.name for path in empty.iterdir()} == {"ball"} and not (empty / "ball" / "ball.onnx").exists()
     expected = r"about [\d.]+ minutes on this machine: [\d.]+ to simulate 6 presses, [\d.]+ for 2 steps .*"
     assert re.fullmatch(expected, out[0])
     assert any(re.fullmatch(r"trained in \d+\.\d minutes", line) for line in out)
-    assert any(line.startswith("emulated sensor 4: pattern (40, 40) in mm, ") for line in out)
-    assert out[-1].endswith(" patterns; from now on: edge-sr --model ball/ball.onnx")
+    assert re.search(r"not trained on, PSNR .*: ball [\d.]+ dB, stsr-int8 [\d.]+ dB, bilinear [\d.]+ dB", out[-2])
+    assert out[-1].startswith("not handed over: it is not better than stsr-int8. Train it for longer")
 
 
 @pytest.fixture
-def trained(monkeypatch):
+def trained(monkeypatch, tmp_path):
     """The example on a machine without an adapter, whose training takes no time; it counts its trainings."""
     spec = importlib.util.spec_from_file_location("train_and_deploy", ROOT / "examples" / "train_and_deploy.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.trainings = []
-    monkeypatch.setattr(module, "train", lambda mesh, out, **_: module.trainings.append(mesh) or out / "ball.onnx")
+
+    def train(mesh, out, **_):
+        module.trainings.append(mesh)
+        (out / "checkpoints").mkdir(parents=True, exist_ok=True)
+        (out / "checkpoints" / "ball.onnx").touch()
+        return out / "checkpoints" / "ball.onnx"
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(module, "train", train)
+    module.compare = module.is_better
+    monkeypatch.setattr(module, "is_better", lambda *_: True)
     monkeypatch.setattr(module, "tried", lambda mesh: (0.02, 0.2))
     monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", list)
     return module
+
+
+def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(trained, monkeypatch, tmp_path, capsys):
+    trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
+    trained.JUDGED = 12
+    good, poor = find_model("stsr"), write_model(tmp_path / "poor.onnx", make_contract(taps=1))
+    for own, bundled, better in ((good, poor, True), (poor, good, False)):
+        monkeypatch.setattr(trained, "find_model", lambda name, path=bundled: path)
+        assert trained.compare(own, tmp_path / "box.stl", tmp_path, 1) == better
+        assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 
 
 def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys):
