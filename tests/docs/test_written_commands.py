@@ -61,12 +61,12 @@ PARSED = {
 }
 LEFT_OUT = {
     r"git clone .*": "needs the network",
-    r"\. \.venv/bin/activate": "is of the shell; the environment is made by make",
+    r"(python3 -m venv \S+ && )?\. \S+/bin/activate": "is of the shell",
     r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
     r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
     r"ros2 .*": "needs ROS",
     r"lerobot-record .*|tactile-sr-to-lerobot .*": "needs LeRobot; test_lerobot runs it where that is installed",
-    r"pip install \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
+    r"pip install -e \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
     r"python examples/viewers/rerun_view\.py .*": "needs Rerun; test_mcap_viewers runs it where that is installed",
     r"your-robot-program \| .*": "is the reader's own; test_poses_stdin pipes poses of a program",
     r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
