@@ -12,7 +12,11 @@ from math import prod
 from struct import unpack_from
 
 import numpy as np
-import zenoh
+
+try:
+    import zenoh
+except ModuleNotFoundError as error:
+    sys.exit(f"zenoh_listen: {error}: pip install eclipse-zenoh")
 
 
 def unpack(message: bytes) -> tuple[dict, dict[str, np.ndarray]]:

@@ -1,16 +1,21 @@
 """Open a recording in Rerun with a layout: patterns in metres, plots of numbers, events and frames.
 
-pip install rerun-sdk
+pip install 'rerun-sdk>=0.41'
 python examples/viewers/rerun_view.py press.mcap [--save press.rrd]
 """
 
+import argparse
 import sys
 from pathlib import Path
 
-import rerun as rr
-import rerun.blueprint as rrb
 from mcap.reader import make_reader
-from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+try:
+    import rerun as rr
+    import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+except ModuleNotFoundError as error:
+    sys.exit(f"rerun_view: {error}, expected Rerun 0.41 or later: pip install 'rerun-sdk>=0.41'")
 
 RESULT = "tactile_edge_sr/msg/Result"
 PLOTS = {"force, counts": ("force_counts",), "area, mm2": ("area_mm2",), "uncertainty, mm": ("interval_mm",)}
@@ -60,4 +65,8 @@ def main(recording: Path, save: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[3]) if sys.argv[2:3] == ["--save"] else None)
+    parser = argparse.ArgumentParser(description="Open a recording in Rerun.")
+    parser.add_argument("recording", type=Path, help="an .mcap file of edge-sr")
+    parser.add_argument("--save", type=Path, help="write an .rrd file instead of opening the viewer")
+    options = parser.parse_args()
+    main(options.recording, options.save)

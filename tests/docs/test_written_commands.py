@@ -63,7 +63,7 @@ LEFT_OUT = {
     r"git clone .*": "needs the network",
     r"(python3 -m venv \S+ && )?\. \S+/bin/activate": "is of the shell",
     r"(echo .*\| )?sudo .*": "needs root, and the machine that the adapter is plugged into",
-    r"(cmake|export) .*|pip install [\w-]+": "makes, or fetches, what is of others",
+    r"(cmake|export) .*|pip install [\w'>=.-]+": "makes, or fetches, what is of others",
     r"ros2 .*": "needs ROS",
     r"lerobot-record .*|tactile-sr-to-lerobot .*": "needs LeRobot; test_lerobot runs it where that is installed",
     r"pip install -e \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
