@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, TextIO
 
 import numpy as np
 
-from edge.api import ModelError, bundled_models, load_model
+from edge.api import DEFAULT_MODEL, POSED_MODEL, ModelError, bundled_models, load_model
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.schedule import Ticker
 
@@ -20,6 +20,8 @@ ROUNDS: Final = 3
 ROUND_TICKS: Final = 50
 WINDOWS: Final = 16
 SEED: Final = 1
+_SHOWN: Final = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
+"""Metrics that are shown, and how wide."""
 UNEVEN: Final = 3.0
 """Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine."""
 
@@ -32,16 +34,19 @@ def run(*, measure: bool, stdout: TextIO) -> None:
     models = [load_model(path) for path in paths]
     took_us = run_times_us(models) if measure else []
     widest = max(len(path.stem) for path in paths)
-    head = f"{'model':{widest}s} taps scale    size arithmetic "
-    stdout.write(head + (" p50 us p99 us" if measure else "") + " error on the frozen test set, with all taps\n")
+    times = " p50 us p99 us" if measure else ""
+    stdout.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
     for index, (path, model) in enumerate(zip(paths, models, strict=True)):
         contract = model.contract
         error = contract.test_error.get(str(contract.taps), {})
-        figures = ", ".join(f"{name} {value:.3g}" for name, value in error.items())
-        size_mb = path.stat().st_size / 1e6
-        cells = f"{path.stem:{widest}s} {contract.taps:4d} {f'x{contract.scale}':>5s} {size_mb:4.1f} MB "
+        figures = "".join(
+            f" {error[name]:{width}}" if name in error else f" {'-':>{width[0]}s}" for name, width in _SHOWN.items()
+        )
+        cells = f"{path.stem:{widest}s} {contract.taps:4d} {path.stat().st_size / 1e6:4.1f} {contract.arithmetic:10s}"
         times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
-        stdout.write(f"{cells}{contract.arithmetic:10s} {times} {figures or 'not known'}\n")
+        default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
+        stdout.write(f"{cells}{figures}{times}{default}\n")
+    stdout.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
     if measure:
         stdout.writelines(_notes(paths, took_us))
 
