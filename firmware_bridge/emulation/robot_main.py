@@ -16,6 +16,7 @@ import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError
+from firmware_bridge.poses.pad_pose import POSE_FIELDS
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_columns import POSE_FIELDS
 from firmware_bridge.recording.tracks import Recording, Track
 
 FOLLOW: Final = "follow"
@@ -49,11 +50,9 @@ class Robot:
 
     def __init__(self, recording: Recording, options: Mapping[str, NDArray[Any]]) -> None:
         self._options = options
-        self._poses: dict[int, list[Any]] = {}
-        poses, rate_hz = recording.poses, recording.rate_hz
-        if poses is not None and rate_hz is not None:
-            for row, time_ns in enumerate(poses.time_ns.tolist()):
-                self._poses[round(time_ns * rate_hz / 1e9)] = [*poses.values[row].tolist(), bool(poses.holds[row])]
+        rate_hz = recording.rate_hz or 0.0
+        poses = recording.poses if rate_hz else ()
+        self._poses = {round(one.time_ns * rate_hz / 1e9): [*astuple(one.pose), one.holds] for one in poses}
         tap = options.get("tap", np.zeros(0, dtype=int))
         begins = np.flatnonzero((tap[1:] > tap[:-1]) & (tap[1:] > 0)) + 1
         self._taps = {int(first): int(np.flatnonzero(tap == tap[first])[-1]) + 1 for first in begins}

@@ -19,7 +19,6 @@ from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.csv_columns import CsvColumns, rate_of
-from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
@@ -99,7 +98,7 @@ class _Scans:
         self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
         self._counts = array("i")
         self._newtons = array("f")
-        self._poses = PoseRows()
+        self._poses: list[TimedPose] = []
         self._times = {column: array("d") for column in self._columns.times}
         self._before: list[str] = []
         self.count = 0
@@ -129,7 +128,7 @@ class _Scans:
         if wrong:
             _refuse(self._path, line, f"'{wrong[0][:20]}'", "a number for each value of a pose, or for none")
         try:
-            self._poses.add(TimedPose(PadPose(*values), self.count, used_from_ns=self.count))
+            self._poses.append(TimedPose(PadPose(*values), self.count, used_from_ns=self.count))
         except ValueError as error:
             raise RecordingError(f"{self._path}, line {line}: its pose: {error}") from error
 
@@ -158,9 +157,10 @@ class _Scans:
             vendor=_vendor(self._newtons, geometry) if self._newtons else None,
         )
         rate_hz = rate_hz or _meta_rate_hz(path.with_name(_META_NAME))
-        poses = self._poses.columns(by_row=True)
         origin = "emulated" if columns.emulated else None
-        return Recording(path, (track,), rate_hz, notes=tuple(notes), origin=origin, poses=poses)
+        return Recording(
+            path, (track,), rate_hz, notes=tuple(notes), origin=origin, poses=self._poses, poses_by_row=True
+        )
 
 
 def _rows(path: Path) -> Iterator[_Row]:

@@ -26,7 +26,6 @@ from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, Sensor
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
-from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
     POSE,
@@ -41,6 +40,7 @@ from firmware_bridge.recording.scan_messages import (
 )
 from firmware_bridge.recording.tracks import (
     GEOMETRY_METADATA,
+    MOST_POSES,
     MOST_SENSORS,
     MOUNTING_METADATA,
     SOURCE_METADATA,
@@ -57,7 +57,6 @@ MOST_KEPT_BYTES: Final = 1 << 31
 """Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
-_POSE_BYTES: Final = 64
 MOST_BAG_BYTES: Final = 1 << 20
 """Most bytes of a bag's metadata.yaml."""
 MOST_SHOWN_TOPICS: Final = 10
@@ -146,7 +145,8 @@ class _Reading:
         self._described = False  # whether there are metadata of edge-sr
         self._offset_ns: int | None = None
         self._kept_bytes = 0
-        self._poses = PoseRows()
+        self._poses: list[TimedPose] = []
+        self._posed: set[str | None] = set()
         self._notes: list[str] = []
         self._origin: Literal["device", "emulated"] | None = None
 
@@ -291,11 +291,11 @@ class _Reading:
         lane.renewed.append(scan.renewed)
 
     def _take_pose(self, timed: TimedPose) -> None:
-        self._kept_bytes += _POSE_BYTES
-        if self._kept_bytes > MOST_KEPT_BYTES:
-            raise RecordingError(f"{self._path}: more poses than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
-        self._poses.add(timed)
-        if self._poses.sensors > MOST_SENSORS + 1:
+        self._poses.append(timed)
+        if len(self._poses) > MOST_POSES:
+            raise RecordingError(f"{self._path}: more than {MOST_POSES:,} poses: cut it in parts")
+        self._posed.add(timed.sensor)
+        if len(self._posed) > MOST_SENSORS + 1:
             raise RecordingError(f"{self._path}: poses of more than {MOST_SENSORS} sensors")
 
     def _take_baseline(self, baseline: Baseline) -> None:
@@ -346,7 +346,7 @@ class _Reading:
             self._offset_ns,
             tuple(self._notes),
             self._origin,
-            self._poses.columns(),
+            self._poses,
         )
 
     def _instead(self) -> str:
