@@ -113,24 +113,17 @@ class _Scans:
         cells, columns = row.cells, self._columns
         _check_whole(row, self._width, self._before)
         self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
-        self._add_pose(row.line, [cells[column] for column in columns.poses])
         self._newtons.extend(_number(cells[column]) for column in columns.newtons)
+        if any(cells[column] for column in columns.poses):
+            try:
+                pose = PadPose(*(_number(cells[column]) for column in columns.poses))
+            except ValueError as error:
+                raise RecordingError(f"{self._path}, line {row.line}: its pose: {error}") from error
+            self._poses.append(TimedPose(pose, self.count, used_from_ns=self.count))
         for column, times in self._times.items():
             times.append(_time_s(cells[column]))
         self._before = cells
         self.count += 1
-
-    def _add_pose(self, line: int, cells: list[str]) -> None:
-        if not any(cells):
-            return
-        values = [_number(cell) for cell in cells]
-        wrong = [cell for cell, value in zip(cells, values, strict=True) if not math.isfinite(value)]
-        if wrong:
-            _refuse(self._path, line, f"'{wrong[0][:20]}'", "a number for each value of a pose, or for none")
-        try:
-            self._poses.append(TimedPose(PadPose(*values), self.count, used_from_ns=self.count))
-        except ValueError as error:
-            raise RecordingError(f"{self._path}, line {line}: its pose: {error}") from error
 
     def recording(self, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others.
@@ -149,17 +142,20 @@ class _Scans:
                 f"{path}: {_listed(columns.left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
                 "it, such as txl1_x, time_s, pose_x_mm"
             )
-        geometry = columns.pad
-        track = Track(
-            harmless(path.stem, kept=""),
-            _by_axis(np.frombuffer(self._counts, np.int32), geometry),
-            time_ns=None,
-            vendor=_vendor(self._newtons, geometry) if self._newtons else None,
-        )
-        rate_hz = rate_hz or _meta_rate_hz(path.with_name(_META_NAME))
-        origin = "emulated" if columns.emulated else None
+        vendor = None
+        if self._newtons:
+            newtons = _by_axis(np.frombuffer(self._newtons, np.float32), columns.pad)
+            sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
+            vendor = tuple(VendorReading(one) if right else None for one, right in zip(newtons, sound, strict=True))
+        counts = _by_axis(np.frombuffer(self._counts, np.int32), columns.pad)
         return Recording(
-            path, (track,), rate_hz, notes=tuple(notes), origin=origin, poses=self._poses, poses_by_row=True
+            path,
+            (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
+            rate_hz or _meta_rate_hz(path.with_name(_META_NAME)),
+            notes=tuple(notes),
+            origin="emulated" if columns.emulated else None,
+            poses=self._poses,
+            poses_by_row=True,
         )
 
 
@@ -242,13 +238,6 @@ def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
     """Return values of rows as (n, 3, rows, cols)."""
     taxels = values.reshape(-1, geometry.taxel_count, len(AXES))
     return np.ascontiguousarray(taxels.transpose(0, 2, 1)).reshape(-1, *geometry.scan_shape)
-
-
-def _vendor(newtons: "array[float]", geometry: SensorGeometry) -> tuple[VendorReading | None, ...]:
-    """Return the vendor's newtons of each scan, None where one of them is missing or out of range."""
-    scans = _by_axis(np.frombuffer(newtons, np.float32), geometry)
-    right = np.abs(scans).reshape(len(scans), -1).max(axis=1) <= HIGHEST_NEWTONS
-    return tuple(VendorReading(one) if sound else None for one, sound in zip(scans, right, strict=True))
 
 
 def _meta_rate_hz(path: Path) -> float | None:
