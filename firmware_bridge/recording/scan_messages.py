@@ -154,7 +154,7 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
         if array.size:
             right = array.size == int(np.prod(shape))
             _check(right, f"vendor_{name}", f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
-            vendor[name] = array.reshape(shape)
+            vendor[name] = array.reshape(shape).copy()  # a view would keep the whole chunk of a file in memory
     return RecordedScan(
         *(fields["header"]["frame_id"], sensor, fields["number"], fields["time_ns"], fields["device_time_ns"]),
         *(fresh, renewed, counts, VendorReading(**vendor) if vendor else None),
