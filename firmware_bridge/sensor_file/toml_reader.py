@@ -54,10 +54,9 @@ def one_of(*values: str | int) -> Callable[[Any], Any]:
     """Return a reader that accepts one of these values, of its type."""
 
     def read(value: Any) -> Any:
-        for one in values:
-            if type(value) is type(one) and value == one:
-                return value
-        raise ValueError(" or ".join(map(repr, values)))
+        if not any(type(value) is type(one) and value == one for one in values):
+            raise ValueError(" or ".join(map(repr, values)))
+        return value
 
     return read
 
@@ -73,13 +72,6 @@ def a_table(value: Any) -> dict[str, Any]:
     """Read a table, whose keys a Table of its own checks."""
     if not isinstance(value, dict):
         raise ValueError("a table")
-    return value
-
-
-def sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
-    """Read the tables of the sensors."""
-    if not isinstance(value, dict) or not value or not all(isinstance(one, dict) for one in value.values()):
-        raise ValueError("a table for each sensor, such as [sensors.4]")
     return value
 
 
@@ -101,22 +93,38 @@ def between(low: float, high: float) -> Callable[[Any], float]:
     """Return a reader that accepts a number in this range, both ends included, in its written type."""
 
     def read(value: Any) -> float:
-        if not is_number(value) or not low <= value <= high:
+        if not is_number(value, low, high):
             raise ValueError(f"a number from {low:g} to {high:g}")
         return value  # not as a float: a baseline's id differs between 1000 and 1000.0
 
     return read
 
 
-def flat_cells(value: Any, shape: tuple[int, ...], expected: str) -> list[Any]:
-    """Flatten nested lists of this shape."""
-    if not isinstance(value, list) or len(value) != shape[0]:
-        raise ValueError(expected)
-    if len(shape) == 1:
-        return value
-    return [cell for part in value for cell in flat_cells(part, shape[1:], expected)]
+def cells(shape: tuple[int, ...], right: Callable[[list[Any]], bool], expected: str) -> Callable[[Any], Any]:
+    """Return a reader of nested lists of this shape, whose flat cells, a tuple, have to be `right`."""
+
+    def flat(value: Any, shape: tuple[int, ...]) -> list[Any]:
+        if not isinstance(value, list) or len(value) != shape[0]:
+            raise ValueError(expected)
+        return value if len(shape) == 1 else [cell for part in value for cell in flat(part, shape[1:])]
+
+    def read(value: Any) -> tuple[Any, ...]:
+        found = flat(value, shape)
+        if not right(found):
+            raise ValueError(expected)
+        return tuple(found)
+
+    return read
 
 
-def is_number(value: Any) -> bool:
-    """Return True for a number of at most LARGEST in magnitude."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
+def numbers(
+    shape: tuple[int, ...], expected: str, low: float = -LARGEST, high: float = LARGEST
+) -> Callable[[Any], tuple[float, ...]]:
+    """Return a reader of nested lists of numbers in a range, both ends included."""
+    read = cells(shape, lambda found: all(is_number(cell, low, high) for cell in found), expected)
+    return lambda value: tuple(map(float, read(value)))
+
+
+def is_number(value: Any, low: float, high: float) -> bool:
+    """Return True for a number in a range, both ends included."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
