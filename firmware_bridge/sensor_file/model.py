@@ -18,8 +18,8 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file.pad_frame import LARGEST_MM, PadFrame
-from firmware_bridge.sensor_file.toml_reader import (
-    REMEDY,
+from firmware_bridge.strict_table import (
+    LEAST_POSITIVE,
     Table,
     a_table,
     between,
@@ -40,6 +40,7 @@ MOST_BYTES: Final = 1 << 16
 LONGEST_LINE_BYTES: Final = 2048
 """Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
 took 27 s."""
+_REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
 PARTS: Final = ("mounting", "force", "baseline", "gains")
 """Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
 
@@ -162,15 +163,18 @@ def load_sensor_file(path: str | Path) -> SensorFile:
     except OSError as error:
         raise SensorFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
-        raise SensorFileError(f"{path}: not TOML ({error}): {REMEDY}") from error
-    top = Table(path, "", document)
+        raise SensorFileError(f"{path}: not TOML ({error}): {_REMEDY}") from error
+    top = Table(path, "", document, SensorFileError, _REMEDY)
     top.take("format", one_of(FILE_FORMAT))
     top.take("version", one_of(FILE_VERSION))
     model = top.take("model", one_of(*ID_MAPS))
     adapter = top.take("adapter", text_value, required=False)
     sensors = top.take("sensors", _sensor_tables)
     top.end()
-    entries = {name: _entry(path, name, table, ID_MAPS[model].geometry) for name, table in sensors.items()}
+    entries = {
+        name: _entry(top.part(f"sensors.{name}", table), name, ID_MAPS[model].geometry)
+        for name, table in sensors.items()
+    }
     return SensorFile(model, adapter, entries, path=path)
 
 
@@ -182,8 +186,7 @@ def _sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
     return value
 
 
-def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> SensorEntry:
-    table = Table(path, f"sensors.{name}.", values)
+def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     grid, taxels = geometry.scan_shape[1:], list(range(geometry.taxel_count))
     places = f"{grid[0]} rows of {grid[1]}, each of 0..{taxels[-1]} once"
     mounting = {
@@ -204,7 +207,7 @@ def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeo
         counts_per_newton,
         **marks,
         **{
-            key: read(Table(path, f"sensors.{name}.{key}.", tables[key]), name, geometry)
+            key: read(table.part(key, tables[key]), name, geometry)
             for key, read in parts.items()
             if tables[key] is not None
         },
@@ -272,7 +275,7 @@ def _gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
     expected = f"positive numbers, 3, or {len(AXES)} x {geometry.rows} x {geometry.cols}"
     per_taxel = isinstance(value, list) and any(isinstance(one, list) for one in value)
     shape = geometry.scan_shape if per_taxel else (len(AXES),)
-    gains = numbers(shape, expected, low=math.ulp(0.0))(value)
+    gains = numbers(shape, expected, low=LEAST_POSITIVE)(value)
     return gains if per_taxel else tuple(gain for gain in gains for _ in range(geometry.taxel_count))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal, NoReturn, Self, TypeGuard
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
+from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, whole
 from firmware_bridge.zeroing.sha256 import sha256_hex
 
 COUNTS_ON_CIRCLE: Final = 0x10000
@@ -267,26 +268,27 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: not JSON ({error}): {_FILE_REMEDY}") from error
-    if not isinstance(document, dict) or document.get("format") != FILE_FORMAT:
-        _refuse_file(
-            path, "format", document.get("format") if isinstance(document, dict) else document, f"'{FILE_FORMAT}'"
-        )
-    if document.get("version") != FILE_VERSION:
-        _refuse_file(path, "version", document.get("version"), str(FILE_VERSION))
-    entries = document.get("baselines")
-    if not isinstance(entries, list) or not entries:
-        _refuse_file(path, "baselines", entries, "a list of at least one")
+    top = Table(path, "", document if isinstance(document, dict) else {}, RecordingError, _FILE_REMEDY)
+    top.take("format", one_of(FILE_FORMAT))
+    top.take("version", one_of(FILE_VERSION))
     baselines: dict[str, Baseline] = {}
-    for entry in entries:
-        baseline = _read_entry(path, entry)
-        if baseline.sensor in baselines:
-            _refuse_file(path, "sensor", baseline.sensor, "each sensor once")
-        now = orders.get(baseline.sensor)
+    for entry in top.take("baselines", _read_entries):
+        table = Table(path, "", entry, RecordingError, _FILE_REMEDY)
+        sensor = table.take("sensor", _read_sensor)
+        if sensor in baselines:
+            table.refuse("sensor", repr(sensor), "each sensor once")
+        created_unix_s = table.take("created_unix_s", _read_date, required=False)
+        scans, counts = table.take("scans", whole), table.take("counts", _read_counts)
+        dated = math.nan if created_unix_s is None else created_unix_s
+        baselines[sensor] = Baseline.of(sensor, counts, dated, scans, "file")
+        right = baselines[sensor].id
+        if entry.get("id", right) != right:
+            table.refuse("id", repr(entry["id"]), f"'{right}', which the counts give, or none: the file was changed")
+        now = orders.get(sensor)
         if entry.get("order") != (None if now is None else list(now)):
             raise RecordingError(
-                f"{path}: the taxels of sensor {baseline.sensor} lay in another order: zero again with the sensor file"
+                f"{path}: the taxels of sensor {sensor} lay in another order: zero again with the sensor file"
             )
-        baselines[baseline.sensor] = baseline
     return baselines
 
 
@@ -345,45 +347,31 @@ def _refuse(where: tuple[int, ...], what: str, limit: float, remedy: str) -> Non
     )
 
 
-def _read_entry(path: Path, entry: Any) -> Baseline:
-    if not isinstance(entry, dict):
-        _refuse_file(path, "baselines", entry, "objects")
-    sensor, created_unix_s, scans = entry.get("sensor"), entry.get("created_unix_s"), entry.get("scans")
-    if not isinstance(sensor, str) or not is_sensor_name(sensor):
-        _refuse_file(path, "sensor", sensor, f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
-    if created_unix_s is None:
-        created_unix_s = math.nan
-    elif not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
-        _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970, or null")
-    if type(scans) is not int or not 1 <= scans < 2**31:
-        _refuse_file(path, "scans", scans, "a whole number from 1")
-    baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")
-    if entry.get("id", baseline.id) != baseline.id:
-        expected = f"'{baseline.id}', which the counts give, or none: the file was changed"
-        _refuse_file(path, "id", entry["id"], expected)
-    return baseline
+def _read_entries(value: Any) -> list[Any]:
+    if not isinstance(value, list) or not value or not all(isinstance(one, dict) for one in value):
+        raise ValueError("a list of at least one object")
+    return value
 
 
-def _read_counts(path: Path, counts: Any) -> NDArray[np.float64]:
+def _read_sensor(value: Any) -> str:
+    if not isinstance(value, str) or not is_sensor_name(value):
+        raise ValueError(f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    return value
+
+
+def _read_date(value: Any) -> float | None:
+    if value is not None and not is_number(value, LEAST_POSITIVE, LAST_UNIX_S):
+        raise ValueError("seconds since 1970, or null")
+    return value
+
+
+def _read_counts(value: Any) -> NDArray[np.float64]:
     expected = f"numbers 0..{COUNTS_ON_CIRCLE}, as {len(AXES)} axes of rows of equal length"
-    planes = counts if isinstance(counts, list) else []
-    rows = [row for plane in planes if isinstance(plane, list) for row in plane]
-    cells = [cell for row in rows if isinstance(row, list) for cell in row]
-    if not cells or not all(_is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
-        _refuse_file(path, "counts", counts, expected)
     try:
-        array = np.array(counts, dtype=np.float64)
-    except ValueError:
-        _refuse_file(path, "counts", counts, expected)
-    if array.ndim != 3 or len(array) != len(AXES):
-        _refuse_file(path, "counts", f"shape {array.shape}", expected)
-    return array
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _refuse_file(path: Path, key: str, got: object, expected: str) -> NoReturn:
-    text = repr(got)
-    raise RecordingError(f"{path}, '{key}': {text[:60]}{'...' * (len(text) > 60)}, expected {expected}: {_FILE_REMEDY}")
+        shape = (len(AXES), len(value[0]), len(value[0][0]))
+    except (TypeError, LookupError) as error:
+        raise ValueError(expected) from error
+    counts = np.array(numbers(shape, expected, 0, math.nextafter(COUNTS_ON_CIRCLE, 0))(value))
+    if not counts.size:
+        raise ValueError(expected)
+    return counts.reshape(shape)

@@ -1,25 +1,35 @@
-"""Tables of the sensor file, read strictly: a misspelt key must not count as a missing one."""
+"""Tables of users' files, read strictly: a misspelt key must not count as a missing one."""
 
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from firmware_bridge.errors import SensorFileError
-
 LARGEST: Final = 1e12
 """Largest magnitude of a number in the file; a whole number can have more digits than any float."""
-REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
+LEAST_POSITIVE: Final = 1e-300
+"""Least number above 0: much smaller ones count as 0 where a library has made the processor faster."""
 
 
 class Table:
-    """One table of the file, whose keys are taken one by one; `end` refuses any left over."""
+    """One table of a file, whose keys are taken one by one; `end` refuses any left over.
 
-    def __init__(self, path: Path, name: str, values: Mapping[str, Any]) -> None:
-        self._path = path
-        self._name = name
+    Args:
+        path: of the file.
+        name: of the table, with a dot at its end, for messages.
+        values: of the table.
+        error: raised where a value cannot be used.
+        remedy: what a user can do then.
+    """
+
+    def __init__(self, path: Path, name: str, values: Mapping[str, Any], error: type[ValueError], remedy: str) -> None:
+        self._path, self._name, self._error, self._remedy = path, name, error, remedy
         self._values = dict(values)
         self._known: list[str] = []
+
+    def part(self, key: str, values: Mapping[str, Any]) -> "Table":
+        """Return a table in this one."""
+        return Table(self._path, f"{self._name}{key}.", values, self._error, self._remedy)
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
         """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
@@ -39,7 +49,7 @@ class Table:
 
     def refuse(self, key: str, got: str, expected: str) -> NoReturn:
         """Raise the error of a key, with its value, the expected one and the remedy."""
-        raise SensorFileError(f"{self._path}, '{self._name}{key}': {got}, expected {expected}: {REMEDY}")
+        raise self._error(f"{self._path}, '{self._name}{key}': {got}, expected {expected}: {self._remedy}")
 
 
 def _shown(value: Any) -> str:
