@@ -67,16 +67,17 @@ class Robot:
         number = 0
         while number < len(track.counts):
             if number in self._taps and self._steered:
-                option = yield from self._waits(track.counts[number - MOVE_SCANS : number])
+                moving = track.counts[number - MOVE_SCANS : number]
+                option = yield from self._waits(moving)
                 self._asked.clear()
                 if option is not None:
-                    pose = [*self._options["option_pose"][option].tolist(), True]
-                    moving = track.counts[number - MOVE_SCANS : number]
-                    for counts in (*moving, *self._options["option_counts"][option]):
-                        yield from self._sends(counts, pose)
-                        pose = None
+                    self._stated.append([*self._options["option_pose"][option].tolist(), True])
+                    taken = (*moving, *self._options["option_counts"][option])
+                    self._stated.extend([None] * (len(taken) - 1))
+                    yield from taken
                     number = self._taps[number]
-            yield from self._sends(track.counts[number], self._poses.get(number))
+            self._stated.append(self._poses.get(number))
+            yield track.counts[number]
             number += 1
 
     def take(self, text: bytes) -> None:
@@ -96,11 +97,6 @@ class Robot:
             with suppress(BlockingIOError):  # who does not read it goes without
                 os.write(sys.stdout.fileno(), f"{json.dumps(line)}\n".encode())
 
-    def _sends(self, counts: NDArray[np.int32], pose: list[Any] | None = None) -> Iterator[NDArray[np.int32]]:
-        """Yield a scan, whose pose is stated once it was sent."""
-        self._stated.append(pose)
-        yield counts
-
     def _waits(self, free: NDArray[np.int32]) -> Generator[NDArray[np.int32], None, int | None]:
         """Yield scans of the free pad until a tap is asked for, and return its number; None for the recording's."""
         for scan in range(LONGEST_WAIT_SCANS):
@@ -110,7 +106,8 @@ class Robot:
                     return None
                 away = self._options["option_pose"][:, :2] - np.array(place)
                 return int(np.hypot(*away.T).argmin())
-            yield from self._sends(free[scan % len(free)])
+            self._stated.append(None)
+            yield free[scan % len(free)]
         return None
 
 
@@ -125,15 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         recording = load_recording(options.file)
         robot = Robot(recording, _options(options.file))
-        emulator = Emulator(
-            [recording],
-            rate_hz=options.rate_hz,
-            loop=options.loop,
-            on_scan=robot.state,
-            played=robot.played,
-            take_input=robot.take,
-        )
-        _play(emulator)
+        settings = {"rate_hz": options.rate_hz, "loop": options.loop}
+        _play(robot, Emulator([recording], **settings, on_scan=robot.state, played=robot.played))
     except KeyboardInterrupt:
         return INTERRUPTED
     except (BridgeError, ValueError) as error:
@@ -141,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _play(emulator: Emulator) -> None:
+def _play(robot: Robot, emulator: Emulator) -> None:
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)
     with emulator:
@@ -152,7 +142,7 @@ def _play(emulator: Emulator) -> None:
                 text = os.read(0, 4096)
                 if not text:
                     return
-                emulator.take_input(text)
+                robot.take(text)
 
 
 def _options(path: Path) -> dict[str, NDArray[Any]]:

@@ -81,7 +81,7 @@ def test_saving_where_nothing_can_be_written(tmp_path):
         ({"version": 2}, "'version': 2, expected 1"),
         ({"baselines": []}, "'baselines'"),
         ({"baselines": {}}, "'baselines'"),
-        ({"baselines": [1]}, r"'baselines': \[1\], expected a list of at least one object"),
+        ({"baselines": [{}, 1]}, r"'baselines': \[{}, 1\], expected a list of at least one object"),
         ({"sensor": ""}, "'sensor'"),
         ({"sensor": 4}, "'sensor'"),
         ({"created_unix_s": 0}, "'created_unix_s'"),
