@@ -24,20 +24,10 @@ _SPEEDS_BAUD: Final = {
 
 
 class PseudoPort:
-    """Port whose clients may come and go, and be disconnected.
-
-    Attributes:
-        path: path for clients: the pseudo-terminal, or the requested link.
-        plugged: True while the cable is in.
-    """
+    """Port whose clients may come and go; `path` is theirs, and it is `plugged` while the cable is in."""
 
     def __init__(self, link: Path | None = None, *, ignores_line_speed: bool = False, seed: int = 0) -> None:
-        """Prepare a port; it is not plugged in yet.
-
-        Args:
-            link: link that always points to the present pseudo-terminal, like udev's link by serial number.
-            ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
-            seed: seed of the noise that arrives at another speed.
+        """Prepare a port that is not plugged in; a link points to its present pseudo-terminal, as udev's does.
 
         Raises:
             ValueError: another file is at `link`, or its folder does not exist.
@@ -63,20 +53,18 @@ class PseudoPort:
         """
         # The client's side stays open in this process as well, so that clients may come and go.
         self._far_fd, self._client_fd = os.openpty()
-        terminal = os.ttyname(self._client_fd)
-        if elsewhere and terminal == self._terminal:
+        if elsewhere and os.ttyname(self._client_fd) == self._terminal:
             taken = self._far_fd, self._client_fd
             self._far_fd, self._client_fd = os.openpty()
-            terminal = os.ttyname(self._client_fd)
             for descriptor in taken:
                 os.close(descriptor)
         os.set_blocking(self._far_fd, False)
-        self.path = self._terminal = terminal
+        self.path = self._terminal = os.ttyname(self._client_fd)
         if self._link is not None:
             draft = self._link.with_name(f".{self._link.name}.{os.getpid()}")
             try:
                 draft.unlink(missing_ok=True)
-                draft.symlink_to(terminal)
+                draft.symlink_to(self._terminal)
                 draft.replace(self._link)
             except OSError as error:
                 os.close(self._far_fd)
