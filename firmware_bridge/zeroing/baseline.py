@@ -281,8 +281,7 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
 
 def unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
     """Return the differences of scans (n, 3, rows, cols) to the first, the short way round the circle of counts."""
-    half = COUNTS_ON_CIRCLE // 2
-    return (counts.astype(np.int32) - counts[0].astype(np.int32) + half) % COUNTS_ON_CIRCLE - half
+    return (counts - counts[0]).astype(np.int16).astype(np.int32)  # sixteen bits go round the same circle
 
 
 def refuse_motion(counts: NDArray[np.int32]) -> None:
@@ -363,10 +362,9 @@ def _read_date(value: Any) -> float | None:
 def _read_counts(value: Any) -> NDArray[np.float64]:
     expected = f"numbers 0..{COUNTS_ON_CIRCLE}, as {len(AXES)} axes of rows of equal length"
     try:
-        shape = (len(AXES), len(value[0]), len(value[0][0]))
-    except (TypeError, LookupError) as error:
+        shape = np.shape(value)
+    except ValueError as error:
         raise ValueError(expected) from error
-    counts = np.array(numbers(shape, expected, 0, math.nextafter(COUNTS_ON_CIRCLE, 0))(value))
-    if not counts.size:
+    if len(shape) != 3 or shape[0] != len(AXES) or not all(shape):
         raise ValueError(expected)
-    return counts.reshape(shape)
+    return np.array(numbers(shape, expected, 0, math.nextafter(COUNTS_ON_CIRCLE, 0))(value)).reshape(shape)
