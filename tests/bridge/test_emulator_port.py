@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
-from serial_samples import wait_for
+from edge_samples import wait_for
 
 from firmware_bridge.emulation.robot_main import main
 from firmware_bridge.emulation.slcan_emulator import Emulator
