@@ -82,10 +82,6 @@ class Emulator:
             ValueError: an option is out of range.
             RecordingError: a recording that this sensor cannot have made, or one without a rate.
         """
-        lengths = {"jitter_s": jitter_s, "latency_s": latency_s, "frame_s": frame_s, "first_frame": first_frame}
-        for name, value in lengths.items():
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, expected 0 or more")
         bus = controllers_of(recordings, controllers, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
