@@ -50,7 +50,7 @@ class ServerEmulator:
         self._sequence = 0
         self._greeted = asyncio.Event()
         self._clients: set[ServerConnection] = set()
-        self._thawed, self._through = threading.Event(), threading.Event()
+        self._thawed = threading.Event()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="server-emulator", daemon=True)
 
@@ -68,10 +68,6 @@ class ServerEmulator:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; return False on time-out."""
-        return self._through.wait(timeout_s)
 
     def kill(self) -> None:
         """End as a killed process does: connections break, and the port is closed."""
@@ -157,4 +153,3 @@ class ServerEmulator:
             behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
             ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         await self._close(1001, "")
-        self._through.set()
