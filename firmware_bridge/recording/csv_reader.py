@@ -85,11 +85,6 @@ class _Scans:
     """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
 
     def __init__(self, path: Path, header: _Row) -> None:
-        """Begin without a row, by the names of the columns.
-
-        Raises:
-            RecordingError: they are not those of a sensor.
-        """
         self._path = path
         try:
             self._columns = CsvColumns(header.cells)
@@ -104,12 +99,7 @@ class _Scans:
         self.count = 0
 
     def add(self, row: _Row) -> None:
-        """Take one row.
-
-        Raises:
-            RecordingError: a value in a whole row is impossible.
-            _DamageError: the row is damaged.
-        """
+        """Take one row; a _DamageError where it is damaged, a RecordingError where a value is impossible."""
         cells, columns = row.cells, self._columns
         _check_whole(row, self._width, self._before)
         self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
@@ -126,11 +116,7 @@ class _Scans:
         self.count += 1
 
     def recording(self, notes: list[str]) -> Recording:
-        """Return the recording, with these notes and others.
-
-        Raises:
-            RecordingError: the file with the rate cannot be used.
-        """
+        """Return the recording, with these notes and others."""
         path, columns = self._path, self._columns
         rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
@@ -192,11 +178,7 @@ def _rows(path: Path) -> Iterator[_Row]:
 
 
 def _check_whole(row: _Row, width: int, before: list[str]) -> None:
-    """Check that a row has `width` cells, and that its last line was not cut off within a number.
-
-    Raises:
-        _DamageError: it has others, or a last line without its end ends in a shorter number than the one above.
-    """
+    """Raise a _DamageError where a row does not have `width` cells, or its last line was cut off within a number."""
     cells = row.cells[:width]
     if len(cells) < width or any(row.cells[width:]):
         raise _DamageError(row.line, f"{len(row.cells)} columns", f"{width}")

@@ -35,17 +35,15 @@ A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Scans of one sensor in a recording.
+    """Scans of one sensor in a recording; what was not recorded is None.
 
     Attributes:
-        sensor: name of the sensor.
         counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
-        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling; None if not recorded.
-        numbers: (n,) int64 numbers of the scans; None if not recorded, as for the following ones.
+        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling.
+        numbers: (n,) int64 numbers of the scans.
         device_time_ns: (n,) int64 device times on the clock of `time_ns`, in [ns]; -1 where the device had none.
         renewed: (n, rows, cols) bool, True where a reading was new.
         vendor: (n,) values of the vendor's software.
-        pad: pad that the file names; None if it does not.
     """
 
     sensor: str
@@ -75,13 +73,11 @@ class Recording:
     """Tracks of one file, at least one, each with at least one scan.
 
     Attributes:
-        path: path of the file.
         tracks: one per sensor, in the order in which they first occur.
         rate_hz: rate of each sensor's scans, in [Hz]; None if the file does not state it.
         baselines: baselines at the first scan of each sensor; without sensors that were not zeroed yet.
         mountings: mountings of the sensors, by name. The taxels are in place; only the axes are still to be turned.
         unix_offset_ns: offset from `time_ns` to [ns] since 1970; None if the file does not state it.
-        notes: remarks for the user who plays it.
         origin: "device" or "emulated", the origin of its scans, however often they were played and recorded again;
             None if the file does not state it.
         poses: poses of the pads, in the order in which they were taken.
