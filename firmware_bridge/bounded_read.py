@@ -2,7 +2,7 @@
 
 import errno
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 PIECE_BYTES: Final = 1 << 20
 
@@ -10,26 +10,13 @@ PIECE_BYTES: Final = 1 << 20
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Read a whole file.
 
-    Args:
-        path: path of the file.
-        most_bytes: largest allowed size, in bytes.
-
     Raises:
         OSError: it cannot be read, or is larger; no more than a piece beyond the limit is read.
     """
-    with path.open("rb") as file:
-        return read_up_to(file, most_bytes)
-
-
-def read_up_to(file: BinaryIO, most_bytes: int) -> bytes:
-    """Read the rest of an open file, with the limit of `read_bounded`.
-
-    Raises:
-        OSError: it cannot be read, or is larger.
-    """
     content = bytearray()
-    while piece := file.read(PIECE_BYTES):  # one large read would allocate memory for the whole limit
-        content += piece
-        if len(content) > most_bytes:
-            raise OSError(errno.EFBIG, f"larger than the {most_bytes:,} bytes that are read")
+    with path.open("rb") as file:
+        while piece := file.read(PIECE_BYTES):  # one large read would allocate memory for the whole limit
+            content += piece
+            if len(content) > most_bytes:
+                raise OSError(errno.EFBIG, f"larger than the {most_bytes:,} bytes that are read")
     return bytes(content)

@@ -16,10 +16,9 @@ Bad frames, skipped bytes and torn scans are counted, never raised.
 
 
 def harmless(text: str, kept: str = "\n\t") -> str:
-    """Return text of a stranger without control characters, which could move a terminal's cursor or set its title.
+    """Return text of a file, device or model without control characters, which could move a terminal's cursor.
 
-    Files, devices and models state names and texts, and so do file names, whose bytes need not be UTF-8. What is not
-    printable is escaped, but for `kept`; the result can be encoded.
+    What is not printable is escaped, but for `kept`; the result can be encoded, also of a file name that is not UTF-8.
     """
     if text.isprintable():
         return text

@@ -42,11 +42,7 @@ def write_in_place(
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file can be written in place, before time is spent on its content.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Raise an OSError where a file cannot be written in place, before time is spent on its content."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():

@@ -25,21 +25,16 @@ def sleep_until(deadline_ns: int, clock: Clock = time.monotonic_ns, sleep: Sleep
 
 
 class Ticker:
-    """Source of ticks at start + n / rate. A late tick does not move the ones after it.
+    """Source of ticks at start + n / rate: a late tick does not move the ones after it.
 
-    Attributes:
-        late: number of ticks that were already past when they were requested.
-        skipped: number of ticks left out, because the next one was past as well.
+    It counts the ticks that were `late`, and those `skipped`, because the next one was past as well.
     """
 
     def __init__(self, rate_hz: float, clock: Clock = time.monotonic_ns, sleep: Sleep = time.sleep) -> None:
         if not (math.isfinite(rate_hz) and rate_hz > 0):
             raise ValueError(f"rate is {rate_hz} Hz, expected a positive number")
-        self.late = 0
-        self.skipped = 0
-        self._rate_hz = rate_hz
-        self._clock = clock
-        self._sleep = sleep
+        self.late = self.skipped = 0
+        self._rate_hz, self._clock, self._sleep = rate_hz, clock, sleep
         self._start_ns = clock()
         self._tick = 0
 

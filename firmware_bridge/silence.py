@@ -1,8 +1,7 @@
-"""Thresholds of silence: every time without data after which the bridge reacts, and the reason for its value.
+"""Thresholds of silence: times without data after which the bridge reacts; of readings in [ns], of waits in [s].
 
-Two figures decide most of them. The slowest sensor on record renews a taxel four times a second, so a quarter of a
-second without a reading is no silence; and an adapter hands on its data after 16 ms at the latest. Thresholds of a
-reading or scan are in [ns], on the clock of the scans; those of a wait are in [s].
+The slowest sensor on record renews a taxel four times a second, so a quarter of a second without a reading is no
+silence; and an adapter hands on its data after 16 ms at the latest.
 """
 
 from typing import Final
@@ -13,40 +12,37 @@ SLOWEST_PERIOD_NS: Final = 250_000_000
 # ---- A sensor ----
 
 SENSOR_SILENT_NS: Final = 2 * SLOWEST_PERIOD_NS
-"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey, in [ns]."""
+"""Time without a scan after which a sensor is reported silent, if another one goes on, and drawn grey."""
 TAPS_FORGOTTEN_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Time without a scan after which earlier taps are dropped, in [ns]: a tap is over by then."""
+"""Time without a scan after which earlier taps are dropped: a tap is over by then."""
 SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Time after its first reading at which an incomplete scan is given up, in [ns]: later readings are another scan's."""
+"""Time after its first reading at which an incomplete scan is given up: later readings are another scan's."""
 SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
-"""Age at which a reading from the vendor's server belongs to a silent sensor, in [ns]."""
+"""Age at which a reading from the vendor's server belongs to a silent sensor."""
 TAXEL_SILENT_SCANS: Final = 50
 """Scans without a taxel after which its loss is reported, and zeroing goes on without it."""
 POSES_SILENT_NS: Final = SENSOR_SILENT_NS
-"""Time without a pose, after one that does not hold, after which its source is reported silent, in [ns]. Poses are
-interpolated over less, so by then some scans were without one."""
+"""Time without a pose, after one that does not hold, after which its source is reported silent: some scans were without
+one by then."""
 LATEST_SCAN_S: Final = 2.0
-"""Age of the last scan at the end of its watch above which the doctor reports a sensor, in [s]."""
+"""Age of the last scan at the end of its watch above which the doctor reports a sensor."""
 
 # ---- A link ----
 
 LINK_SILENT_S: Final = 0.7
-"""Time without a scan after which a link is closed and opened again, in [s]: an adapter that was reset keeps its port,
-and is silent until its channel is reopened. A little more than a sensor's silence, which must not reopen the link."""
+"""Time without a scan after which a link is opened again: a little more than a sensor's silence, which must not."""
 ADAPTER_ASKED_NS: Final = 500_000_000
-"""Time without a scan after which an adapter's status is requested, in [ns], since it can explain the silence; before
-the link is opened again."""
+"""Time without a scan after which an adapter's status, which can explain the silence, is requested."""
 SERVER_QUIET_S: Final = 0.75
-"""Time without a message after which the vendor's server is pinged, in [s]."""
+"""Time without a message after which the vendor's server is pinged."""
 
 # ---- A person, or a program that waits ----
 
 SHOWN_SILENT_S: Final = 1.0
-"""Time without a scan after which the status line and the diagnostics report it, in [s]: below, they would flicker."""
+"""Time without a scan after which the status line and the diagnostics report it: below, they would flicker."""
 SHOWN_AT_REST_S: Final = 0.25
-"""Longest time for which a scan without contact may wait until a person sees it, in [s]: well below every silence."""
+"""Longest time for which a scan without contact may wait until a person sees it: well below every silence."""
 GIVEN_UP_S: Final = 10.0
-"""Time without a scan after which zeroing and the doctor give up, in [s]: a sensor just plugged in has come by then."""
+"""Time without a scan after which zeroing and the doctor give up: a sensor just plugged in has come by then."""
 POLL_S: Final = 0.25
-"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces.
-Scans at rest come as seldom, so that these waits seldom end before them: each end wakes two threads."""
+"""Longest time until a stop, a command or a silent link is noticed: scans at rest come as seldom."""

@@ -15,7 +15,6 @@ from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -126,11 +125,7 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
             {"time_ns": scan.time_ns, "sensor": scan.sensor, "scan": scan.number, "counts": scan.counts} | facts
             for scan, _ in read
         )
-        stated = PoseRows()
-        for _, some in read:
-            for pose in some:
-                stated.add(pose)
-        poses = stated.columns()
+        poses = [pose for _, some in read for pose in some]
     write_npz(path, rows, recording.mountings, poses)
 
 
@@ -165,8 +160,7 @@ def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     recording = replay.recordings[0]
     track = next(track for track in recording.tracks if sensor in (None, track.sensor))
     mounting = recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
-    columns = recording.poses
-    poses = [] if columns is None else [columns.at(row, -replay.first_ns) for row in range(len(columns))]
+    poses = [pose.later(-replay.first_ns) for pose in recording.poses]
     own = [pose for pose in poses if pose.sensor == track.sensor] or [pose for pose in poses if pose.sensor is None]
     write_csv(path, track, replay.times_ns(track.sensor), mounting, own, emulated=recording.origin == "emulated")
 

@@ -26,12 +26,10 @@ _LOGISTIC: Final = 1.702
 
 
 class Evidence(NamedTuple):
-    """Evidence of one pattern, in the pad's axes.
+    """Evidence of one pattern, in the pad's axes, and the height of its top above what it does not touch, in [mm].
 
-    Attributes:
-        layers: (H, W, 4): weight of what was covered, log odds of a touch, information about the height in [1/mm^2],
-            and that information times the pattern.
-        top_mm: height of the pattern's top above what it does not touch, in [mm].
+    Layers are (H, W, 4): weight of what was covered, log odds of a touch, information about the height in [1/mm^2], and
+    that information times the pattern.
     """
 
     layers: NDArray[np.float32]
@@ -39,18 +37,9 @@ class Evidence(NamedTuple):
 
 
 def weigh(
-    pattern: NDArray[np.float32],
-    deviation: NDArray[np.float32] | None,
-    pose: PadPose,
-    pixel_mm: float,
-    level: float,
+    pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None, pose: PadPose, pixel_mm: float, level: float
 ) -> Evidence | None:
-    """Return the evidence of a pattern; None if it is flat zero.
-
-    A pattern is how deep each part of the object was pressed in, so it grows with the press. Its share of the pattern's
-    top does not: a pixel is touched where that share exceeds `level`. Heights are compared by the caller, who knows
-    what overlaps.
-    """
+    """Return the evidence of a pattern, None if it is flat: touched is where its share of the top exceeds `level`."""
     height, width = pattern.shape
     top_mm = float(np.partition(pattern, -_TOP_PIXELS, axis=None)[-_TOP_PIXELS:].mean())
     if not top_mm >= LEAST_TOP_MM:

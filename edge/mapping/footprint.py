@@ -21,13 +21,7 @@ class Grid(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """Pixels of a map under a pad.
-
-    Attributes:
-        pixels: (n,), row-major.
-        rows: (n,), row of each in the pattern, with its fraction; that of the first row's centre is 0.
-        cols: the same of the column.
-    """
+    """Pixels (n,) of a map under a pad, row-major, and the row and column of each in the pattern, with fractions."""
 
     pixels: NDArray[np.intp]
     rows: NDArray[np.floating]

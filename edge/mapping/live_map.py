@@ -20,16 +20,7 @@ class Box(NamedTuple):
 
 
 class MapState(NamedTuple):
-    """State of a map, whose layers nobody changes any more.
-
-    Attributes:
-        number: from 1.
-        grid: of the map.
-        contact: (H, W), NaN where nothing is known.
-        doubted: (H, W).
-        pads: pose of each pad on the map, by its sensor.
-        counts: patterns fused, doubted and left out, by name.
-    """
+    """State of a map, numbered from 1: layers (H, W), poses of the pads by sensor, and patterns by their fate."""
 
     number: int
     grid: Grid

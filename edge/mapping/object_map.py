@@ -1,12 +1,7 @@
 """Map of an object in its own plane, larger than the pad, in memory that does not grow with the run.
 
-Patterns that a slide makes one after the other are not independent: the same model makes the same mistake again while
-the same part of the object lies under the same taxels. So evidence is counted by the distance that the pad has moved,
-and not by the scan: patterns within STEP_MM of one another are one, of which the strongest press is taken, and it
-counts as the share of INDEPENDENT_MM, a taxel pitch, that its place is away from the nearest one that counted before.
-A tap on a new place counts as one.
-
-A part that another press pushes deeper in does not come out higher: heights are those of a press plus an offset, by
+Evidence is counted by the distance that the pad has moved, and not by the scan, since a model makes the same mistake
+again while the same part of the object lies under the same taxels. Heights are those of a press plus an offset, by
 which it agrees with what lies on the map already where both touched.
 """
 
@@ -53,8 +48,7 @@ class MapLayers:
     Attributes:
         height_mm: height against the map's top, which is 0, where the object was touched.
         contact: probability that a press that covers it touches it.
-        deviation_mm: standard deviation of the height.
-        coverage: patterns that covered it and were believed, counted as the taps that they are worth; 0 or more.
+        coverage: patterns that covered it and were believed, counted as the taps that they are worth.
         doubted: the same of patterns that were not believed, which no other layer holds.
     """
 
@@ -88,12 +82,6 @@ class ObjectMap:
         centre_mm: place of the map's centre in the object's plane.
         contact_level: share of a pattern's top from which a pixel counts as touched.
 
-    Attributes:
-        fused: patterns on the map.
-        doubted: patterns that were not believed.
-        light: patterns of presses too light to tell from drift, which are left out.
-        outside: patterns that miss the map.
-
     Raises:
         UsageError: the size is out of range.
     """
@@ -112,7 +100,8 @@ class ObjectMap:
                 f"a map of {size_mm:g} mm at {px_per_mm:g} px/mm, expected 1 to {MOST_PX} pixels along a side"
             )
         self.grid = Grid(count, px_per_mm, centre_mm)
-        self.fused = self.doubted = self.light = self.outside = 0
+        self.counts = {"fused": 0, "doubted": 0, "light": 0, "outside": 0}
+        """Patterns by their fate; those of presses too light to tell from drift are left out."""
         self._level = contact_level
         # Coverage, log odds of a touch, information about the height, and that times the height, as in the evidence.
         self._sums = np.zeros((count * count, 4), dtype=np.float32)
@@ -122,9 +111,9 @@ class ObjectMap:
         self._presses: dict[str, _Press] = {}
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Patterns by their fate: fused, doubted, light and outside."""
-        return {"fused": self.fused, "doubted": self.doubted, "light": self.light, "outside": self.outside}
+    def fused(self) -> int:
+        """Patterns on the map."""
+        return self.counts["fused"]
 
     def blank(self) -> "ObjectMap":
         """Return an empty map of the same size at the same place, for another object."""
@@ -132,9 +121,7 @@ class ObjectMap:
         return ObjectMap(pixels / px_per_mm, px_per_mm, centre_mm=centre_mm, contact_level=self._level)
 
     def add(self, result: Result, pose: PadPose | None) -> None:
-        """Take a result and the pose of its pad at that time.
-
-        Without contact, or without a pose, the press before is over.
+        """Take a result and the pose of its pad; without contact, or without a pose, the press before is over.
 
         Raises:
             UsageError: the pattern is not in [mm].
@@ -197,7 +184,7 @@ class ObjectMap:
         if fate == "fused":
             pose = press.pose
             self._places[self.fused % PLACES] = pose.x_mm, pose.y_mm, radians(pose.turn_deg)
-        setattr(self, fate, getattr(self, fate) + 1)
+        self.counts[fate] += 1
 
     def _fuse(self, press: _Press, sums: NDArray[np.float32], doubts: NDArray[np.float32]) -> str:
         """Add a press to layers, and return the counter of presses with its fate."""

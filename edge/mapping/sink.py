@@ -32,14 +32,9 @@ SHOWN_PX: Final = 240 * 240
 
 
 class MapSink(Sink):
-    """Fusion of results at their poses.
+    """Fusion of results at their poses into `whole`, a map; after a reset the next one.
 
-    Attributes:
-        whole: the map; after a reset the next one.
-        fused: patterns on all maps.
-        without_pose: patterns without a pose, which are left out.
-        together: patterns of pads that are at one place by their poses, which are left out, too.
-        origin: kind of source that the scans come from, where results are of a recording; else that of the results.
+    Left out are patterns without a pose, and those of pads that are at one place `together` by their poses.
     """
 
     uses_poses = True
@@ -61,7 +56,7 @@ class MapSink(Sink):
             npz: file of the layers, written on `close`, and at a reset; later maps have a number in their names.
             png: picture, written likewise.
             show: called with the map's state a few times a second; it must not wait.
-            origin: as above.
+            origin: kind of source that the scans come from, where results are of a recording; else that of the results.
             clock_ns: monotonic, in [ns].
 
         Raises:
@@ -90,7 +85,8 @@ class MapSink(Sink):
         self._shown = 0
 
     @property
-    def fused(self) -> int:  # noqa: D102 - above
+    def fused(self) -> int:
+        """Patterns on all maps."""
         return self._before["fused"] + self.whole.fused
 
     @property
@@ -103,16 +99,10 @@ class MapSink(Sink):
         return None
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
-        """Fuse a result at its pose, on the next map if taps were forgotten as for a new object.
-
-        Raises:
-            UsageError: its pattern is not in [mm].
-            SinkError: a file of the map before cannot be written.
-        """
+        """Fuse a result at its pose, on the next map if taps were forgotten as for a new object."""
         if any(event.kind == "reset" for event in result.events):
             self._begin_next()
-        sensor = result.scan.sensor
-        pose = result.pose
+        sensor, pose = result.scan.sensor, result.pose
         if pose is None:
             self._pads.pop(sensor, None)
             self.without_pose += result.pattern is not None
@@ -131,11 +121,7 @@ class MapSink(Sink):
         self._show()
 
     def close(self) -> None:
-        """Take the presses that have not ended, show the last state, and write the files; nothing fused, no file.
-
-        Raises:
-            SinkError: a file cannot be written.
-        """
+        """Take the presses that have not ended, show the last state, and write the files; nothing fused, no file."""
         self._save()
         self._due_ns, self._unseen = 0, True
         self._show()
@@ -156,12 +142,11 @@ class MapSink(Sink):
 
     def _is_shared(self, sensor: str, pose: PadPose, time_ns: int) -> bool:
         """Return whether another pad is at this place by its pose: then one has poses that are not its own."""
-        near = (
+        return any(
             abs(time_ns - at_ns) <= GAP_NS and hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm) < APART_MM
             for name, (other, at_ns) in self._pads.items()
             if name != sensor
         )
-        return any(near)
 
     def _begin_next(self) -> None:
         self._save()

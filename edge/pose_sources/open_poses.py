@@ -19,11 +19,10 @@ _NAMED: Final = re.compile(r"([A-Za-z0-9_/-]{1,64})=(.+)", re.DOTALL)
 
 
 class PoseSource(Protocol):
-    """Open source of poses, which receives in a thread of its own."""
+    """Open source of poses, which receives in a thread of its own until it is closed."""
 
     def close(self) -> None:
         """End it."""
-        ...
 
 
 def check_poses(text: str) -> tuple[str | None, str, str]:

@@ -1,9 +1,4 @@
-"""Pose of a pad in the plane of an object, and its time, from a stamped pose of ROS. No I/O.
-
-The pose is that of a tool frame with its origin at the middle of the pad's face: x to the right of a pattern, y up, z
-out of the pad, to the object. The z of the other frame stands on the object's plane, towards the pad or away from it.
-docs/poses.md draws both.
-"""
+"""Pose of a pad in the plane of an object, and its time, from a stamped pose of ROS, as docs/poses.md draws it."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -78,10 +73,10 @@ def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> P
 
 
 class StampClock:
-    """Map from stamps of one source of poses to monotonic time; `warn` takes one line where the clocks do not agree.
+    """Map from stamps of one source of poses to monotonic time, by this machine's wall clock.
 
-    By this machine's wall clock, so that a delay stays visible. Clocks that do not agree show it: even the fastest pose
-    of the last seconds seems to arrive before its time, or long after. Then the smallest delay counts as none.
+    Clocks that do not agree, of which `warn` takes one line, show it: even the fastest pose of the last seconds seems
+    to arrive before its time, or long after. Then the smallest delay counts as none.
     """
 
     def __init__(

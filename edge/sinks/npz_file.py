@@ -3,8 +3,9 @@
 import json
 import shutil
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import astuple
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.field import Out
 from edge.perception.result_fields import FIELDS
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from firmware_bridge.recording.pose_columns import PoseColumns
 from firmware_bridge.recording.scan_messages import mounting_text
 from firmware_bridge.scans.mounting import Mounting
 
@@ -30,7 +31,7 @@ _PIECE_BYTES: Final = 1 << 20
 
 
 def write_npz(
-    path: Path, rows: Iterable[Mapping[str, Any]], mountings: Mapping[str, Mounting], poses: PoseColumns | None
+    path: Path, rows: Iterable[Mapping[str, Any]], mountings: Mapping[str, Mounting], poses: Sequence[TimedPose]
 ) -> None:
     """Write a recording of rows, each the values of a scan by the names of KINDS; what a row lacks is unknown there.
 
@@ -94,13 +95,13 @@ def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
         npy.write_array(entry, array)
 
 
-def _pose_arrays(poses: PoseColumns | None) -> dict[str, NDArray[Any]]:
-    if poses is None:
+def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
+    if not poses:
         return {}
     return {
-        "pose_time_ns": poses.time_ns,
-        "pose": poses.values,
-        "pose_sensor": np.array(poses.sensors)[poses.sensor],
-        "pose_holds": poses.holds,
-        "pose_used_from_ns": poses.used_from_ns,
+        "pose_time_ns": np.array([one.time_ns for one in poses]),
+        "pose": np.array([astuple(one.pose) for one in poses], np.float64),
+        "pose_sensor": np.array([one.sensor or "" for one in poses]),
+        "pose_holds": np.array([one.holds for one in poses]),
+        "pose_used_from_ns": np.array([-1 if one.used_from_ns is None else one.used_from_ns for one in poses]),
     }

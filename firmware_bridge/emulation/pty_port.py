@@ -12,8 +12,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from firmware_bridge.errors import DeviceError
-
 LINE_SPEED_BAUD: Final = 3_000_000
 COUNTED_LATE_NS: Final = 10_000_000
 """Longest delay, in [ns], until a busy kernel counts sent bytes as unread."""
@@ -24,29 +22,10 @@ _SPEEDS_BAUD: Final = {
 
 
 class PseudoPort:
-    """Port whose clients may come and go, and be disconnected.
-
-    Attributes:
-        path: path for clients: the pseudo-terminal, or the requested link.
-        plugged: True while the cable is in.
-    """
+    """Port whose clients may come and go; `path` is theirs, and it is `plugged` while the cable is in."""
 
     def __init__(self, link: Path | None = None, *, ignores_line_speed: bool = False, seed: int = 0) -> None:
-        """Prepare a port; it is not plugged in yet.
-
-        Args:
-            link: link that always points to the present pseudo-terminal, like udev's link by serial number.
-            ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
-            seed: seed of the noise that arrives at another speed.
-
-        Raises:
-            ValueError: another file is at `link`, or its folder does not exist.
-        """
-        if link is not None and not link.is_symlink():
-            if link.exists():
-                raise ValueError(f"link is {link}, expected a path that is free or a link: a file or folder is there")
-            if not link.parent.is_dir():
-                raise ValueError(f"link is {link}, expected a path in a folder that exists: make {link.parent} first")
+        """Prepare a port that is not plugged in; a link points to its present pseudo-terminal, as udev's does."""
         self.path = ""
         self.plugged = False
         self._link = link
@@ -56,32 +35,19 @@ class PseudoPort:
         self._far_fd = self._client_fd = -1
 
     def plug(self, *, elsewhere: bool = False) -> None:
-        """Put the cable in; with `elsewhere`, under another name than before.
-
-        Raises:
-            DeviceError: the link cannot be made.
-        """
+        """Put the cable in; with `elsewhere`, under another name than before."""
         # The client's side stays open in this process as well, so that clients may come and go.
         self._far_fd, self._client_fd = os.openpty()
-        terminal = os.ttyname(self._client_fd)
-        if elsewhere and terminal == self._terminal:
+        if elsewhere and os.ttyname(self._client_fd) == self._terminal:
             taken = self._far_fd, self._client_fd
             self._far_fd, self._client_fd = os.openpty()
-            terminal = os.ttyname(self._client_fd)
             for descriptor in taken:
                 os.close(descriptor)
         os.set_blocking(self._far_fd, False)
-        self.path = self._terminal = terminal
+        self.path = self._terminal = os.ttyname(self._client_fd)
         if self._link is not None:
-            draft = self._link.with_name(f".{self._link.name}.{os.getpid()}")
-            try:
-                draft.unlink(missing_ok=True)
-                draft.symlink_to(terminal)
-                draft.replace(self._link)
-            except OSError as error:
-                os.close(self._far_fd)
-                os.close(self._client_fd)
-                raise DeviceError(f"link is {self._link}, which cannot be made: {error.strerror}") from error
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self._terminal)
             self.path = str(self._link)
         self.plugged = True
 

@@ -16,6 +16,7 @@ import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError
+from firmware_bridge.poses.pad_pose import POSE_FIELDS
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_columns import POSE_FIELDS
 from firmware_bridge.recording.tracks import Recording, Track
 
 FOLLOW: Final = "follow"
@@ -49,11 +50,9 @@ class Robot:
 
     def __init__(self, recording: Recording, options: Mapping[str, NDArray[Any]]) -> None:
         self._options = options
-        self._poses: dict[int, list[Any]] = {}
-        poses, rate_hz = recording.poses, recording.rate_hz
-        if poses is not None and rate_hz is not None:
-            for row, time_ns in enumerate(poses.time_ns.tolist()):
-                self._poses[round(time_ns * rate_hz / 1e9)] = [*poses.values[row].tolist(), bool(poses.holds[row])]
+        rate_hz = recording.rate_hz or 0.0
+        poses = recording.poses if rate_hz else ()
+        self._poses = {round(one.time_ns * rate_hz / 1e9): [*astuple(one.pose), one.holds] for one in poses}
         tap = options.get("tap", np.zeros(0, dtype=int))
         begins = np.flatnonzero((tap[1:] > tap[:-1]) & (tap[1:] > 0)) + 1
         self._taps = {int(first): int(np.flatnonzero(tap == tap[first])[-1]) + 1 for first in begins}
@@ -68,16 +67,17 @@ class Robot:
         number = 0
         while number < len(track.counts):
             if number in self._taps and self._steered:
-                option = yield from self._waits(track.counts[number - MOVE_SCANS : number])
+                moving = track.counts[number - MOVE_SCANS : number]
+                option = yield from self._waits(moving)
                 self._asked.clear()
                 if option is not None:
-                    pose = [*self._options["option_pose"][option].tolist(), True]
-                    moving = track.counts[number - MOVE_SCANS : number]
-                    for counts in (*moving, *self._options["option_counts"][option]):
-                        yield from self._sends(counts, pose)
-                        pose = None
+                    self._stated.append([*self._options["option_pose"][option].tolist(), True])
+                    taken = (*moving, *self._options["option_counts"][option])
+                    self._stated.extend([None] * (len(taken) - 1))
+                    yield from taken
                     number = self._taps[number]
-            yield from self._sends(track.counts[number], self._poses.get(number))
+            self._stated.append(self._poses.get(number))
+            yield track.counts[number]
             number += 1
 
     def take(self, text: bytes) -> None:
@@ -97,11 +97,6 @@ class Robot:
             with suppress(BlockingIOError):  # who does not read it goes without
                 os.write(sys.stdout.fileno(), f"{json.dumps(line)}\n".encode())
 
-    def _sends(self, counts: NDArray[np.int32], pose: list[Any] | None = None) -> Iterator[NDArray[np.int32]]:
-        """Yield a scan, whose pose is stated once it was sent."""
-        self._stated.append(pose)
-        yield counts
-
     def _waits(self, free: NDArray[np.int32]) -> Generator[NDArray[np.int32], None, int | None]:
         """Yield scans of the free pad until a tap is asked for, and return its number; None for the recording's."""
         for scan in range(LONGEST_WAIT_SCANS):
@@ -111,7 +106,8 @@ class Robot:
                     return None
                 away = self._options["option_pose"][:, :2] - np.array(place)
                 return int(np.hypot(*away.T).argmin())
-            yield from self._sends(free[scan % len(free)])
+            self._stated.append(None)
+            yield free[scan % len(free)]
         return None
 
 
@@ -126,15 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         recording = load_recording(options.file)
         robot = Robot(recording, _options(options.file))
-        emulator = Emulator(
-            [recording],
-            rate_hz=options.rate_hz,
-            loop=options.loop,
-            on_scan=robot.state,
-            played=robot.played,
-            take_input=robot.take,
-        )
-        _play(emulator)
+        settings = {"rate_hz": options.rate_hz, "loop": options.loop}
+        _play(robot, Emulator([recording], **settings, on_scan=robot.state, played=robot.played))
     except KeyboardInterrupt:
         return INTERRUPTED
     except (BridgeError, ValueError) as error:
@@ -142,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _play(emulator: Emulator) -> None:
+def _play(robot: Robot, emulator: Emulator) -> None:
     with suppress(OSError):
         os.set_blocking(sys.stdout.fileno(), False)
     with emulator:
@@ -153,7 +142,7 @@ def _play(emulator: Emulator) -> None:
                 text = os.read(0, 4096)
                 if not text:
                     return
-                emulator.take_input(text)
+                robot.take(text)
 
 
 def _options(path: Path) -> dict[str, NDArray[Any]]:

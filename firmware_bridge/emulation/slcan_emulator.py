@@ -1,8 +1,4 @@
-"""Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal.
-
-It is as strict as the device: silent until bitrate and open, deaf at the wrong line speed, and frames
-that the client does not fetch in time are lost.
-"""
+"""Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal, as strict as the device."""
 
 import math
 import threading
@@ -25,9 +21,8 @@ _DRAIN_POLL_S: Final = 0.01
 _EMPTY_LOOKS: Final = 3
 """Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
 _STOOD_STILL_S: Final = 0.2
-"""Lateness in [s] at which the emulator itself was stopped: it goes on where it was, since no controller sends in one
-burst what it has missed. It ends the scans under way first: none stops amid a scan either. One that waits for its
-client may be late all the time."""
+"""Lateness in [s] at which the emulator itself was stopped: it ends the scans under way, and goes on where it was,
+since no controller sends in one burst what it has missed."""
 
 
 class Emulator:
@@ -36,7 +31,6 @@ class Emulator:
     Attributes:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
-        take_input: takes what is written to the emulator's stdin.
         line: this end of the pseudo-terminal.
         sent_frames: number of frames that went out whole.
         lost_frames: number of frames without room, because the client did not read.
@@ -62,7 +56,6 @@ class Emulator:
         link: Path | None = None,
         waits: bool = False,
         played: Played = attrgetter("counts"),
-        take_input: Callable[[bytes], object] = lambda text: None,
     ) -> None:
         """Prepare to play; nothing is opened yet.
 
@@ -84,23 +77,15 @@ class Emulator:
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
             waits: True to wait for a client that reads late, as no bus does, so that no frame is lost.
             played: scans that are played of a track; each is asked for while the one before is sent.
-            take_input: takes what is written to the emulator's stdin.
 
         Raises:
             ValueError: an option is out of range.
             RecordingError: a recording that this sensor cannot have made, or one without a rate.
         """
-        for name, value in (("jitter_s", jitter_s), ("latency_s", latency_s), ("frame_s", frame_s)):
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, expected 0 or more")
-        if first_frame < 0:
-            raise ValueError(f"first_frame is {first_frame}, expected 0 or more")
         bus = controllers_of(recordings, controllers, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
-        self.take_input = take_input
-        self.sent_frames = 0
-        self.lost_frames = 0
+        self.sent_frames = self.lost_frames = 0
         self._timeline = bus_timeline(
             bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame, played=played
         )
@@ -157,20 +142,11 @@ class Emulator:
                 yield from self._hand_on(frames)
             yield from self._drain()
         finally:
-            self._unplug()
+            self.line.unplug()
             self._through.set()
 
-    def _unplug(self) -> None:
-        self.line.unplug()
-
     def _handed_on_s(self, timed: tuple[float, CanFrame]) -> float:
-        latency_s = self._latency_at(timed[0])
-        if latency_s == 0:
-            return timed[0]
-        return math.ceil(timed[0] / latency_s) * latency_s
-
-    def _latency_at(self, time_s: float) -> float:
-        return self._latency_s
+        return math.ceil(timed[0] / self._latency_s) * self._latency_s if self._latency_s else timed[0]
 
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> Iterator[float]:
         if not self.adapter.hears_the_bus:
@@ -220,9 +196,9 @@ class Emulator:
             written = self.line.write(self._answers)
             self._answers = self._answers[written:] if self._waits else b""
 
-    def _drain(self, deadline_s: float = math.inf) -> Iterator[float]:
+    def _drain(self) -> Iterator[float]:
         """Let the client fetch the bytes under way, which hanging up would discard."""
         looks = 0
-        while self.adapter.channel_open and looks < _EMPTY_LOOKS and time.monotonic() < deadline_s:
+        while self.adapter.channel_open and looks < _EMPTY_LOOKS:
             looks = 0 if self.line.unread_bytes() else looks + 1
             yield from self._wait_until(time.monotonic() + _DRAIN_POLL_S)

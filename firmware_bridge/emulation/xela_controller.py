@@ -70,7 +70,7 @@ def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate
     """
     tracks = [(recording, track) for recording in recordings for track in recording.tracks]
     can_ids = can_ids or range(4, 4 + 2 * len(tracks), 2)
-    if not len(tracks) == len(can_ids) == len(set(can_ids)) or not all(0 <= can_id <= 15 for can_id in can_ids):
+    if not len(tracks) == len(can_ids) == len(set(can_ids)) or not set(can_ids) <= set(range(16)):
         raise ValueError(f"controllers are {list(can_ids)}, expected {len(tracks)} different ones of 0..15")
     controllers: list[Controller] = []
     for (recording, track), can_id in zip(tracks, can_ids, strict=True):
@@ -89,13 +89,12 @@ def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -
         ValueError: the rate is not positive.
         RecordingError: no rate is requested, and the recording has none.
     """
-    known_rates_hz = (rate_hz, recording.rate_hz, track.mean_rate_hz)
-    own_rate_hz = next((known_hz for known_hz in known_rates_hz if known_hz is not None), None)
-    if own_rate_hz is None:
+    known_hz = [one for one in (rate_hz, recording.rate_hz, track.mean_rate_hz) if one is not None]
+    if not known_hz:
         raise RecordingError(f"{recording.path} does not state its rate: pass --rate-hz")
-    if not 0 < own_rate_hz < math.inf:
-        raise ValueError(f"rate is {own_rate_hz} Hz, expected a positive number")
-    return own_rate_hz
+    if not 0 < known_hz[0] < math.inf:
+        raise ValueError(f"rate is {known_hz[0]} Hz, expected a positive number")
+    return known_hz[0]
 
 
 def bus_timeline(
@@ -146,14 +145,7 @@ class SlcanAdapter:
     """
 
     def __init__(self, *, acknowledges: bool = True, left_open: bool = False, old_canable: bool = False) -> None:
-        """Switch the adapter on.
-
-        Args:
-            acknowledges: True if it answers commands.
-            left_open: True for an open channel, as a client leaves it that died without closing.
-            old_canable: True for no answers, and no effect of commands that CANable's first firmware does not have,
-                such as time stamps and flags.
-        """
+        """Switch the adapter on; `left_open`, as a client leaves it that died, `old_canable`, as its first firmware."""
         self.acknowledges = acknowledges and not old_canable
         self.flags = 0
         self.state = "a"
@@ -212,7 +204,7 @@ class SlcanAdapter:
             if command != b"C":
                 return BEL
             self.channel_open = False
-        elif name == b"S" and value in (b"0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"8"):
+        elif name == b"S" and len(value) == 1 and value in b"012345678":
             self._bitrate = int(value)
         elif command == b"O" and self._bitrate is not None:
             self.channel_open = True

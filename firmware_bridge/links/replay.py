@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError, harmless
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.links.replay_poses import PoseLane, timed_by_rows
+from firmware_bridge.links.replay_poses import PoseLane
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
@@ -159,12 +160,14 @@ class ReplayLink(Link):
         """Return the poses of a recording, None where it has none whose times hold."""
         recording = self.recordings[number]
         poses, first_ns = recording.poses, _first_ns(recording)
-        if poses is None or not len(poses):
+        if not poses:
             return None
         sensors = [track.sensor for track in recording.tracks] if len(self.recordings) > 1 else ()
-        if poses.by_row:
+        if recording.poses_by_row:
             due_times_ns = next(due_times_ns for track, due_times_ns in lanes if track is recording.tracks[0])
-            return PoseLane(timed_by_rows(poses, due_times_ns), 0, sensors)
+            times_ns = due_times_ns.tolist()
+            timed = [replace(one, time_ns=times_ns[one.time_ns], used_from_ns=times_ns[one.time_ns]) for one in poses]
+            return PoseLane(timed, 0, sensors)
         if rate_hz is not None or first_ns is None:
             self.notes.append(
                 f"{recording.path}: its {len(poses)} poses are left out, since --rate-hz replaces the times"

@@ -5,16 +5,15 @@ the axis that points into the page. With turn t, the pad's x axis lies along (co
 point p of the newest tap's pattern lies at R(t)^T (p - c) in that of an earlier tap whose relative pose has place c.
 """
 
-from dataclasses import dataclass
-from math import cos, hypot, isfinite, radians, sin
+from dataclasses import dataclass, fields
+from math import cos, hypot, radians, sin
 from typing import Final
 
 PLACE_ERROR_MM: Final = 0.2
 TURN_ERROR_DEG: Final = 1.0
 """Standard deviations of a pose on a gripper mounted by hand, where nothing else is stated."""
-MOST_MM: Final = 1e6
-MOST_DEG: Final = 1e6
-"""Largest coordinates and turns, so that every difference of two is a number with a meaning."""
+MOST: Final = 1e6
+"""Largest coordinate in [mm] and turn in [deg], so that every difference of two is a number with a meaning."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +38,10 @@ class PadPose:
     error_deg: float = TURN_ERROR_DEG
 
     def __post_init__(self) -> None:
-        for name, most in (("x_mm", MOST_MM), ("y_mm", MOST_MM), ("turn_deg", MOST_DEG)):
+        for name, low in (("x_mm", -MOST), ("y_mm", -MOST), ("turn_deg", -MOST), ("error_mm", 0), ("error_deg", 0)):
             value = getattr(self, name)
-            if not (isfinite(value) and abs(value) <= most):
-                raise ValueError(f"{name} is {value}, expected a number from -{most:g} to {most:g}")
-        for name, most in (("error_mm", MOST_MM), ("error_deg", MOST_DEG)):
-            value = getattr(self, name)
-            if not (isfinite(value) and 0 <= value <= most):
-                raise ValueError(f"{name} is {value}, expected a number from 0 to {most:g}")
+            if not low <= value <= MOST:  # False of NaN
+                raise ValueError(f"{name} is {value}, expected a number from {low:g} to {MOST:g}")
 
     def seen_from(self, newest: "PadPose") -> "PadPose":
         """Return this pose in the axes of a newer tap's pad, with the errors of both; the turn lies within 180 deg."""
@@ -59,3 +54,6 @@ class PadPose:
             hypot(self.error_mm, newest.error_mm),
             hypot(self.error_deg, newest.error_deg),
         )
+
+
+POSE_FIELDS: Final = tuple(one.name for one in fields(PadPose))

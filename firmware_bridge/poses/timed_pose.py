@@ -1,6 +1,6 @@
 """A pose of a pad as it came, with its time and its sensor."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from firmware_bridge.poses.pad_pose import PadPose
 
@@ -23,3 +23,8 @@ class TimedPose:
     sensor: str | None = None
     holds: bool = False
     used_from_ns: int | None = None
+
+    def later(self, by_ns: int) -> "TimedPose":
+        """Return the same pose with later times."""
+        used_from_ns = None if self.used_from_ns is None else self.used_from_ns + by_ns
+        return replace(self, time_ns=self.time_ns + by_ns, used_from_ns=used_from_ns)

@@ -1,8 +1,7 @@
 """Encoding of ROS 2 messages by the text of their own definition, so that the two cannot differ. No I/O.
 
-The encoding is CDR version 1, little-endian, as every ROS 2 middleware writes it: four bytes of header, then each
-field at a multiple of its size; texts and sequences begin with their length. Bytes are not trusted: every length is
-checked against the bytes that are there.
+CDR version 1, little-endian: a header of four bytes, then each field at a multiple of its size; texts and sequences
+begin with their length, which is checked against the bytes that are there.
 """
 
 import re
@@ -17,13 +16,11 @@ from firmware_bridge.errors import CdrError
 LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
 """Latest time of ROS 2, in [ns] since 1970 (in 2038)."""
 HEADER: Final = b"\x00\x01\x00\x00"
-_NUMBERS: Final = dict(
-    (
-        *(("bool", "?"), ("int8", "b"), ("uint8", "B"), ("byte", "B"), ("int16", "h"), ("uint16", "H")),
-        *(("int32", "i"), ("uint32", "I")),
-        *(("int64", "q"), ("uint64", "Q"), ("float32", "f"), ("float64", "d")),
-    )
-)
+_NUMBERS: Final = {"bool": "?", "byte": "B", "float32": "f", "float64": "d"} | {
+    f"{sign}int{bits}": code.upper() if sign else code
+    for sign in ("", "u")
+    for bits, code in ((8, "b"), (16, "h"), (32, "i"), (64, "q"))
+}
 _LENGTH: Final = struct.Struct("<I")
 _FIELD = re.compile(r"([A-Za-z][A-Za-z0-9_/]*)(\[([0-9]*)\])? +([a-z][a-z0-9_]*)")
 _RULE: Final = "=" * 80
@@ -43,29 +40,17 @@ class Field(NamedTuple):
 
     name: str
     kind: str
-    number: struct.Struct | None
-    dtype: np.dtype[Any] | None
-    length: int | None
-    message: "MessageType | None"
+    number: struct.Struct | None = None
+    dtype: np.dtype[Any] | None = None
+    length: int | None = None
+    message: "MessageType | None" = None
 
 
 class MessageType:
-    """Type of a message: its definition, and its encoding as bytes.
-
-    Attributes:
-        name: name of the type, such as "std_msgs/msg/Header".
-        fields: its fields in order.
-        definition: its text, followed by those of the messages in it, the format of MCAP for the encoding "ros2msg".
-    """
+    """Type of a message: its name, such as "std_msgs/msg/Header", its fields, and its encoding as bytes."""
 
     def __init__(self, name: str, text: str, *parts: "MessageType") -> None:
-        """Read a definition.
-
-        Args:
-            name: name with its package.
-            text: text of the .msg file: numbers, texts, arrays of numbers, other messages and sequences of them; no
-                constants, no defaults.
-            parts: the messages in it.
+        """Read the text of a .msg file, without constants and defaults; `parts` are the messages in it.
 
         Raises:
             ValueError: a line is no such field.
@@ -92,16 +77,13 @@ class MessageType:
         return cls(name, text, *parts)
 
     @property
-    def definition(self) -> str:  # noqa: D102 - above
+    def definition(self) -> str:
+        """Its text, followed by those of the messages in it, the format of MCAP for the encoding "ros2msg"."""
         parts = (f"\n{_RULE}\nMSG: {part.name.replace('/msg/', '/')}\n{part._text}" for part in self._parts)
         return self._text + "".join(parts) + "\n"
 
     def encode(self, values: Mapping[str, Any]) -> bytes:
-        """Encode a message from the values of its fields; arrays of numbers may be of any shape.
-
-        Raises:
-            KeyError: a field has no value.
-        """
+        """Encode a message from the values of its fields; arrays of numbers may be of any shape."""
         out = bytearray()
         self._write(out, values)
         return HEADER + out
@@ -124,11 +106,10 @@ class MessageType:
     def _write(self, out: bytearray, values: Mapping[str, Any]) -> None:
         for name, _, number, dtype, count, message in self.fields:
             value = values[name]
-            if message is not None and count is None:
-                message._write(out, value)
-            elif message is not None:
-                out += bytes(-len(out) % 4) + _LENGTH.pack(len(value))
-                for one in value:
+            if message is not None:
+                if count is not None:
+                    out += bytes(-len(out) % 4) + _LENGTH.pack(len(value))
+                for one in (value,) if count is None else value:
                     message._write(out, one)
             elif number is None:
                 text = value.encode() + b"\0"
@@ -147,36 +128,30 @@ class MessageType:
     def _read(self, body: memoryview, at: int) -> tuple[dict[str, Any], int]:
         values: dict[str, Any] = {}
         for name, _, number, dtype, count, message in self.fields:
-            if message is not None and count is None:
-                values[name], at = message._read(body, at)
-                continue
-            if number is not None and count is None:
-                at += -at % number.size
-                (values[name],) = number.unpack_from(body, at)
-                at += number.size
-                continue
-            length = count
-            if not length:
+            length = 1 if count is None else count
+            if count == 0 or (number is None and message is None):
                 at += -at % 4
                 (length,) = _LENGTH.unpack_from(body, at)
                 at += 4
             if message is not None:
-                values[name] = []
+                read: list[dict[str, Any]] = []
                 for _ in range(length):
                     one, at = message._read(body, at)
-                    values[name].append(one)
-                continue
-            if number is None:
+                    read.append(one)
+                values[name] = read[0] if count is None else read
+            elif number is None:
                 if not 0 < length <= len(body) - at:
                     raise ValueError(f"{name} has {length} bytes, {len(body) - at} are there")
                 values[name] = str(body[at : at + length - 1], "utf-8")
                 at += length
-                continue
-            if length:
-                at += -at % number.size
-            # frombuffer refuses to read beyond the end.
-            values[name] = np.frombuffer(body, dtype, length, at) if length else np.empty(0, dtype)
-            at += length * number.size
+            else:
+                if length:
+                    at += -at % number.size
+                if count is None:
+                    (values[name],) = number.unpack_from(body, at)
+                else:  # frombuffer refuses to read beyond the end
+                    values[name] = np.frombuffer(body, dtype, length, at) if length else np.empty(0, dtype)
+                at += length * number.size
         return values, at
 
 
@@ -187,12 +162,12 @@ def _field(line: str, known: Mapping[str, MessageType]) -> Field:
     kind, array, length, name = match.groups()
     count = None if array is None else int(length or 0)
     if kind in known and not count:
-        return Field(name, kind, None, None, count, known[kind])
+        return Field(name, kind, length=count, message=known[kind])
     if kind == "string" and count is None:
-        return Field(name, kind, None, None, None, None)
+        return Field(name, kind)
     if kind in _NUMBERS:
         number = struct.Struct("<" + _NUMBERS[kind])
-        return Field(name, kind, number, np.dtype("<" + _NUMBERS[kind]), count, None)
+        return Field(name, kind, number, np.dtype(number.format), count)
     raise ValueError(f"{line!r}: {kind} is not a supported kind")
 
 

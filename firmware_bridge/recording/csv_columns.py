@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
-from firmware_bridge.schedule import NS_PER_S
 
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
 EMULATED: Final = "emulated"
@@ -16,12 +15,15 @@ EMULATED: Final = "emulated"
 _TAXEL: Final = re.compile(r"(?P<force>force[ _])?(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
 _TIMES: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "datetime", "clock", "epoch", "elapsed"}
 _UNITS: Final = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec", "msecs", "millis", "milliseconds"), 1e3),
-    **dict.fromkeys(("us", "usec", "usecs", "micros", "microseconds"), 1e6),
-    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanoseconds"), float(NS_PER_S)),
+    word: per_second
+    for words, per_second in (
+        ("s sec secs second seconds", 1.0),
+        ("ms msec msecs millis milliseconds", 1e3),
+        ("us usec usecs micros microseconds", 1e6),
+        ("ns nsec nsecs nanos nanoseconds", 1e9),
+    )
+    for word in words.split()
 }
-"""Units of times, by the words for them in the name of a column: how many are a second."""
 _USUAL_PERIODS_S: Final = (0.0005, 0.25)
 """Periods between scans that tell the unit of times without one: none of them is usual in two units."""
 _GAP: Final = 10.0
@@ -29,17 +31,7 @@ _GAP: Final = 10.0
 
 
 class CsvColumns:
-    """Places of the columns that are read.
-
-    Attributes:
-        pad: pad whose taxels they are.
-        counts: columns of the taxels' counts, taxel by taxel, x, y and z each.
-        newtons: columns of the vendor's newtons, in the same order; empty without all of them.
-        poses: columns of the poses, as CSV_POSES; empty without.
-        times: names of the columns of times, by column.
-        emulated: whether there is the column of an emulated sensor.
-        left_out: names of all others.
-    """
+    """Places of the columns that are read; counts and newtons taxel by taxel, x, y and z each."""
 
     def __init__(self, names: Sequence[str]) -> None:
         """Sort the columns by their names.
@@ -50,8 +42,11 @@ class CsvColumns:
         counts: dict[tuple[int, str], int] = {}
         newtons: dict[tuple[int, str], int] = {}
         self.times: dict[int, str] = {}
-        others: dict[int, str] = {}
+        others: dict[str, int] = {}
+        posed: list[str] = []
         names = ["".join(char if char.isprintable() else "?" for char in name.strip()) for name in names]
+        if not any(names):
+            raise ValueError("an empty file, expected a header and rows of counts")
         for column, name in enumerate(names):
             matched = _TAXEL.fullmatch(name.lower())
             if matched is not None:
@@ -62,25 +57,22 @@ class CsvColumns:
             elif _TIMES & set(_words(name)):
                 self.times[column] = name
             elif name:
-                others[column] = name
-        self.pad = next((pad for pad in PADS if counts.keys() == _taxels(pad).keys()), USPA44)
+                others[name] = column
+                posed += [name] * name.lower().startswith("pose")
+        self.pad = next((pad for pad in PADS if counts.keys() == _taxels(pad)), USPA44)
         wanted = _taxels(self.pad)
-        if not any(names):
-            raise ValueError("an empty file, expected a header and rows of counts")
-        if counts.keys() != wanted.keys():
+        if counts.keys() != wanted:
             shown = ", ".join(names)
             raise ValueError(
                 f"{len(names)} columns: {shown[:60]}{'...' if len(shown) > 60 else ''}, expected a first line with "
                 f"{len(wanted)}: txl1_x, txl1_y, txl1_z, txl2_x, ..., txl{self.pad.taxel_count}_z, of one sensor"
             )
-        self.counts = [counts[key] for key in wanted]
-        self.newtons = [newtons[key] for key in wanted] if newtons.keys() == wanted.keys() else []
-        poses = [names.index(name) for name in CSV_POSES if name in others.values()]
-        self.poses = poses if [names[column] for column in poses] in (list(CSV_POSES[:2]), list(CSV_POSES)) else []
-        self.emulated = EMULATED in others.values()
-        self.left_out = [name for column, name in others.items() if column not in self.poses and name != EMULATED]
-        posed = [name for name in self.left_out if name.lower().startswith("pose")]
-        if posed:
+        self.counts = [counts[key] for key in sorted(wanted)]
+        self.newtons = [newtons[key] for key in sorted(wanted)] if newtons.keys() == wanted else []
+        self.poses = [others[name] for name in CSV_POSES if name in others]
+        self.emulated = EMULATED in others
+        self.left_out = [name for name in others if name not in (*CSV_POSES, EMULATED)]
+        if sorted(posed) not in ([], list(CSV_POSES[:2]), sorted(CSV_POSES)):
             raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")
 
 
@@ -102,8 +94,8 @@ def rate_of(name: str, times: ArrayLike) -> float | None:
     return units[-1] / step if units and step else None
 
 
-def _taxels(pad: SensorGeometry) -> dict[tuple[int, str], None]:
-    return {(taxel, axis): None for taxel in range(1, pad.taxel_count + 1) for axis in AXES}
+def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
+    return {(taxel, axis) for taxel in range(1, pad.taxel_count + 1) for axis in AXES}
 
 
 def _words(name: str) -> list[str]:

@@ -19,7 +19,6 @@ from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.csv_columns import CsvColumns, rate_of
-from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
@@ -86,11 +85,6 @@ class _Scans:
     """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
 
     def __init__(self, path: Path, header: _Row) -> None:
-        """Begin without a row, by the names of the columns.
-
-        Raises:
-            RecordingError: they are not those of a sensor.
-        """
         self._path = path
         try:
             self._columns = CsvColumns(header.cells)
@@ -99,46 +93,30 @@ class _Scans:
         self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
         self._counts = array("i")
         self._newtons = array("f")
-        self._poses = PoseRows()
+        self._poses: list[TimedPose] = []
         self._times = {column: array("d") for column in self._columns.times}
         self._before: list[str] = []
         self.count = 0
 
     def add(self, row: _Row) -> None:
-        """Take one row.
-
-        Raises:
-            RecordingError: a value in a whole row is impossible.
-            _DamageError: the row is damaged.
-        """
+        """Take one row; a _DamageError where it is damaged, a RecordingError where a value is impossible."""
         cells, columns = row.cells, self._columns
         _check_whole(row, self._width, self._before)
         self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
-        self._add_pose(row.line, [cells[column] for column in columns.poses])
         self._newtons.extend(_number(cells[column]) for column in columns.newtons)
+        if any(cells[column] for column in columns.poses):
+            try:
+                pose = PadPose(*(_number(cells[column]) for column in columns.poses))
+            except ValueError as error:
+                raise RecordingError(f"{self._path}, line {row.line}: its pose: {error}") from error
+            self._poses.append(TimedPose(pose, self.count, used_from_ns=self.count))
         for column, times in self._times.items():
             times.append(_time_s(cells[column]))
         self._before = cells
         self.count += 1
 
-    def _add_pose(self, line: int, cells: list[str]) -> None:
-        if not any(cells):
-            return
-        values = [_number(cell) for cell in cells]
-        wrong = [cell for cell, value in zip(cells, values, strict=True) if not math.isfinite(value)]
-        if wrong:
-            _refuse(self._path, line, f"'{wrong[0][:20]}'", "a number for each value of a pose, or for none")
-        try:
-            self._poses.add(TimedPose(PadPose(*values), self.count, used_from_ns=self.count))
-        except ValueError as error:
-            raise RecordingError(f"{self._path}, line {line}: its pose: {error}") from error
-
     def recording(self, notes: list[str]) -> Recording:
-        """Return the recording, with these notes and others.
-
-        Raises:
-            RecordingError: the file with the rate cannot be used.
-        """
+        """Return the recording, with these notes and others."""
         path, columns = self._path, self._columns
         rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
@@ -150,17 +128,21 @@ class _Scans:
                 f"{path}: {_listed(columns.left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
                 "it, such as txl1_x, time_s, pose_x_mm"
             )
-        geometry = columns.pad
-        track = Track(
-            harmless(path.stem, kept=""),
-            _by_axis(np.frombuffer(self._counts, np.int32), geometry),
-            time_ns=None,
-            vendor=_vendor(self._newtons, geometry) if self._newtons else None,
+        vendor = None
+        if self._newtons:
+            newtons = _by_axis(np.frombuffer(self._newtons, np.float32), columns.pad)
+            sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
+            vendor = tuple(VendorReading(one) if right else None for one, right in zip(newtons, sound, strict=True))
+        counts = _by_axis(np.frombuffer(self._counts, np.int32), columns.pad)
+        return Recording(
+            path,
+            (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
+            rate_hz or _meta_rate_hz(path.with_name(_META_NAME)),
+            notes=tuple(notes),
+            origin="emulated" if columns.emulated else None,
+            poses=self._poses,
+            poses_by_row=True,
         )
-        rate_hz = rate_hz or _meta_rate_hz(path.with_name(_META_NAME))
-        poses = self._poses.columns(by_row=True)
-        origin = "emulated" if columns.emulated else None
-        return Recording(path, (track,), rate_hz, notes=tuple(notes), origin=origin, poses=poses)
 
 
 def _rows(path: Path) -> Iterator[_Row]:
@@ -196,11 +178,7 @@ def _rows(path: Path) -> Iterator[_Row]:
 
 
 def _check_whole(row: _Row, width: int, before: list[str]) -> None:
-    """Check that a row has `width` cells, and that its last line was not cut off within a number.
-
-    Raises:
-        _DamageError: it has others, or a last line without its end ends in a shorter number than the one above.
-    """
+    """Raise a _DamageError where a row does not have `width` cells, or its last line was cut off within a number."""
     cells = row.cells[:width]
     if len(cells) < width or any(row.cells[width:]):
         raise _DamageError(row.line, f"{len(row.cells)} columns", f"{width}")
@@ -242,13 +220,6 @@ def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
     """Return values of rows as (n, 3, rows, cols)."""
     taxels = values.reshape(-1, geometry.taxel_count, len(AXES))
     return np.ascontiguousarray(taxels.transpose(0, 2, 1)).reshape(-1, *geometry.scan_shape)
-
-
-def _vendor(newtons: "array[float]", geometry: SensorGeometry) -> tuple[VendorReading | None, ...]:
-    """Return the vendor's newtons of each scan, None where one of them is missing or out of range."""
-    scans = _by_axis(np.frombuffer(newtons, np.float32), geometry)
-    right = np.abs(scans).reshape(len(scans), -1).max(axis=1) <= HIGHEST_NEWTONS
-    return tuple(VendorReading(one) if sound else None for one, sound in zip(scans, right, strict=True))
 
 
 def _meta_rate_hz(path: Path) -> float | None:

@@ -1,7 +1,4 @@
-"""Recordings in MCAP files, as the sink mcap: writes them; also if the sink was killed while it wrote.
-
-Only scans and baselines are kept; patterns are skipped, since they are computed again.
-"""
+"""Recordings in MCAP files, as the sink mcap: writes them, also if it was killed; patterns are computed again."""
 
 import json
 import os
@@ -12,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal, NoReturn
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -26,12 +23,12 @@ from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, Sensor
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
-from firmware_bridge.recording.pose_columns import PoseRows
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
     POSE,
     SCAN_NAME,
     SENSOR,
+    RecordedScan,
     baseline_type,
     decode_baseline,
     decode_pose,
@@ -41,6 +38,7 @@ from firmware_bridge.recording.scan_messages import (
 )
 from firmware_bridge.recording.tracks import (
     GEOMETRY_METADATA,
+    MOST_POSES,
     MOST_SENSORS,
     MOUNTING_METADATA,
     SOURCE_METADATA,
@@ -57,16 +55,10 @@ MOST_KEPT_BYTES: Final = 1 << 31
 """Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
-_POSE_BYTES: Final = 64
 MOST_BAG_BYTES: Final = 1 << 20
 """Most bytes of a bag's metadata.yaml."""
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
-
-
-class _Topic(NamedTuple):
-    name: str
-    kind: MessageType | None
 
 
 @dataclass
@@ -80,6 +72,21 @@ class _Lane:
     renewed: "array[int]" = field(default_factory=lambda: array("Q"))
     vendor: dict[int, VendorReading] = field(default_factory=dict)
 
+    def track(self, sensor: str, pad: SensorGeometry) -> Track:
+        scans = len(self.times_ns)
+        masks = np.frombuffer(self.renewed, "<u8").view(np.uint8).reshape(scans, 8)
+        renewed = np.unpackbits(masks, axis=1, count=pad.taxel_count, bitorder="little").astype(bool)
+        return Track(
+            sensor,
+            np.frombuffer(self.counts, np.int32).reshape(scans, *pad.scan_shape),
+            np.frombuffer(self.times_ns, np.int64),
+            np.frombuffer(self.numbers, np.int64),
+            np.frombuffer(self.device_times_ns, np.int64),
+            renewed.reshape(scans, pad.rows, pad.cols),
+            tuple(map(self.vendor.get, range(scans))) if self.vendor else None,
+            pad,
+        )
+
 
 def load_mcap(path: Path) -> Recording:
     """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record.
@@ -92,7 +99,7 @@ def load_mcap(path: Path) -> Recording:
     files, missing = mcap_files(path)
     if missing:
         names = ", ".join(map(ascii, missing))
-        reading.note(f"{path}: its metadata.yaml names {names[:100]}, which is not there")
+        reading.notes.append(f"{path}: its metadata.yaml names {names[:100]}, which is not there")
     for one in files:
         with one.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
@@ -102,9 +109,10 @@ def load_mcap(path: Path) -> Recording:
                 for opcode, data in records(file):
                     reading.take(opcode, data)
             except CutOffError as end:
-                reading.broken_off(str(end))
+                reading.notes.insert(0, f"{one} breaks off ({end}): its recording was killed, or the disk was full")
             except DamageError as damage:
-                reading.damaged(str(damage), os.fstat(file.fileno()).st_size - file.tell())
+                left_bytes = os.fstat(file.fileno()).st_size - file.tell()
+                reading.notes.insert(0, f"{one} is damaged ({damage}): {left_bytes:,} bytes after that are not read")
     return reading.recording()
 
 
@@ -131,10 +139,13 @@ def mcap_files(path: Path) -> tuple[list[Path], list[str]]:
 
 
 class _Reading:
+    """Content of the records so far, with notes for the user."""
+
     def __init__(self, path: Path) -> None:
+        self.notes: list[str] = []
         self._whole = self._path = path
         self._schemas: dict[int, MessageType | None] = {}
-        self._topics: dict[int, _Topic] = {}
+        self._topics: dict[int, tuple[str, MessageType | None]] = {}
         self._lanes: dict[str, _Lane] = {}
         self._baselines: dict[str, Baseline] = {}
         self._latest: dict[str, Baseline] = {}
@@ -146,18 +157,13 @@ class _Reading:
         self._described = False  # whether there are metadata of edge-sr
         self._offset_ns: int | None = None
         self._kept_bytes = 0
-        self._poses = PoseRows()
-        self._notes: list[str] = []
+        self._poses: list[TimedPose] = []
+        self._posed: set[str | None] = set()
         self._origin: Literal["device", "emulated"] | None = None
 
     def begin(self, path: Path) -> None:
         """Go on with a file: its numbers of schemas and channels are its own."""
-        self._path = path
-        self._schemas, self._topics = {}, {}
-
-    def note(self, text: str) -> None:
-        """Add a remark for the user."""
-        self._notes.append(text)
+        self._path, self._schemas, self._topics = path, {}, {}
 
     def take(self, opcode: int, data: memoryview) -> None:
         """Process one record, from a chunk or between chunks."""
@@ -171,14 +177,41 @@ class _Reading:
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
                 kind = self._schemas.get(channel.schema_id) if channel.message_encoding == "cdr" else None
-                self._topics[channel.id] = _Topic(channel.topic[:LONGEST_SHOWN], kind)
+                self._topics[channel.id] = channel.topic[:LONGEST_SHOWN], kind
             elif opcode == Opcode.METADATA:
                 self._described = True
-                self._take_metadata(Metadata.read(stream))
+                metadata = Metadata.read(stream)
+                self._take_metadata(metadata.name, metadata.metadata)
+        except RecordingError:
+            raise
         except BROKEN as error:
-            if isinstance(error, RecordingError):
-                raise
             raise DamageError(f"a record that cannot be read ({short(error)})") from error
+
+    def recording(self) -> Recording:
+        """Return what was read.
+
+        Raises:
+            RecordingError: no scans.
+        """
+        if not self._lanes:
+            self._refuse(f"no scans that edge-sr recorded{self._instead()}")
+        bare = [] if self._described else sorted(self._lanes.keys() - self._facts.keys())
+        if bare:
+            self.notes.append(
+                f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
+                "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
+            )
+        return Recording(
+            self._whole,
+            tuple(lane.track(sensor, self._geometry) for sensor, lane in self._lanes.items()),
+            None,
+            {name: one for name, one in self._baselines.items() if name in self._lanes},
+            {name: one for name, one in self._mountings.items() if name in self._lanes},
+            self._offset_ns,
+            tuple(self.notes),
+            self._origin,
+            self._poses,
+        )
 
     def _take_schema(self, schema: Schema) -> None:
         sized = re.search(rb"\[([0-9]{1,4})\] counts ", schema.data)
@@ -187,27 +220,25 @@ class _Reading:
         taxels = self._geometry.taxel_count
         known = {kind.name: kind for kind in (scan_type(taxels), baseline_type(taxels), POSE, SENSOR)}.get(schema.name)
         if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
-            raise RecordingError(f"{self._path}: its {known.name} is of another release of edge-sr than this one")
+            self._refuse(f"its {known.name} is of another release of edge-sr than this one")
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
         self._schemas[schema.id] = known
 
-    def _take_metadata(self, metadata: Metadata) -> None:
-        if metadata.name == SOURCE_METADATA:
-            self._origin = origin_of({metadata.metadata.get("kind", ""), self._origin or ""} - {""})
-        if metadata.name == GEOMETRY_METADATA:
-            self._take_geometry(metadata.metadata)
-        if metadata.name != MOUNTING_METADATA:
-            return
-        sensor = metadata.metadata.get("sensor", "")
-        try:
-            mounting = read_mounting(metadata.metadata.get("mounting", ""), self._geometry.taxel_count)
-        except ValueError as error:
-            raise RecordingError(f"{self._path}: no mounting of sensor {sensor[:20]!r}: {short(error)}") from error
-        if not is_sensor_name(sensor) or len(self._mountings) > MOST_SENSORS:
-            raise RecordingError(f"{self._path}: a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
-        if self._mountings.get(sensor, mounting) != mounting:
-            raise RecordingError(f"{self._path}: two mountings of sensor {sensor!r}, expected one: cut it in parts")
-        self._mountings[sensor] = mounting
+    def _take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
+        if name == SOURCE_METADATA:
+            self._origin = origin_of({fields.get("kind", ""), self._origin or ""} - {""})
+        elif name == GEOMETRY_METADATA:
+            self._take_geometry(fields)
+        elif name == MOUNTING_METADATA:
+            sensor = fields.get("sensor", "")
+            try:
+                mounting = read_mounting(fields.get("mounting", ""), self._geometry.taxel_count)
+            except ValueError as error:
+                self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
+            if not is_sensor_name(sensor) or len(self._mountings) > MOST_SENSORS:
+                self._refuse(f"a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
+            if self._mountings.setdefault(sensor, mounting) != mounting:
+                self._refuse(f"two mountings of sensor {sensor!r}, expected one: cut it in parts")
 
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
@@ -220,7 +251,7 @@ class _Reading:
             if geometry.taxel_count > MOST_TAXELS:
                 raise ValueError(f"{geometry.taxel_count} taxels, expected at most {MOST_TAXELS}")
         except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-            raise RecordingError(f"{self._path}: no geometry of its sensors: {short(error)}") from error
+            self._refuse(f"no geometry of its sensors: {short(error)}")
         self._geometry, self._named = geometry, True
 
     def _take_facts(self, data: memoryview) -> None:
@@ -229,12 +260,11 @@ class _Reading:
         if self._facts.get(sensor) == text:
             return
         try:
-            facts = json.loads(text)
-            for name, values in facts.items():
-                self._take_metadata(Metadata(name, {str(key): str(value) for key, value in values.items()}))
+            for name, values in json.loads(text).items():
+                self._take_metadata(name, {str(key): str(value) for key, value in values.items()})
+        except RecordingError:
+            raise
         except (ValueError, AttributeError, RecursionError) as error:
-            if isinstance(error, RecordingError):
-                raise
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
         if len(self._facts) > MOST_SENSORS:
             raise CdrError(f"facts of more than {MOST_SENSORS} sensors")
@@ -245,45 +275,39 @@ class _Reading:
             channel, _, log_ns, _ = MESSAGE.unpack_from(data)
         except struct.error as error:
             raise DamageError("a message that is cut off") from error
-        topic = self._topics.get(channel)
-        if topic is None or topic.kind is None:
-            return
+        topic, kind = self._topics.get(channel, ("", None))
+        body = data[MESSAGE.size :]
         try:
-            if topic.kind.name == SCAN_NAME:
-                self._take_scan(data[MESSAGE.size :], log_ns)
-            elif topic.kind is SENSOR:
-                self._take_facts(data[MESSAGE.size :])
-            elif topic.kind is POSE:
-                self._take_pose(decode_pose(data[MESSAGE.size :]))
-            else:
-                self._take_baseline(decode_baseline(data[MESSAGE.size :], self._geometry))
+            if kind is POSE:
+                self._take_pose(decode_pose(body))
+            elif kind is SENSOR:
+                self._take_facts(body)
+            elif kind is not None and kind.name == SCAN_NAME:
+                self._take_scan(decode_scan(body, self._geometry), log_ns)
+            elif kind is not None:
+                self._take_baseline(decode_baseline(body, self._geometry))
         except CdrError as error:
-            raise RecordingError(f"{self._path}, topic {topic.name!r}: {error}") from error
+            raise RecordingError(f"{self._path}, topic {topic!r}: {error}") from error
 
-    def _take_scan(self, data: memoryview, log_ns: int) -> None:
-        scan = decode_scan(data, self._geometry)
+    def _take_scan(self, scan: RecordedScan, log_ns: int) -> None:
         if scan.frame == f"emulated/{scan.sensor}":
             self._origin = "emulated"
-        lane = self._lanes.get(scan.sensor)
-        if lane is None:
-            if len(self._lanes) == MOST_SENSORS:
-                raise RecordingError(f"{self._path}: more than {MOST_SENSORS} sensors")
-            lane = self._lanes[scan.sensor] = _Lane()
+        lane = self._lanes.get(scan.sensor) or self._lanes.setdefault(scan.sensor, _Lane())
+        if len(self._lanes) > MOST_SENSORS:
+            self._refuse(f"more than {MOST_SENSORS} sensors")
         if self._offset_ns is None:
             self._offset_ns = log_ns - scan.time_ns
         unix_ns = scan.time_ns + self._offset_ns
         if not 0 <= unix_ns < LAST_STAMP_NS:  # such a scan could be played, but not recorded again
-            raise RecordingError(
-                f"{self._path}: a scan of sensor {scan.sensor!r} at {unix_ns:,} ns since 1970, expected "
-                f"0..{LAST_STAMP_NS:,}"
-            )
+            got = f"a scan of sensor {scan.sensor!r} at {unix_ns:,} ns since 1970"
+            self._refuse(f"{got}, expected 0..{LAST_STAMP_NS:,}")
         if lane.times_ns and scan.time_ns < lane.times_ns[-1]:
-            raise RecordingError(f"{self._path}: times of sensor {scan.sensor!r} that go back, expected none")
+            self._refuse(f"times of sensor {scan.sensor!r} that go back, expected none")
         self._kept_bytes += _SCAN_BYTES if scan.vendor is None else _SCAN_BYTES + _VENDOR_BYTES
         if self._kept_bytes > MOST_KEPT_BYTES:
-            raise RecordingError(f"{self._path}: more scans than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
+            self._refuse(f"more scans than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
         if scan.vendor is not None:
-            lane.vendor[len(lane.times_ns)] = _own(scan.vendor)
+            lane.vendor[len(lane.times_ns)] = scan.vendor
         lane.counts += scan.counts.tobytes()
         lane.numbers.append(scan.number)
         lane.times_ns.append(scan.time_ns)
@@ -291,72 +315,39 @@ class _Reading:
         lane.renewed.append(scan.renewed)
 
     def _take_pose(self, timed: TimedPose) -> None:
-        self._kept_bytes += _POSE_BYTES
-        if self._kept_bytes > MOST_KEPT_BYTES:
-            raise RecordingError(f"{self._path}: more poses than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
-        self._poses.add(timed)
-        if self._poses.sensors > MOST_SENSORS + 1:
-            raise RecordingError(f"{self._path}: poses of more than {MOST_SENSORS} sensors")
+        self._poses.append(timed)
+        self._posed.add(timed.sensor)
+        if len(self._poses) > MOST_POSES:
+            self._refuse(f"more than {MOST_POSES:,} poses: cut it in parts")
+        if len(self._posed) > MOST_SENSORS + 1:
+            self._refuse(f"poses of more than {MOST_SENSORS} sensors")
 
     def _take_baseline(self, baseline: Baseline) -> None:
-        sensor = baseline.sensor
-        before = self._latest.get(sensor)
-        if before is None and len(self._latest) == MOST_SENSORS:
-            raise RecordingError(f"{self._path}: baselines of more than {MOST_SENSORS} sensors")
-        if sensor not in self._lanes or (before is None and self._was_used(baseline)):
+        sensor, lane = baseline.sensor, self._lanes.get(baseline.sensor)
+        before, self._latest[sensor] = self._latest.get(sensor), baseline
+        if len(self._latest) > MOST_SENSORS:
+            self._refuse(f"baselines of more than {MOST_SENSORS} sensors")
+        # A part of a file may have it after a sensor's first scan, which was made with it: it is repeated.
+        first_ns = 0 if lane is None else lane.times_ns[0] + (self._offset_ns or 0)
+        if lane is None or (before is None and baseline.created_unix_s < first_ns / NS_PER_S):
             self._baselines[sensor] = baseline
-        elif before is not None and before.id != baseline.id and len(self._notes) < MOST_SENSORS:
-            self._notes.append(
+        elif before is not None and before.id != baseline.id and len(self.notes) < MOST_SENSORS:
+            self.notes.append(
                 f"{self._path}: sensor {sensor} was zeroed again while it was recorded ({before.id}, then "
                 f"{baseline.id}); played again it keeps to the baseline of its beginning"
             )
-        self._latest[sensor] = baseline
-
-    def _was_used(self, baseline: Baseline) -> bool:
-        """Return True if a sensor's first scan was made with it: a part of a file may have it after that, repeated."""
-        first_unix_ns = self._lanes[baseline.sensor].times_ns[0] + (self._offset_ns or 0)
-        return baseline.created_unix_s < first_unix_ns / NS_PER_S
-
-    def broken_off(self, why: str) -> None:
-        """Keep the records so far and note that the file ends early."""
-        self._notes.insert(0, f"{self._path} breaks off ({why}): its recording was killed, or the disk was full")
-
-    def damaged(self, why: str, left_bytes: int) -> None:
-        """Keep the records before the damage and note it."""
-        self._notes.insert(0, f"{self._path} is damaged ({why}): {left_bytes:,} bytes after that are not read")
-
-    def recording(self) -> Recording:
-        if not self._lanes:
-            raise RecordingError(f"{self._path}: no scans that edge-sr recorded{self._instead()}")
-        tracks = tuple(_track(sensor, lane, self._geometry) for sensor, lane in self._lanes.items())
-        mountings = {name: one for name, one in self._mountings.items() if name in self._lanes}
-        bare = [] if self._described else sorted(self._lanes.keys() - self._facts.keys())
-        if bare:
-            self._notes.append(
-                f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
-                "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
-            )
-        baselines = {name: one for name, one in self._baselines.items() if name in self._lanes}
-        return Recording(
-            self._whole,
-            tracks,
-            None,
-            baselines,
-            mountings,
-            self._offset_ns,
-            tuple(self._notes),
-            self._origin,
-            self._poses.columns(),
-        )
 
     def _instead(self) -> str:
-        if self._notes:
-            return f"; {self._notes[0]}"
-        names = [topic.name for topic in self._topics.values()]
+        if self.notes:
+            return f"; {self.notes[0]}"
+        names = [name for name, _ in self._topics.values()]
         if not names:
             return ", and no topics"
         more = f", and {len(names) - MOST_SHOWN_TOPICS} more" if len(names) > MOST_SHOWN_TOPICS else ""
         return f"; its topics are {', '.join(map(repr, names[:MOST_SHOWN_TOPICS]))}{more}"
+
+    def _refuse(self, why: str) -> NoReturn:
+        raise RecordingError(f"{self._path}: {why}")
 
 
 def _pad_with(taxels: int) -> SensorGeometry:
@@ -364,25 +355,3 @@ def _pad_with(taxels: int) -> SensorGeometry:
     if not 0 < taxels <= MOST_TAXELS:
         return USPA44
     return next((pad for pad in PADS if pad.taxel_count == taxels), None) or pad_of(1, taxels)
-
-
-def _track(sensor: str, lane: _Lane, geometry: SensorGeometry) -> Track:
-    scans = len(lane.times_ns)
-    masks = np.frombuffer(lane.renewed, "<u8").astype("<u8").view(np.uint8).reshape(scans, 8)
-    renewed = np.unpackbits(masks, axis=1, count=geometry.taxel_count, bitorder="little").astype(bool)
-    return Track(
-        sensor,
-        np.frombuffer(lane.counts, np.int32).reshape(scans, *geometry.scan_shape),
-        np.frombuffer(lane.times_ns, np.int64),
-        np.frombuffer(lane.numbers, np.int64),
-        np.frombuffer(lane.device_times_ns, np.int64),
-        renewed.reshape(scans, geometry.rows, geometry.cols),
-        tuple(map(lane.vendor.get, range(scans))) if lane.vendor else None,
-        geometry,
-    )
-
-
-def _own(vendor: VendorReading) -> VendorReading:
-    """Return a copy, since a view would keep the whole chunk in memory."""
-    arrays = (vendor.newtons, vendor.temperature_k, vendor.ups_hz)
-    return VendorReading(*(None if array is None else array.copy() for array in arrays))

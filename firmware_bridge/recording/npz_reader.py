@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from firmware_bridge.errors import NpzError
 
 LONGEST_READ_BYTES: Final = 1 << 20
-"""Most bytes of one read. zipfile reads a table of contents in one piece, and millions of empty members take gigabytes.
-numpy reads arrays in pieces of 256 kB, or of one element: so no text in an array can be longer than this either."""
-HIGHEST_CODE_POINT: Final = 0x10FFFF
+"""Most bytes of one read: zipfile reads a table of contents in one piece, whose members could take gigabytes."""
 _SURROGATES: Final = (0xD800, 0xDFFF)
 _BROKEN: Final = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, TypeError, LookupError, OverflowError),
@@ -48,7 +46,7 @@ def read_npz(
     Args:
         path: path of the file.
         names: names of the arrays.
-        most_bytes: largest allowed size of them together, in bytes.
+        most_bytes: largest allowed size of them together.
         damaged: called where the file has lost its end, to read the arrays that are whole; without it that is refused.
 
     Raises:
@@ -131,6 +129,6 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
     if dtype.kind == "U" and array.size and dtype.itemsize:
         points = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(dtype.byteorder))
         low, high = _SURROGATES
-        if points.max() > HIGHEST_CODE_POINT or ((points >= low) & (points <= high)).any():
+        if points.max() > 0x10FFFF or ((points >= low) & (points <= high)).any():
             raise NpzError(f"{info.filename} holds text that is not Unicode")
     return array

@@ -11,10 +11,20 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
+from firmware_bridge.poses.pad_pose import POSE_FIELDS, PadPose
+from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.recording.pose_columns import POSE_FIELDS, PoseColumns
 from firmware_bridge.recording.scan_messages import read_mounting
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, MOST_SENSORS, Recording, Track, is_rate, origin_of
+from firmware_bridge.recording.tracks import (
+    A_RATE,
+    HIGHEST_COUNT,
+    MOST_POSES,
+    MOST_SENSORS,
+    Recording,
+    Track,
+    is_rate,
+    origin_of,
+)
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S
@@ -72,7 +82,7 @@ def load_npz(path: Path) -> Recording:
         _mountings(path, arrays.get("mountings"), tracks),
         notes=tuple(notes),
         origin=_origin(path, arrays, len(counts)),
-        poses=None if notes and "pose" not in arrays else _poses(path, arrays),
+        poses=[] if notes and "pose" not in arrays else _poses(path, arrays),
     )
 
 
@@ -161,10 +171,10 @@ def _origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> Liter
     return None
 
 
-def _poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | None:
+def _poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
     found = {name: arrays[name] for name in _POSES if name in arrays}
     if not found:
-        return None
+        return []
     for name in _POSES[:2]:
         if name not in found:
             raise RecordingError(f"{path}, array '{name}': missing, expected together with '{next(iter(found))}'")
@@ -172,27 +182,31 @@ def _poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> PoseColumns | None
     for name, kinds in zip(_POSES, ("iu", "fiu", "U", "b", "iu"), strict=True):
         if name in found:
             _check_array(path, name, found[name], kinds, (count, len(POSE_FIELDS)) if name == "pose" else (count,))
-    if not count:
-        return None
-    names, sensor = np.unique(found.get("pose_sensor", np.zeros(count, "U1")), return_inverse=True)
-    if len(names) > MOST_SENSORS:
-        raise RecordingError(f"{path}, array 'pose_sensor': {len(names)} sensors, expected at most {MOST_SENSORS}")
+    if count > MOST_POSES:
+        _refuse(path, "pose", f"{count:,} poses", f"at most {MOST_POSES:,}: cut it in parts")
+    sensors = found.get("pose_sensor", np.zeros(count, "U1")).tolist()
+    if len(set(sensors)) > MOST_SENSORS + 1:
+        _refuse(path, "pose_sensor", f"{len(set(sensors))} sensors", f"at most {MOST_SENSORS}")
+    for name in set(sensors) - {""}:
+        if not is_sensor_name(name):
+            _refuse(path, "pose_sensor", repr(name[:20]), "the name of a sensor, or none")
+    times_ns, used_ns = found["pose_time_ns"], found.get("pose_used_from_ns", np.full(count, -1))
+    for name, times, low in (("pose_time_ns", times_ns, 0), ("pose_used_from_ns", used_ns, -1)):
+        if count and not low <= times.min() <= times.max() <= LAST_TIME_NS:
+            _refuse(path, name, f"times {times.min()}..{times.max()}", f"{low}..{LAST_TIME_NS}")
+    holds = found.get("pose_holds", np.zeros(count, bool))
+    rows = zip(
+        *(array.tolist() for array in (found["pose"].astype(np.float64), times_ns, holds, used_ns)),
+        sensors,
+        strict=True,
+    )
     try:
-        return PoseColumns(
-            _whole(found["pose_time_ns"]),
-            found["pose"].astype(np.float64),
-            tuple(names.tolist()),
-            sensor.astype(np.int32),
-            found.get("pose_holds", np.zeros(count, bool)),
-            _whole(found.get("pose_used_from_ns", np.full(count, -1))),
-        )
+        return [
+            TimedPose(PadPose(*values), time_ns, sensor or None, held, None if used_from_ns < 0 else used_from_ns)
+            for values, time_ns, held, used_from_ns, sensor in rows
+        ]
     except ValueError as error:
-        raise RecordingError(f"{path}, array 'pose' or another of the poses: {error}") from error
-
-
-def _whole(array: NDArray[Any]) -> NDArray[np.int64]:
-    """Return whole numbers as int64; those beyond it stay beyond all limits."""
-    return np.minimum(array, np.iinfo(np.int64).max).astype(np.int64)
+        raise RecordingError(f"{path}, array 'pose': {error}") from error
 
 
 def _check_array(path: Path, name: str, array: NDArray[Any], kinds: str, shape: tuple[int, ...]) -> None:

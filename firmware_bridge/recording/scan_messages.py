@@ -1,7 +1,9 @@
 """Messages of scans, baselines, poses and sensors: all that is needed to play a recording again, bit for bit."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
+from dataclasses import fields as dataclass_fields
 from functools import lru_cache
 from typing import Any, Final, NamedTuple, get_args
 
@@ -10,10 +12,9 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses.pad_pose import POSE_FIELDS, PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
-from firmware_bridge.recording.pose_columns import POSE_FIELDS
 from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading, is_sensor_name
@@ -23,7 +24,6 @@ from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline, Origin
 
 SCAN_NAME: Final = "tactile_edge_sr/msg/Scan"
 BASELINE_NAME: Final = "tactile_edge_sr/msg/Baseline"
-SENSOR_NAME: Final = "tactile_edge_sr/msg/Sensor"
 # The reader takes a definition by its text, so not even a comment in it may change: earlier recordings have it.
 _SCAN_TEXT: Final = """\
 # One reading of all taxels of one sensor, raw.
@@ -56,7 +56,6 @@ std_msgs/Header header
 string sensor
 string facts                    # JSON: by name, what the file's metadata records hold as well, and units
 """
-
 _POSE_TEXT: Final = """\
 # Pose of a pad in the plane of the object that it touches: x to the right, y down, a turn from x to y.
 std_msgs/Header header          # wall clock time of time_ns
@@ -86,7 +85,7 @@ def baseline_type(taxel_count: int) -> MessageType:
 
 SCAN: Final = scan_type(USPA44.taxel_count)
 BASELINE: Final = baseline_type(USPA44.taxel_count)
-SENSOR: Final = MessageType(SENSOR_NAME, _SENSOR_TEXT, STD_HEADER)
+SENSOR: Final = MessageType("tactile_edge_sr/msg/Sensor", _SENSOR_TEXT, STD_HEADER)
 POSE: Final = MessageType("tactile_edge_sr/msg/PadPose", _POSE_TEXT, STD_HEADER)
 
 
@@ -109,10 +108,10 @@ def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) 
 
     `frame` is that of the results' messages, so that raw scans are marked, too, where their source is no device.
     """
-    vendor = VendorReading() if scan.vendor is None else scan.vendor
+    vendor = ((one.name, getattr(scan.vendor, one.name, None)) for one in dataclass_fields(VendorReading))
     return scan_type(scan.fresh.size).encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
+            "header": _header(frame, unix_ns),
             "sensor": scan.sensor,
             "number": scan.number,
             "time_ns": scan.time_ns,
@@ -120,9 +119,7 @@ def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) 
             "fresh": fresh,
             "renewed": renewed,
             "counts": scan.counts,
-            "vendor_newtons": () if vendor.newtons is None else vendor.newtons,
-            "vendor_temperature_k": () if vendor.temperature_k is None else vendor.temperature_k,
-            "vendor_ups_hz": () if vendor.ups_hz is None else vendor.ups_hz,
+            **{f"vendor_{name}": () if array is None else array for name, array in vendor},
         }
     )
 
@@ -134,30 +131,33 @@ def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> 
         CdrError: it is no scan message, or a value is impossible.
     """
     fields = scan_type(geometry.taxel_count).decode(data)
-    sensor, number, fresh, renewed = fields["sensor"], fields["number"], fields["fresh"], fields["renewed"]
+    sensor, fresh, renewed = fields["sensor"], fields["fresh"], fields["renewed"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
-    _check(0 <= number <= LAST_TIME_NS, "number", number, f"0..{LAST_TIME_NS}")
-    for name, least in (("time_ns", 0), ("device_time_ns", -1)):
-        _check(least <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{least}..{LAST_TIME_NS}")
+    _check_times(fields, number=0, time_ns=0, device_time_ns=-1)
     right = fresh < 1 << geometry.taxel_count and renewed & ~fresh == 0
     _check(right, "fresh and renewed", (fresh, renewed), "renewed taxels that are")
     counts = fields["counts"].reshape(geometry.scan_shape)
-    low, high = int(counts.min()), int(counts.max())
-    _check(low >= ABSENT and high <= HIGHEST_COUNT, "counts", (low, high), f"{ABSENT}..{HIGHEST_COUNT}")
-    absent = counts == ABSENT
-    arrived = mask(fresh, geometry)
-    _check(bool((absent == ~arrived).all()), "counts", "readings", "one on each axis of a fresh taxel, none of others")
-    _check_vendor(fields)
-    vendor = {
-        "newtons": _vendor(fields, "vendor_newtons", geometry.scan_shape),
-        "temperature_k": _vendor(fields, "vendor_temperature_k", arrived.shape),
-        "ups_hz": _vendor(fields, "vendor_ups_hz", arrived.shape),
-    }
-    known = any(array is not None for array in vendor.values())
+    _check_range("counts", counts, ABSENT, HIGHEST_COUNT)
+    taxels = np.unpackbits(np.frombuffer(fresh.to_bytes(8, "little"), np.uint8), bitorder="little")
+    absent = ~taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
+    right = bool(((counts == ABSENT) == absent).all())
+    _check(right, "counts", "readings", "one on each axis of a fresh taxel, none of others")
+    vendor: dict[str, NDArray[np.float32]] = {}
+    for name, shape, low, high in (
+        ("newtons", geometry.scan_shape, -HIGHEST_NEWTONS, HIGHEST_NEWTONS),
+        ("temperature_k", absent.shape, *KELVIN),
+        ("ups_hz", absent.shape, 0, HIGHEST_UPS_HZ),
+    ):
+        array = fields[f"vendor_{name}"]
+        # NaN is a taxel without a thermometer.
+        _check_range(f"vendor_{name}", array, low, high, or_none=name == "temperature_k")
+        if array.size:
+            right = array.size == int(np.prod(shape))
+            _check(right, f"vendor_{name}", f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
+            vendor[name] = array.reshape(shape).copy()  # a view would keep the whole chunk of a file in memory
     return RecordedScan(
-        *(fields["header"]["frame_id"], sensor, number, fields["time_ns"], fields["device_time_ns"], fresh, renewed),
-        counts,
-        VendorReading(**vendor) if known else None,
+        *(fields["header"]["frame_id"], sensor, fields["number"], fields["time_ns"], fields["device_time_ns"]),
+        *(fresh, renewed, counts, VendorReading(**vendor) if vendor else None),
     )
 
 
@@ -165,7 +165,7 @@ def encode_baseline(baseline: Baseline, frame: str, age_s: float | None, unix_ns
     """Encode a baseline that is used from `unix_ns` on, in [ns] since 1970."""
     return baseline_type(baseline.counts[0].size).encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": frame},
+            "header": _header(frame, unix_ns),
             "sensor": baseline.sensor,
             "id": baseline.id,
             "origin": baseline.origin,
@@ -196,8 +196,7 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
         _check(0 < created_unix_s <= LAST_UNIX_S, "created_unix_s", created_unix_s, "seconds since 1970, or none")
     _check(scans >= 1, "scans", scans, "a whole number from 1")
     counts = np.array(fields["counts"].reshape(geometry.scan_shape))
-    inside = np.isnan(counts) | ((counts >= 0) & (counts <= HIGHEST_COUNT + 1))
-    _check(bool(inside.all()), "counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
+    _check_range("counts", counts, 0, HIGHEST_COUNT + 1, or_none=True)
     counts.setflags(write=False)
     origin: Origin = fields["origin"] if fields["origin"] in get_args(Origin) else "file"
     return Baseline(sensor, counts, created_unix_s, scans, origin, fields["id"])
@@ -205,18 +204,18 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
 
 def encode_sensor(sensor: str, frame: str, facts: str, unix_ns: int) -> bytes:
     """Encode what the scans of a sensor mean, as JSON, at `unix_ns` [ns] since 1970."""
-    return SENSOR.encode({"header": {"stamp": stamp(unix_ns), "frame_id": frame}, "sensor": sensor, "facts": facts})
+    return SENSOR.encode({"header": _header(frame, unix_ns), "sensor": sensor, "facts": facts})
 
 
 def encode_pose(timed: TimedPose, unix_ns: int) -> bytes:
     """Encode a pose whose time is `unix_ns` [ns] since 1970."""
     return POSE.encode(
         {
-            "header": {"stamp": stamp(unix_ns), "frame_id": timed.sensor or ""},
+            "header": _header(timed.sensor or "", unix_ns),
             "sensor": timed.sensor or "",
             "time_ns": timed.time_ns,
             "used_from_ns": -1 if timed.used_from_ns is None else timed.used_from_ns,
-            **{name: getattr(timed.pose, name) for name in POSE_FIELDS},
+            **asdict(timed.pose),
             "holds": int(timed.holds),
         }
     )
@@ -231,8 +230,7 @@ def decode_pose(data: bytes | memoryview) -> TimedPose:
     fields = POSE.decode(data)
     sensor, used_from_ns = fields["sensor"], fields["used_from_ns"]
     _check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
-    for name, least in (("time_ns", 0), ("used_from_ns", -1)):
-        _check(least <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{least}..{LAST_TIME_NS}")
+    _check_times(fields, time_ns=0, used_from_ns=-1)
     _check(fields["holds"] <= 1, "holds", fields["holds"], "0 or 1")
     try:
         pose = PadPose(*(fields[name] for name in POSE_FIELDS))
@@ -266,30 +264,20 @@ def read_mounting(text: str, taxel_count: int) -> Mounting:
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from error
 
 
-def mask(bits: int, geometry: SensorGeometry = USPA44) -> NDArray[np.bool_]:
-    """Convert a number to a (rows, cols) mask: bit i is taxel i, row-major from the top left."""
-    taxels = np.unpackbits(np.frombuffer(bits.to_bytes(8, "little"), np.uint8), bitorder="little")
-    return taxels[: geometry.taxel_count].astype(bool).reshape(geometry.rows, geometry.cols)
+def _header(frame: str, unix_ns: int) -> dict[str, Any]:
+    return {"stamp": stamp(unix_ns), "frame_id": frame}
 
 
-def _check_vendor(fields: dict[str, Any]) -> None:
-    """Check the vendor's values against the ranges for the server itself; NaN is a taxel without a thermometer."""
-    newtons, kelvin, ups_hz = (fields[name] for name in ("vendor_newtons", "vendor_temperature_k", "vendor_ups_hz"))
-    right = bool((np.abs(newtons) <= HIGHEST_NEWTONS).all())
-    _check(right, "vendor_newtons", "others", f"-{HIGHEST_NEWTONS:g}..{HIGHEST_NEWTONS:g}")
-    low, high = KELVIN
-    right = bool((np.isnan(kelvin) | ((kelvin >= low) & (kelvin <= high))).all())
-    _check(right, "vendor_temperature_k", "others", f"{low:g}..{high:g}, or none")
-    right = bool(((ups_hz >= 0) & (ups_hz <= HIGHEST_UPS_HZ)).all())
-    _check(right, "vendor_ups_hz", "others", f"0..{HIGHEST_UPS_HZ:g}")
+def _check_times(fields: Mapping[str, Any], **least: int) -> None:
+    for name, low in least.items():
+        _check(low <= fields[name] <= LAST_TIME_NS, name, fields[name], f"{low}..{LAST_TIME_NS}")
 
 
-def _vendor(fields: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-    array = fields[name]
-    if not array.size:
-        return None
-    _check(array.size == int(np.prod(shape)), name, f"{array.size} numbers", f"none, or {int(np.prod(shape))}")
-    return array.reshape(shape)
+def _check_range(name: str, array: NDArray[Any], low: float, high: float, *, or_none: bool = False) -> None:
+    inside = (array >= low) & (array <= high)
+    right = (inside | np.isnan(array)) if or_none else inside
+    got = "others" if right.all() else f"{array[~right][0]:g}"
+    _check(bool(right.all()), name, got, f"{low:g}..{high:g}" + ", or none" * or_none)
 
 
 def _check(right: bool, name: str, got: object, expected: str) -> None:

@@ -1,6 +1,6 @@
 """Recordings in memory: tracks of scans, one per sensor."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -13,7 +13,7 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 
 if TYPE_CHECKING:
-    from firmware_bridge.recording.pose_columns import PoseColumns
+    from firmware_bridge.poses.timed_pose import TimedPose
     from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
@@ -26,6 +26,8 @@ SOURCE_METADATA: Final = "source"
 HIGHEST_COUNT: Final = 0xFFFF
 MOST_SENSORS: Final = 64
 """Most sensors of a recording; one wire can have sixteen."""
+MOST_POSES: Final = 1 << 23
+"""Most poses of a recording: those of a day at 100 Hz, in 3 GB."""
 RATES_HZ: Final = (1e-3, 1e5)
 """Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
 A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
@@ -33,17 +35,15 @@ A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Scans of one sensor in a recording.
+    """Scans of one sensor in a recording; what was not recorded is None.
 
     Attributes:
-        sensor: name of the sensor.
         counts: (n, 3, rows, cols) int32, ABSENT where a taxel gave no reading.
-        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling; None if not recorded.
-        numbers: (n,) int64 numbers of the scans; None if not recorded, as for the following ones.
+        time_ns: (n,) int64 monotonic time of each scan in [ns], never falling.
+        numbers: (n,) int64 numbers of the scans.
         device_time_ns: (n,) int64 device times on the clock of `time_ns`, in [ns]; -1 where the device had none.
         renewed: (n, rows, cols) bool, True where a reading was new.
         vendor: (n,) values of the vendor's software.
-        pad: pad that the file names; None if it does not.
     """
 
     sensor: str
@@ -73,16 +73,15 @@ class Recording:
     """Tracks of one file, at least one, each with at least one scan.
 
     Attributes:
-        path: path of the file.
         tracks: one per sensor, in the order in which they first occur.
         rate_hz: rate of each sensor's scans, in [Hz]; None if the file does not state it.
         baselines: baselines at the first scan of each sensor; without sensors that were not zeroed yet.
         mountings: mountings of the sensors, by name. The taxels are in place; only the axes are still to be turned.
         unix_offset_ns: offset from `time_ns` to [ns] since 1970; None if the file does not state it.
-        notes: remarks for the user who plays it.
         origin: "device" or "emulated", the origin of its scans, however often they were played and recorded again;
             None if the file does not state it.
-        poses: poses of the pads; None without.
+        poses: poses of the pads, in the order in which they were taken.
+        poses_by_row: the times of the poses are rows of the scans, which have no times themselves.
     """
 
     path: Path
@@ -93,7 +92,8 @@ class Recording:
     unix_offset_ns: int | None = None
     notes: tuple[str, ...] = ()
     origin: Literal["device", "emulated"] | None = None
-    poses: "PoseColumns | None" = None
+    poses: "Sequence[TimedPose]" = ()
+    poses_by_row: bool = False
 
 
 def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:

@@ -1,7 +1,4 @@
-"""Model of the sensor file: the properties of a sensor from its setup, in TOML that a person can read and edit.
-
-This module holds its content and its reading; `toml_writer` writes it.
-"""
+"""Model of the sensor file and its reading: the properties of a sensor, in TOML that a person can read and edit."""
 
 import math
 import tomllib
@@ -12,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import SensorFileError
@@ -22,15 +18,15 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
 from firmware_bridge.sensor_file.pad_frame import LARGEST_MM, PadFrame
-from firmware_bridge.sensor_file.toml_reader import (
-    REMEDY,
+from firmware_bridge.strict_table import (
+    LEAST_POSITIVE,
     Table,
     a_table,
     between,
-    flat_cells,
+    cells,
     is_number,
+    numbers,
     one_of,
-    sensor_tables,
     text_value,
     truth,
     whole,
@@ -44,6 +40,7 @@ MOST_BYTES: Final = 1 << 16
 LONGEST_LINE_BYTES: Final = 2048
 """Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
 took 27 s."""
+_REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
 PARTS: Final = ("mounting", "force", "baseline", "gains")
 """Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
 
@@ -104,7 +101,7 @@ class SensorFile:
     @property
     def mountings(self) -> dict[str, Mounting]:
         """Mountings by sensor name."""
-        return {name: entry.mounting for name, entry in self.sensors.items()}
+        return self._known("mounting")
 
     @property
     def orders(self) -> dict[str, tuple[int, ...]]:
@@ -124,29 +121,31 @@ class SensorFile:
     @property
     def baselines(self) -> dict[str, Baseline]:
         """Available baselines by sensor name."""
-        return {name: entry.baseline for name, entry in self.sensors.items() if entry.baseline is not None}
+        return self._known("baseline")
 
     @property
     def counts_per_newton(self) -> dict[str, float]:
         """Summed z per [N] by sensor name, where it is available."""
-        known = {name: entry.counts_per_newton for name, entry in self.sensors.items()}
-        return {name: counts for name, counts in known.items() if counts is not None}
+        return self._known("counts_per_newton")
 
     @property
     def frames(self) -> dict[str, PadFrame]:
         """Places of the pads on the robot by sensor name, where they are available."""
-        return {name: entry.frame for name, entry in self.sensors.items() if entry.frame is not None}
+        return self._known("frame")
 
     @property
     def measured_pads(self) -> dict[str, Pad]:
         """Pads without what was learned, by sensor name."""
-        return {name: entry.pad for name, entry in self.sensors.items() if entry.pad is not None}
+        return self._known("pad")
 
     @property
     def pads(self) -> dict[str, Pad]:
         """Pads in use by sensor name, with what was learned."""
-        used = {name: entry.used_pad for name, entry in self.sensors.items()}
-        return {name: pad for name, pad in used.items() if pad is not None}
+        return self._known("used_pad")
+
+    def _known(self, name: str) -> dict[str, Any]:
+        values = {sensor: getattr(entry, name) for sensor, entry in self.sensors.items()}
+        return {sensor: value for sensor, value in values.items() if value is not None}
 
 
 def load_sensor_file(path: str | Path) -> SensorFile:
@@ -164,73 +163,79 @@ def load_sensor_file(path: str | Path) -> SensorFile:
     except OSError as error:
         raise SensorFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
-        raise SensorFileError(f"{path}: not TOML ({error}): {REMEDY}") from error
-    top = Table(path, "", document)
+        raise SensorFileError(f"{path}: not TOML ({error}): {_REMEDY}") from error
+    top = Table(path, "", document, SensorFileError, _REMEDY)
     top.take("format", one_of(FILE_FORMAT))
     top.take("version", one_of(FILE_VERSION))
     model = top.take("model", one_of(*ID_MAPS))
     adapter = top.take("adapter", text_value, required=False)
-    sensors = top.take("sensors", sensor_tables)
-    for name in sensors:
-        if not is_sensor_name(name):
-            top.refuse("sensors", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    sensors = top.take("sensors", _sensor_tables)
     top.end()
-    entries = {name: _entry(path, name, table, ID_MAPS[model].geometry) for name, table in sensors.items()}
+    entries = {
+        name: _entry(top.part(f"sensors.{name}", table), name, ID_MAPS[model].geometry)
+        for name, table in sensors.items()
+    }
     return SensorFile(model, adapter, entries, path=path)
 
 
-def _entry(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> SensorEntry:
-    table = Table(path, f"sensors.{name}.", values)
-    order = table.take("order", partial(_order, geometry), required=False)
-    swap_xy = table.take("swap_xy", truth, required=False)
-    signs = table.take("signs", _signs, required=False)
-    gains = table.take("gains", partial(_gains, geometry), required=False)
+def _sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
+    if not isinstance(value, dict) or not value or not all(isinstance(one, dict) for one in value.values()):
+        raise ValueError("a table for each sensor, such as [sensors.4]")
+    if not all(map(is_sensor_name, value)):
+        raise ValueError(f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    return value
+
+
+def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
+    grid, taxels = geometry.scan_shape[1:], list(range(geometry.taxel_count))
+    places = f"{grid[0]} rows of {grid[1]}, each of 0..{taxels[-1]} once"
+    mounting = {
+        "order": cells(grid, lambda all_: set(map(type, all_)) == {int} and sorted(all_) == taxels, places),
+        "swap_xy": truth,
+        "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
+        "gains": partial(_gains, geometry),
+    }
+    known = {key: table.take(key, read, required=False) for key, read in mounting.items()}
     counts_per_newton = table.take("counts_per_newton", between(*PAD_RANGES["counts_per_newton"]), required=False)
-    pads = {key: table.take(key, a_table, required=False) for key in ("pad", "learned")}
-    baseline = table.take("baseline", a_table, required=False)
-    frame = table.take("frame", a_table, required=False)
-    marks = {key: table.take(key, _parts, required=False) or frozenset() for key in ("assumed", "emulated")}
+    marked = {"assumed": _parts, "emulated": _parts}
+    marks = {key: table.take(key, read, required=False) or frozenset() for key, read in marked.items()}
+    parts = {"pad": _pad, "learned": _pad, "baseline": _baseline, "frame": _frame}
+    tables = {key: table.take(key, a_table, required=False) for key in parts}
     table.end()
-    known = {"order": order, "swap_xy": swap_xy, "signs": signs, "gains": gains}
-    known = {key: value for key, value in known.items() if value is not None}
-    mounting = Mounting(**known, taxel_count=geometry.taxel_count)
-    pads = {key: None if one is None else _pad(path, f"{name}.{key}", one, geometry) for key, one in pads.items()}
     return SensorEntry(
-        mounting,
+        Mounting(**{key: one for key, one in known.items() if one is not None}, taxel_count=geometry.taxel_count),
         counts_per_newton,
-        None if baseline is None else _baseline(path, name, baseline, geometry),
-        pads["pad"],
-        pads["learned"],
-        marks["assumed"],
-        marks["emulated"],
-        None if frame is None else _frame(path, name, frame),
+        **marks,
+        **{
+            key: read(table.part(key, tables[key]), name, geometry)
+            for key, read in parts.items()
+            if tables[key] is not None
+        },
     )
 
 
-def _pad(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Pad:
-    table = Table(path, f"sensors.{name}.", values)
-    constants: dict[str, float] = {}
-    intervals: dict[str, tuple[float, float]] = {}
-    for constant, (low, high) in PAD_RANGES.items():
-        value = table.take(constant, between(low, high), required=False)
-        interval = table.take(f"{constant}_interval", partial(_interval, low, high), required=False)
-        if value is not None:
-            constants[constant] = value
-        if interval is not None:
-            intervals[constant] = interval
-    gains = table.take("gains", partial(_of_places, geometry, *GAIN_RANGE), required=False)
-    widths = table.take("gain_half_widths", partial(_of_places, geometry, 0.0, 1.0), required=False)
+def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
+    constants: dict[str, float | None] = {}
+    intervals: dict[str, tuple[float, float] | None] = {}
+    for name, (low, high) in PAD_RANGES.items():
+        constants[name] = table.take(name, between(low, high), required=False)
+        intervals[name] = table.take(f"{name}_interval", partial(_interval, low, high), required=False)
+    count = len(AXES) * geometry.taxel_count
+    places: dict[str, Any] = {}
+    for name, (low, high) in (("gains", GAIN_RANGE), ("gain_half_widths", (0.0, 1.0))):
+        expected = f"{count} numbers from {low:g} to {high:g}: x of all places, then y, then z"
+        places[name] = table.take(name, numbers((count,), expected, low, high), required=False)
     table.end()
-    if widths is not None and gains is None:
+    if places["gains"] is None and places["gain_half_widths"] is not None:
         table.refuse("gain_half_widths", "without gains", "both, or none")
-    return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=widths)
+    known = {name: ends for name, ends in intervals.items() if ends is not None}
+    return Pad(**constants, intervals=known, **places)
 
 
-def _frame(path: Path, name: str, values: Mapping[str, Any]) -> PadFrame:
-    table = Table(path, f"sensors.{name}.frame.", values)
+def _frame(table: Table, sensor: str, geometry: SensorGeometry) -> PadFrame:
     parent = table.take("parent", text_value)
-    place_mm = table.take("place_mm", partial(_numbers, f"three numbers from -{LARGEST_MM:g} to {LARGEST_MM:g}", 3))
-    quaternion = table.take("quaternion", partial(_numbers, "x, y, z, w of norm 1", 4), required=False)
+    place_mm = table.take("place_mm", numbers((3,), f"three numbers from -{LARGEST_MM:g} to {LARGEST_MM:g}"))
+    quaternion = table.take("quaternion", numbers((4,), "x, y, z, w of norm 1"), required=False)
     table.end()
     try:
         return PadFrame(parent, place_mm, **({} if quaternion is None else {"quaternion": quaternion}))
@@ -238,35 +243,22 @@ def _frame(path: Path, name: str, values: Mapping[str, Any]) -> PadFrame:
         return table.refuse("parent, place_mm and quaternion", str(error), "a frame of the robot and a place in it")
 
 
-def _numbers(expected: str, count: int, value: Any) -> tuple[float, ...]:
-    cells = flat_cells(value, (count,), expected)
-    if not all(map(is_number, cells)):
-        raise ValueError(expected)
-    return tuple(map(float, cells))
-
-
-def _baseline(path: Path, name: str, values: Mapping[str, Any], geometry: SensorGeometry) -> Baseline:
-    table = Table(path, f"sensors.{name}.baseline.", values)
+def _baseline(table: Table, sensor: str, geometry: SensorGeometry) -> Baseline:
     expected_id = table.take("id", text_value, required=False)
     created_unix_s = table.take("created_unix_s", between(1, LAST_UNIX_S), required=False)
     scans = table.take("scans", whole)
-    axes = [table.take(axis, partial(_rest_counts, geometry)) for axis in AXES]
+    grid = geometry.scan_shape[1:]
+    expected = f"{grid[0]} rows of {grid[1]} numbers 0..{COUNTS_ON_CIRCLE - 1}"
+    read = numbers(grid, expected, 0, math.nextafter(COUNTS_ON_CIRCLE, 0))
+    counts = np.array([table.take(axis, read) for axis in AXES]).reshape(geometry.scan_shape)
     table.end()
     dated = math.nan if created_unix_s is None else created_unix_s
-    baseline = Baseline.of(name, np.stack(axes), dated, scans, "file")
+    baseline = Baseline.of(sensor, counts, dated, scans, "file")
     if expected_id not in (None, baseline.id):
         table.refuse(
             "id", repr(expected_id), f"'{baseline.id}', which the counts give, or none; the baseline was changed"
         )
     return baseline
-
-
-def _order(geometry: SensorGeometry, value: Any) -> tuple[int, ...]:
-    expected = f"{geometry.rows} rows of {geometry.cols}, each of 0..{geometry.taxel_count - 1} once"
-    cells = flat_cells(value, geometry.scan_shape[1:], expected)
-    if not all(type(cell) is int for cell in cells) or sorted(cells) != list(range(geometry.taxel_count)):
-        raise ValueError(expected)
-    return tuple(cells)
 
 
 def _parts(value: Any) -> frozenset[str]:
@@ -275,45 +267,19 @@ def _parts(value: Any) -> frozenset[str]:
     return frozenset(value)
 
 
-def _signs(value: Any) -> tuple[int, ...]:
-    expected = "1 or -1 for each of x, y, z"
-    signs = flat_cells(value, (len(AXES),), expected)
-    if not all(type(sign) is int and sign in (1, -1) for sign in signs):
-        raise ValueError(expected)
-    return tuple(signs)
+def _are_signs(found: list[Any]) -> bool:
+    return all(type(sign) is int and sign in (1, -1) for sign in found)
 
 
 def _gains(geometry: SensorGeometry, value: Any) -> tuple[float, ...]:
     expected = f"positive numbers, 3, or {len(AXES)} x {geometry.rows} x {geometry.cols}"
     per_taxel = isinstance(value, list) and any(isinstance(one, list) for one in value)
-    cells = flat_cells(value, geometry.scan_shape if per_taxel else (len(AXES),), expected)
-    if not all(is_number(cell) and cell > 0 for cell in cells):
-        raise ValueError(expected)
-    gains = [float(cell) for cell in cells]
-    return tuple(gains if per_taxel else [gain for gain in gains for _ in range(geometry.taxel_count)])
+    shape = geometry.scan_shape if per_taxel else (len(AXES),)
+    gains = numbers(shape, expected, low=LEAST_POSITIVE)(value)
+    return gains if per_taxel else tuple(gain for gain in gains for _ in range(geometry.taxel_count))
 
 
-def _interval(low: float, high: float, value: Any) -> tuple[float, float]:
+def _interval(low: float, high: float, value: Any) -> tuple[float, ...]:
     expected = f"two numbers from {low:g} to {high:g}, the lower first"
-    ends = flat_cells(value, (2,), expected)
-    if not (all(map(is_number, ends)) and low <= ends[0] <= ends[1] <= high):
-        raise ValueError(expected)
-    return ends[0], ends[1]
-
-
-def _of_places(geometry: SensorGeometry, low: float, high: float, value: Any) -> tuple[float, ...]:
-    count = len(AXES) * geometry.taxel_count
-    expected = f"{count} numbers from {low:g} to {high:g}: x of all places, then y, then z"
-    values = flat_cells(value, (count,), expected)
-    if not all(is_number(one) and low <= one <= high for one in values):
-        raise ValueError(expected)
-    return tuple(map(float, values))
-
-
-def _rest_counts(geometry: SensorGeometry, value: Any) -> NDArray[np.float64]:
-    grid = geometry.scan_shape[1:]
-    expected = f"{grid[0]} rows of {grid[1]} numbers 0..{COUNTS_ON_CIRCLE - 1}"
-    cells = flat_cells(value, grid, expected)
-    if not all(is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
-        raise ValueError(expected)
-    return np.array(cells, dtype=np.float64).reshape(grid)
+    ends = cells((2,), lambda both: all(is_number(end, low, high) for end in both) and both[0] <= both[1], expected)
+    return ends(value)

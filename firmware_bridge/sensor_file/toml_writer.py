@@ -1,7 +1,4 @@
-"""Writer of the sensor file, which formats the text itself.
-
-So a pad's numbers have the same arrangement in the file as on the pad, and comments explain them.
-"""
+"""Writer of the sensor file, in which a pad's numbers have the same arrangement as on the pad."""
 
 import json
 import math
@@ -23,7 +20,6 @@ from firmware_bridge.errors import SensorFileError
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.can_id_maps import ID_MAPS
-from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import (
     FILE_FORMAT,
@@ -103,73 +99,62 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile, *, keep_before: 
 
 
 def _text(sensor_file: SensorFile) -> str:
-    adapter = [] if sensor_file.adapter is None else [f"adapter = {_quoted(sensor_file.adapter)}  # serial number"]
     lines = [
         "# Sensor file of edge-sr doctor; use it with edge-sr --sensor FILE.",
-        f'format = "{FILE_FORMAT}"',
-        f"version = {FILE_VERSION}",
-        f"model = {_quoted(sensor_file.model)}  # which CAN id is which taxel, as --id-map",
-        *adapter,
+        _line("format", FILE_FORMAT),
+        _line("version", FILE_VERSION),
+        _line("model", sensor_file.model, "which CAN id is which taxel, as --id-map"),
     ]
+    if sensor_file.adapter is not None:
+        lines.append(_line("adapter", sensor_file.adapter, "serial number"))
     cols = sensor_file.geometry.cols
     for name, entry in sensor_file.sensors.items():
-        lines += ["", f"[sensors.{_quoted(name)}]", *_mounting_lines(entry.mounting, cols)]
-        if entry.counts_per_newton is not None:
-            lines.append(f"counts_per_newton = {float(entry.counts_per_newton)!r}  # of the summed z")
-        lines += _mark_lines(entry)
+        parts: dict[str, list[str]] = {"": _entry_lines(entry, cols)}
         if entry.frame is not None:
-            lines += ["", f"[sensors.{_quoted(name)}.frame]", *_frame_lines(entry.frame)]
+            parts[".frame"] = _frame_lines(entry.frame)
         if entry.pad is not None:
-            about = "# The pad itself, for networks that ask for it."
-            lines += ["", f"[sensors.{_quoted(name)}.pad]", about, *_pad_lines(entry.pad, cols)]
+            parts[".pad"] = ["# The pad itself, for networks that ask for it.", *_pad_lines(entry.pad, cols)]
         if entry.learned is not None:
             about = "# Learned from contacts while it ran; edge-sr doctor --forget-gains removes it."
-            lines += ["", f"[sensors.{_quoted(name)}.learned]", about, *_pad_lines(entry.learned, cols)]
+            parts[".learned"] = [about, *_pad_lines(entry.learned, cols)]
         if entry.baseline is not None:
-            lines += ["", f"[sensors.{_quoted(name)}.baseline]", *_baseline_lines(entry.baseline)]
+            parts[".baseline"] = _baseline_lines(entry.baseline)
+        for part, own in parts.items():
+            lines += ["", f"[sensors.{_value(name)}{part}]", *own]
     return "\n".join([*lines, ""])
 
 
-def _mark_lines(entry: SensorEntry) -> list[str]:
-    marks = (
+def _entry_lines(entry: SensorEntry, cols: int) -> list[str]:
+    mounting = entry.mounting
+    gains = np.asarray(mounting.gains).reshape(len(AXES), -1)
+    lines = [
+        "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
+        *_grid_lines("order = ", mounting.order, cols),
+        _line("swap_xy", mounting.swap_xy),
+        _line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
+    ]
+    if (gains == gains[:, :1]).all():
+        lines.append(_line("gains", gains[:, 0].tolist(), "of x, y and z"))
+    else:
+        planes = [line for plane in gains.tolist() for line in _grid_lines("    ", plane, cols, end="    ],")]
+        lines += ["gains = [", *planes, "]"]
+    if entry.counts_per_newton is not None:
+        lines.append(_line("counts_per_newton", float(entry.counts_per_newton), "of the summed z"))
+    for key, marked, why in (
         ("assumed", entry.assumed, "as wired; not measured"),
         ("emulated", entry.emulated, "measured on an emulated sensor: not for a device"),
-    )
-    return [
-        f"{key} = {json.dumps([part for part in PARTS if part in parts])}  # {why}"
-        for key, parts, why in marks
-        if parts
-    ]
-
-
-def _mounting_lines(mounting: Mounting, cols: int) -> list[str]:
-    gains = np.asarray(mounting.gains).reshape(len(AXES), -1)
-    even = (gains == gains[:, :1]).all()
-    gain_lines = (
-        [f"gains = {gains[:, 0].tolist()}  # of x, y and z"]
-        if even
-        else [
-            "gains = [",
-            *(line for plane in gains for line in [*_grid_lines("    ", plane.tolist(), cols), "    ],"]),
-            "]",
-        ]
-    )
-    return [
-        "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
-        *_grid_lines("order = ", list(mounting.order), cols),
-        "]",
-        f"swap_xy = {str(mounting.swap_xy).lower()}",
-        f"signs = {list(mounting.signs)}  # of x (to the right), y (down) and z (into the pad), after the swap",
-        *gain_lines,
-    ]
+    ):
+        if marked:
+            lines.append(_line(key, [part for part in PARTS if part in marked], why))
+    return lines
 
 
 def _frame_lines(frame: PadFrame) -> list[str]:
     return [
         "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
-        f"parent = {_quoted(frame.parent)}",
-        f"place_mm = {list(frame.place_mm)}",
-        f"quaternion = {list(frame.quaternion)}  # x, y, z, w",
+        _line("parent", frame.parent),
+        _line("place_mm", frame.place_mm),
+        _line("quaternion", frame.quaternion, "x, y, z, w"),
     ]
 
 
@@ -178,50 +163,44 @@ def _pad_lines(pad: Pad, cols: int) -> list[str]:
     known = pad.constants
     for name in PAD_RANGES:
         if name in known:
-            lines.append(f"{name} = {float(known[name])!r}")
+            lines.append(_line(name, float(known[name])))
         if name in pad.intervals:
-            lines.append(f"{name}_interval = {list(map(float, pad.intervals[name]))}")
-    if pad.gains is not None:
-        lines += [
-            "# How strongly each place reads: x row by row, then y, then z.",
-            *_place_lines("gains", pad.gains, cols),
-        ]
-    if pad.gain_half_widths is not None:
-        lines += [
-            "# Half of each one's 90 % interval, as a share of it.",
-            *_place_lines("gain_half_widths", pad.gain_half_widths, cols),
-        ]
+            lines.append(_line(f"{name}_interval", list(map(float, pad.intervals[name]))))
+    for key, values, about in (
+        ("gains", pad.gains, "How strongly each place reads: x row by row, then y, then z."),
+        ("gain_half_widths", pad.gain_half_widths, "Half of each one's 90 % interval, as a share of it."),
+    ):
+        if values is not None:
+            rows = (values[at : at + cols] for at in range(0, len(values), cols))
+            lines += [f"# {about}", f"{key} = ["]
+            lines += [f"    {', '.join(repr(float(value)) for value in row)}," for row in rows]
+            lines.append("]")
     return lines
 
 
-def _place_lines(key: str, values: Sequence[float], cols: int) -> list[str]:
-    rows = (values[at : at + cols] for at in range(0, len(values), cols))
-    return [f"{key} = [", *(f"    {', '.join(repr(float(value)) for value in row)}," for row in rows), "]"]
-
-
 def _baseline_lines(baseline: Baseline) -> list[str]:
-    axes = [
-        line
-        for axis, plane in zip(AXES, baseline.counts, strict=True)
-        for line in [*_grid_lines(f"{axis} = ", plane.ravel().tolist(), plane.shape[1]), "]"]
-    ]
-    return [
-        "# What the free pad reads, in counts, place by place.",
-        f"id = {_quoted(baseline.id)}",
-        *([] if math.isnan(baseline.created_unix_s) else [f"created_unix_s = {baseline.created_unix_s!r}"]),
-        f"scans = {baseline.scans}",
-        *axes,
-    ]
+    lines = ["# What the free pad reads, in counts, place by place.", _line("id", baseline.id)]
+    if not math.isnan(baseline.created_unix_s):
+        lines.append(_line("created_unix_s", baseline.created_unix_s))
+    lines.append(_line("scans", baseline.scans))
+    for axis, plane in zip(AXES, baseline.counts, strict=True):
+        lines += _grid_lines(f"{axis} = ", plane.ravel().tolist(), plane.shape[1])
+    return lines
 
 
-def _grid_lines(start: str, values: Sequence[int | float], cols: int) -> list[str]:
-    """Format a grid row by row, without its last bracket."""
+def _grid_lines(start: str, values: Sequence[int | float], cols: int, end: str = "]") -> list[str]:
+    """Format a grid row by row."""
     texts = [repr(value) for value in values]
     width = max(map(len, texts))
     indent = " " * (len(start) - len(start.lstrip()) + 4)
     rows = (texts[at : at + cols] for at in range(0, len(texts), cols))
-    return [f"{start}[", *(f"{indent}[{', '.join(text.rjust(width) for text in row)}]," for row in rows)]
+    return [f"{start}[", *(f"{indent}[{', '.join(text.rjust(width) for text in row)}]," for row in rows), end]
 
 
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
+def _line(key: str, value: object, about: str = "") -> str:
+    return f"{key} = {_value(value)}" + (f"  # {about}" if about else "")
+
+
+def _value(value: object) -> str:
+    """Return a text, number, truth value or list of them in TOML, which writes these as JSON does."""
+    return json.dumps(value, ensure_ascii=False)

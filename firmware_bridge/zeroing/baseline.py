@@ -4,10 +4,12 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Literal, NoReturn, Self, TypeGuard
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
-from firmware_bridge.zeroing.sha256 import sha256_hex
+from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, whole
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
@@ -72,12 +74,7 @@ class Baseline:
 
     @classmethod
     def from_counts(cls, sensor: str, counts: NDArray[np.integer], created_unix_s: float) -> Self:
-        """Return the median of whole scans, without a check that the pad was free and still.
-
-        Args:
-            sensor: name of the sensor.
-            counts: (n, 3, rows, cols) raw counts of complete scans, n > 0.
-            created_unix_s: time at which they were taken, in [s] since 1970.
+        """Return the median of whole scans (n, 3, rows, cols), n > 0, without a check that the pad was free and still.
 
         Raises:
             ValueError: no scan, or a taxel is absent.
@@ -88,18 +85,11 @@ class Baseline:
         return cls.of(sensor, median % COUNTS_ON_CIRCLE, created_unix_s, len(counts), "start-up")
 
     @classmethod
-    def of(
-        cls,
-        sensor: str,
-        counts: NDArray[np.floating],
-        created_unix_s: float,
-        scans: int,
-        origin: Origin,
-    ) -> Self:
+    def of(cls, sensor: str, counts: NDArray[np.floating], created_unix_s: float, scans: int, origin: Origin) -> Self:
         """Return a baseline of counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
         own.setflags(write=False)
-        digest = sha256_hex(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
+        digest = _sha256_hex(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
         return cls(sensor, own, created_unix_s, scans, origin, digest[:8])
 
     def age_s(self, now_unix_s: float) -> float:
@@ -142,10 +132,8 @@ def deformation(
 class BaselineEstimator:
     """Estimator of the baseline of one sensor from its scans.
 
-    It refuses a pad that moves while zeroing, and one that is loaded if a reference holds its counts
-    when free. A load that lies on the pad from the first scan to the last, with no reference, looks like
-    a free pad, and becomes part of the baseline. A load that leaves every taxel within
-    LOAD_LIMIT_COUNTS of the reference passes as drift.
+    It refuses a pad that moves, and one that is loaded by more than LOAD_LIMIT_COUNTS against a reference. Without a
+    reference a load that lies on the pad all the time looks like a free pad, and becomes part of the baseline.
     """
 
     def __init__(
@@ -267,33 +255,33 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"{path}: not JSON ({error}): {_FILE_REMEDY}") from error
-    if not isinstance(document, dict) or document.get("format") != FILE_FORMAT:
-        _refuse_file(
-            path, "format", document.get("format") if isinstance(document, dict) else document, f"'{FILE_FORMAT}'"
-        )
-    if document.get("version") != FILE_VERSION:
-        _refuse_file(path, "version", document.get("version"), str(FILE_VERSION))
-    entries = document.get("baselines")
-    if not isinstance(entries, list) or not entries:
-        _refuse_file(path, "baselines", entries, "a list of at least one")
+    top = Table(path, "", document if isinstance(document, dict) else {}, RecordingError, _FILE_REMEDY)
+    top.take("format", one_of(FILE_FORMAT))
+    top.take("version", one_of(FILE_VERSION))
     baselines: dict[str, Baseline] = {}
-    for entry in entries:
-        baseline = _read_entry(path, entry)
-        if baseline.sensor in baselines:
-            _refuse_file(path, "sensor", baseline.sensor, "each sensor once")
-        now = orders.get(baseline.sensor)
+    for entry in top.take("baselines", _read_entries):
+        table = Table(path, "", entry, RecordingError, _FILE_REMEDY)
+        sensor = table.take("sensor", _read_sensor)
+        if sensor in baselines:
+            table.refuse("sensor", repr(sensor), "each sensor once")
+        created_unix_s = table.take("created_unix_s", _read_date, required=False)
+        scans, counts = table.take("scans", whole), table.take("counts", _read_counts)
+        dated = math.nan if created_unix_s is None else created_unix_s
+        baselines[sensor] = Baseline.of(sensor, counts, dated, scans, "file")
+        right = baselines[sensor].id
+        if entry.get("id", right) != right:
+            table.refuse("id", repr(entry["id"]), f"'{right}', which the counts give, or none: the file was changed")
+        now = orders.get(sensor)
         if entry.get("order") != (None if now is None else list(now)):
             raise RecordingError(
-                f"{path}: the taxels of sensor {baseline.sensor} lay in another order: zero again with the sensor file"
+                f"{path}: the taxels of sensor {sensor} lay in another order: zero again with the sensor file"
             )
-        baselines[baseline.sensor] = baseline
     return baselines
 
 
 def unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
     """Return the differences of scans (n, 3, rows, cols) to the first, the short way round the circle of counts."""
-    half = COUNTS_ON_CIRCLE // 2
-    return (counts.astype(np.int32) - counts[0].astype(np.int32) + half) % COUNTS_ON_CIRCLE - half
+    return (counts - counts[0]).astype(np.int16).astype(np.int32)  # sixteen bits go round the same circle
 
 
 def refuse_motion(counts: NDArray[np.int32]) -> None:
@@ -345,45 +333,38 @@ def _refuse(where: tuple[int, ...], what: str, limit: float, remedy: str) -> Non
     )
 
 
-def _read_entry(path: Path, entry: Any) -> Baseline:
-    if not isinstance(entry, dict):
-        _refuse_file(path, "baselines", entry, "objects")
-    sensor, created_unix_s, scans = entry.get("sensor"), entry.get("created_unix_s"), entry.get("scans")
-    if not isinstance(sensor, str) or not is_sensor_name(sensor):
-        _refuse_file(path, "sensor", sensor, f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
-    if created_unix_s is None:
-        created_unix_s = math.nan
-    elif not _is_number(created_unix_s) or not 0 < created_unix_s <= LAST_UNIX_S:
-        _refuse_file(path, "created_unix_s", created_unix_s, "seconds since 1970, or null")
-    if type(scans) is not int or not 1 <= scans < 2**31:
-        _refuse_file(path, "scans", scans, "a whole number from 1")
-    baseline = Baseline.of(sensor, _read_counts(path, entry.get("counts")), created_unix_s, scans, "file")
-    if entry.get("id", baseline.id) != baseline.id:
-        expected = f"'{baseline.id}', which the counts give, or none: the file was changed"
-        _refuse_file(path, "id", entry["id"], expected)
-    return baseline
+def _sha256_hex(data: bytes) -> str:
+    """Return the hash of some bytes by Python's own code: `hashlib` loads OpenSSL, 3.7 MB and 5 ms of every start."""
+    for name in ("_sha2", "_sha256"):  # of Python 3.12 and later, and of 3.11
+        with suppress(ImportError):
+            return import_module(name).sha256(data).hexdigest()
+    return import_module("hashlib").sha256(data).hexdigest()
 
 
-def _read_counts(path: Path, counts: Any) -> NDArray[np.float64]:
+def _read_entries(value: Any) -> list[Any]:
+    if not isinstance(value, list) or not value or not all(isinstance(one, dict) for one in value):
+        raise ValueError("a list of at least one object")
+    return value
+
+
+def _read_sensor(value: Any) -> str:
+    if not isinstance(value, str) or not is_sensor_name(value):
+        raise ValueError(f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
+    return value
+
+
+def _read_date(value: Any) -> float | None:
+    if value is not None and not is_number(value, LEAST_POSITIVE, LAST_UNIX_S):
+        raise ValueError("seconds since 1970, or null")
+    return value
+
+
+def _read_counts(value: Any) -> NDArray[np.float64]:
     expected = f"numbers 0..{COUNTS_ON_CIRCLE}, as {len(AXES)} axes of rows of equal length"
-    planes = counts if isinstance(counts, list) else []
-    rows = [row for plane in planes if isinstance(plane, list) for row in plane]
-    cells = [cell for row in rows if isinstance(row, list) for cell in row]
-    if not cells or not all(_is_number(cell) and 0 <= cell < COUNTS_ON_CIRCLE for cell in cells):
-        _refuse_file(path, "counts", counts, expected)
     try:
-        array = np.array(counts, dtype=np.float64)
-    except ValueError:
-        _refuse_file(path, "counts", counts, expected)
-    if array.ndim != 3 or len(array) != len(AXES):
-        _refuse_file(path, "counts", f"shape {array.shape}", expected)
-    return array
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _refuse_file(path: Path, key: str, got: object, expected: str) -> NoReturn:
-    text = repr(got)
-    raise RecordingError(f"{path}, '{key}': {text[:60]}{'...' * (len(text) > 60)}, expected {expected}: {_FILE_REMEDY}")
+        shape = np.shape(value)
+    except ValueError as error:
+        raise ValueError(expected) from error
+    if len(shape) != 3 or shape[0] != len(AXES) or not all(shape):
+        raise ValueError(expected)
+    return np.array(numbers(shape, expected, 0, math.nextafter(COUNTS_ON_CIRCLE, 0))(value)).reshape(shape)

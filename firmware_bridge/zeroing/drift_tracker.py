@@ -1,16 +1,10 @@
 """Tracking of a free pad's drift while nothing touches it.
 
-A press is local, drift is common: every one of thousands of simulated taps that moves the median taxel moves another
-taxel by more than that again on z, and by twice that on x and y; a warming pad moves all taxels alike within a quarter,
-the earth's field moves all taxels alike except for their gains. So the drift common to all taxels is followed fast, a
-taxel's own drift as far as a share of the common drift explains it, and beyond that very slowly. A larger change of a
-taxel is a touch, long before it is a tap, and stops the tracking.
-
-The tracker works in blocks of half a second: a scan costs very little, and a median suppresses noise and single
-outliers. A block counts once the next one was free as well: the beginning of a contact is not followed.
-
-A press so slow and even that it meets all these criteria is followed as drift, and lost. Simulated taps that grow to
-1500 counts of summed z in 10 s lose .2 % at medium evenness and 4 % at the highest evenness; in 30 s 14 and 44 %.
+A press is local, drift is common. So the drift common to all taxels is followed fast, a taxel's own drift as far as a
+share of the common drift explains it, and beyond that very slowly; a larger change of a taxel is a touch, long before
+it is a tap, and stops the tracking. The tracker works in blocks of half a second, each of which counts once the next
+one was free as well. A press so slow and even that it meets all these criteria is followed as drift, and lost: of
+simulated taps that grow to 1500 counts of summed z in 10 s .2 % to 4 %, in 30 s 14 to 44 %, by their evenness.
 """
 
 from dataclasses import dataclass
@@ -31,20 +25,16 @@ FEWEST_SCANS: Final = 8
 GAP_NS: Final = 5_000_000_000
 """Time without a scan after which the pad may have been replaced or moved, in [ns]."""
 REST_BLOCKS: Final = 4
-"""Still blocks (two seconds) before drift is followed or a rest level compared: the pad has recovered from all but a
-hundredth of a press by then, and a robot that taps every few seconds still leaves that much time."""
+"""Still blocks before drift is followed or a rest level compared: by then a pad has recovered from a press."""
 COMMON_PER_S: Final = 20.0
-"""Highest rate of the common drift that is followed, per axis, in [counts/s]: 1000 counts a minute and more, above any
-drift on record."""
+"""Highest rate of the common drift that is followed, in [counts/s]: above any drift on record."""
 COMMON_COUNTS: Final = 50.0
 """Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
-twice its 18 counts; at this limit the summed z is still half of a contact's."""
+36 counts; at this limit the summed z is still half of a contact's."""
 OWN_SHARE: Final = 0.65
-"""Largest own drift of a taxel as a share of the common drift: its spread is a quarter of the mean taxel's drift, so
-twice that can be six tenths of the median taxel's. A press has a share above one."""
+"""Largest own drift of a taxel as a share of the common drift: six tenths are seen, and a press has more than one."""
 OWN_PER_S: Final = 0.05
-"""Highest rate of a taxel's own drift beyond that share, in [counts/s]: 3 counts a minute. No measured drift needs
-more, and a touch loses about a count before it is detected."""
+"""Highest rate of a taxel's own drift beyond that share, in [counts/s]."""
 TOUCH_COUNTS: Final = 10.0
 """Largest change of a taxel ahead of the common drift that is no touch: .01 N, nine times a block's highest noise."""
 RATE_S: Final = 2.0
@@ -56,8 +46,7 @@ SLOW_PER_S: Final = 1.0
 STILL_COUNTS: Final = 7.0
 """Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
 STEP_COUNTS: Final = 15.0
-"""Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause. A
-smaller change of a single taxel stays in the readings as well, a common one is followed."""
+"""Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause."""
 BACK_COUNTS: Final = 8.0
 """Size of a step up to which it counts as none, and the rest is followed. Smaller than a touch."""
 VOTE_COUNTS: Final = 4.0
@@ -70,12 +59,9 @@ _BACK: Final = "rest level is back where it was"
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Drift of a rest level since it was zeroed.
+    """Drift since zeroing: of all taxels on x, y, z, the most of a taxel beyond it, and the largest signed step.
 
-    Attributes:
-        common_counts: drift of all taxels on x, y, z; subtracted from the readings.
-        own_counts: the largest drift of a taxel beyond it, of any taxel and axis; subtracted as well.
-        step_counts: the largest step in rest level, signed; it stays in the readings. 0 without a step.
+    The step in rest level, 0 without one, stays in the readings; the others are subtracted from them.
     """
 
     common_counts: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -110,15 +96,12 @@ class DriftTracker:
         self._last_ns = 0  # the first scan interrupts, which sets the other attributes
 
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
-        """Process one scan.
+        """Process one scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
 
         Args:
             scan: next scan of the sensor.
             contact: True during a tap, and while the baseline is in doubt.
             dead: taxels (rows, cols) that are ignored; a new array only where they have changed.
-
-        Returns:
-            True if `counts`, `summary` or `note` have changed, or there is an event.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns
@@ -170,10 +153,7 @@ class DriftTracker:
         self._start_ns = self._next_ns = time_ns
 
     def _middle_half(self) -> NDArray[np.float32]:
-        """Return the deviation of the block's scans from the baseline; undefined where a taxel is dead.
-
-        It is the mean of the middle half: a median of whole counts jumps by whole counts.
-        """
+        """Return the mean deviation of the block's middle half: a median of whole counts jumps by whole counts."""
         readings = deformation(np.stack(self._block), self._baseline)
         readings.sort(axis=0)
         outer = len(readings) // 4
@@ -182,12 +162,7 @@ class DriftTracker:
     def _parts(
         self, counts: NDArray[np.float32], voters: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Split counts into the part common to all live taxels, (3, 1, 1), and each taxel's own, 0 where it is dead.
-
-        Args:
-            counts: (3, rows, cols).
-            voters: taxels (rows, cols) that define the common part; None for all live ones.
-        """
+        """Split counts into the part common to `voters`, or all live taxels, (3, 1, 1), and each taxel's own."""
         if voters is not None:
             common = self._middle(counts[:, voters])
             return common, np.where(self._live, counts - common, np.float32(0))

@@ -28,11 +28,9 @@ STEP: Final = 8
 
 
 class Stretch(NamedTuple):
-    """Scans during which a pad is free and still.
+    """Scans during which a pad is free and still: their rows (n,) in the recording, and counts (n, 3, rows, cols).
 
     Attributes:
-        rows: (n,) their rows in the recording; without torn, repeated and incomplete ones among them.
-        counts: (n, 3, rows, cols) raw counts of them.
         touched: True if something touches the pad elsewhere in the recording. Without it, a pad that holds something
             all the time cannot be distinguished from a free one.
         within_counts: how far the level of a taxel may be off, where the pad still recovers; None where it is still.
@@ -101,7 +99,7 @@ def _touched(z: NDArray[np.int64], free: NDArray[np.int64]) -> bool:
 
 
 def _widest(taken: NDArray[np.int32], begin: int, reference: Baseline) -> tuple[int, int]:
-    """Return where a stretch is that begins at a place, or up to as many scans before, and is as long as it may be."""
+    """Return the longest stretch around a place: the numbers of its first scan, and of the one after its last."""
     end = begin + FEWEST_RECORDED
     while end + STEP <= min(len(taken), begin + FEWEST_SCANS) and _goes_on(taken, begin, end + STEP, end, reference):
         end += STEP

@@ -1,6 +1,4 @@
-"""The drift tracker at its thresholds: one count below and above, on a pad without noise, block by block."""
-
-from functools import partial
+"""The drift tracker block by block, on a pad without noise: what it follows, and what it tells of."""
 
 import numpy as np
 import pytest
@@ -62,6 +60,9 @@ class Blocks:
     def step(self):
         return self.tracker.summary.step_counts
 
+    def z(self, taxel=0):
+        return float(self.tracker.counts[2].flat[taxel])
+
 
 def resting(**options):
     pad = Blocks(**options)
@@ -81,15 +82,10 @@ def on_axes(x, y, z):
     return np.broadcast_to(np.array([x, y, z])[:, None, None], (3, 4, 4))
 
 
-def test_a_new_tracker_has_moved_nothing():
-    tracker = DriftTracker(BASELINE)
-    assert tracker.summary == Drift((0, 0, 0), 0, 0) and not tracker.counts.any()
-    assert tracker.note is None and tracker.take_event() is None
-
-
 def test_after_five_blocks_it_is_followed_one_block_late():
     pad = Blocks()
-    assert pad.blocks(7) == [*SETTLED, True, True]
+    assert pad.tracker.summary == Drift((0, 0, 0), 0, 0) and not pad.tracker.counts.any()
+    assert pad.blocks(7) == [*SETTLED, True, True] and pad.tracker.note is None and not pad.event
     assert pad.block(on_axes(2, -3, 6)) is True and not pad.tracker.counts.any()
     assert pad.block(on_axes(2, -3, 6)) is True
     np.testing.assert_allclose(pad.tracker.counts, on_axes(2, -3, 6), atol=1e-5)
@@ -97,14 +93,36 @@ def test_after_five_blocks_it_is_followed_one_block_late():
     assert pad.tracker.summary.own_counts == pytest.approx(0, abs=1e-5) and pad.step == 0
 
 
+CREEP = 0.5 * 0.05
+
+
 @pytest.mark.parametrize("sign", [1, -1])
-def test_of_common_drift_twenty_counts_a_second_are_followed(sign):
-    pad, ahead = resting(), of_z(sign * 25)
-    got = []
-    for _ in range(5):
-        assert pad.block(ahead) is True
-        got.append(float(pad.tracker.counts[2, 1, 1]))
-    assert got == pytest.approx([0, sign * 10, sign * 20, sign * 25, sign * 25], abs=1e-4)
+@pytest.mark.parametrize(
+    ("levels", "common", "own"),
+    [
+        # 20 counts a second of common drift.
+        ([of_z(25)] * 2, 10, 0),
+        ([of_z(25)] * 3, 20, 0),
+        ([of_z(25)] * 5, 25, 0),
+        # What was followed of a touch is dropped.
+        ([of_z(6), of_z(6, own=200), *[of_z()] * 6], 0, 0),
+        # By hand: of 20 counts/s a quarter of the way each half second, less the noise, times the share, and the creep.
+        ([of_z(own=9), of_z(10, own=9)], 0, CREEP),
+        ([of_z(own=9), of_z(10, own=9), of_z(20, own=9)], 10, CREEP + 0.5 * (0.65 * 4.8 + 0.05)),
+        (
+            [of_z(own=9), of_z(10, own=9), *[of_z(20, own=9)] * 2],
+            20,
+            CREEP + 0.5 * (0.65 * 4.8 + 0.05) + 0.5 * (0.65 * 8.55 + 0.05),
+        ),
+    ],
+)
+def test_what_is_followed_at_rest(sign, levels, common, own):
+    pad = resting()
+    for level in levels:
+        pad.block(sign * level)
+    assert pad.z() == pytest.approx(sign * (common + own), abs=1e-3)
+    np.testing.assert_allclose(pad.tracker.counts[2, 1:], sign * common, atol=1e-4)
+    assert pad.tracker.summary.own_counts == pytest.approx(abs(own), abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -126,50 +144,19 @@ def test_what_is_ahead_is_followed_up_to_a_touch(ahead, followed):
     assert pad.blocks(6) == ([True] * 6 if followed else [*SETTLED, True])
 
 
-def test_what_was_followed_of_a_touch_is_dropped():
-    pad = resting()
-    assert [pad.block(of_z(6)), pad.block(of_z(6, own=200))] == [True, False]
-    pad.blocks(6)
-    assert not pad.tracker.counts.any()
-
-
-def test_a_touch_too_light_for_a_tap_is_the_cause_of_a_step():
-    pad = resting()
-    assert pad.blocks(6, of_z(taxel=6, own=-200)) == [False] * 5 + [True]
-    expected = (
-        "rest level 200 counts below the one before on z (taxel 6) after a touch too light for a tap: "
-        "free the pad and zero again"
-    )
-    assert pad.tracker.note == pad.event == expected
-    assert not pad.event and pad.step == -200
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_taxel_has_its_share_of_the_common_rate_and_creeps(sign):
-    """By hand: of 20 counts/s a quarter of the way each half second, less the noise, times the share, and the creep."""
-    pad = resting()
-    pad.block(of_z(own=9 * sign))
-    pad.block(of_z(10 * sign, own=9 * sign))
-    creep, first, second = 0.05 * 0.5, 0.5 * (0.65 * 4.8 + 0.05), 0.5 * (0.65 * 8.55 + 0.05)
-    assert pad.tracker.counts[2, 0, 0] == pytest.approx(sign * creep, abs=1e-4)
-    pad.block(of_z(20 * sign, own=9 * sign))
-    assert pad.tracker.counts[2, 0, 0] == pytest.approx(sign * (10 + creep + first), abs=1e-3)
-    pad.block(of_z(20 * sign, own=9 * sign))
-    assert pad.tracker.counts[2, 0, 0] == pytest.approx(sign * (20 + creep + first + second), abs=1e-3)
-    assert pad.tracker.summary.own_counts == pytest.approx(creep + first + second, abs=1e-3)
-    np.testing.assert_allclose(pad.tracker.counts[2, 1:], 20 * sign, atol=1e-4)
-    before = pad.tracker.counts[2, 0, 0]
-    pad.push(of_z(20 * sign, own=9 * sign), after_ns=6_000_000_000)
-    pad.blocks(7, of_z(20 * sign, own=9 * sign))
-    assert pad.tracker.counts[2, 0, 0] - before == pytest.approx(sign * creep, abs=1e-4), "the rate is forgotten"
+def test_after_a_gap_the_rate_is_forgotten():
+    pad, level = resting(), of_z(20, own=9)
+    pad.blocks(4, level)
+    before = pad.z()
+    pad.push(level, after_ns=6_000_000_000)
+    pad.blocks(7, level)
+    assert pad.z() - before == pytest.approx(CREEP, abs=1e-4)
 
 
 def test_where_scans_are_rare_a_block_lasts_longer():
-    pad, ahead = resting(), of_z(8, own=9)
-    every = partial(pad.block, ahead, after_ns=500_000_000)
-    assert [every(), every()] == [True, True]
-    assert pad.tracker.counts[2, 3, 3] == pytest.approx(8, abs=1e-4)
-    assert pad.tracker.counts[2, 0, 0] == pytest.approx(8 + 4 * (0.65 * 1.8 + 0.05), abs=1e-3)
+    pad = resting()
+    assert [pad.block(of_z(8, own=9), after_ns=500_000_000) for _ in range(2)] == [True, True]
+    assert (pad.z(15), pad.z()) == pytest.approx((8, 8 + 4 * (0.65 * 1.8 + 0.05)), abs=1e-3)
 
 
 def test_scans_closer_than_the_sample_period_are_left_out():
@@ -196,8 +183,7 @@ def test_a_gap_is_a_pause_or_time_that_goes_back(gap_ns, goes_on):
 
 
 def test_scans_without_a_living_taxel_do_not_count():
-    dead = NONE_DEAD.copy()
-    dead[1, 2] = True
+    dead = np.arange(16).reshape(4, 4) == 6
     pad = resting(dead=dead)
     assert pad.block(absent=dead) is True
     assert pad.block(absent=np.arange(16).reshape(4, 4) == 5) is False
@@ -218,15 +204,9 @@ def test_scans_without_a_living_taxel_do_not_count():
     ],
 )
 def test_a_pad_is_still_while_blocks_differ_by_little(change, still):
-    pad, level = Blocks(), np.zeros((3, 4, 4))
-    answers = []
-    for number in range(8):
-        answers.append(pad.block(level + 100))
-        level = level + change
-        assert bool(pad.event) is (still and number == 4)
-        if still and number == 4:
-            break
-    assert answers == ([False] * 4 + [True] if still else [False] * 8)
+    pad = Blocks()
+    assert [pad.block(100 + number * change) for number in range(5)] == [False] * 4 + [still]
+    assert bool(pad.event) is still and (still or not any(pad.block(100 + number * change) for number in (5, 6, 7)))
 
 
 def test_a_restless_block_begins_the_wait_again():
@@ -235,27 +215,33 @@ def test_a_restless_block_begins_the_wait_again():
     assert pad.blocks(5, of_z(own=40)) == [False] * 4 + [True]
 
 
-@pytest.mark.parametrize(("own", "kept", "told"), [(8, 0, False), (9, 9, False), (15, 15, False), (-16, -16, True)])
-def test_a_step_of_one_taxel_is_kept_and_told_of(own, kept, told):
+@pytest.mark.parametrize(
+    ("level", "step", "event"),
+    [
+        (of_z(taxel=7, own=8), 0, ""),
+        (of_z(taxel=7, own=9), 9, ""),
+        (of_z(taxel=7, own=15), 15, ""),
+        (of_z(taxel=7, own=-16), -16, "16 counts below the one before on z (taxel 7)"),
+        (of_z(15, taxel=7, own=-9), -9, ""),
+        (
+            on_axes(3, -40, 30) + of_z(own=5),
+            -40,
+            "40 counts below the one before on y (all taxels alike, as drift or another attitude)",
+        ),
+    ],
+)
+def test_a_step_over_a_contact_is_kept_and_told_of(level, step, event):
+    """A common change that is not told of is followed, and a taxel's own beside a step does not creep."""
     pad = resting()
-    assert pad.touched(of_z(taxel=7, own=own)) == [False] * 4 + [told]
-    assert pad.step == kept
-    assert pad.event == (pad.tracker.note or "")
-    assert pad.tracker.note == (
-        "rest level 16 counts below the one before on z (taxel 7) after a contact: free the pad and zero again"
-        if told
-        else None
-    )
+    assert pad.touched(level) == [False] * 4 + [bool(event)]
+    assert pad.step == step
+    told = f"rest level {event} after a contact: free the pad and zero again" if event else None
+    assert pad.tracker.note == told and pad.event == (told or "") and not pad.event
     before = pad.tracker.counts
-    pad.blocks(2, of_z(taxel=7, own=own))
-    assert pad.tracker.counts[2, 1, 3] - before[2, 1, 3] == pytest.approx(0 if kept else 0.025, abs=1e-4)
-
-
-def test_a_silent_common_change_is_followed_and_not_kept():
-    pad = resting()
-    assert pad.touched(of_z(15, own=-9)) == SETTLED and pad.step == -9
-    pad.blocks(3, of_z(15, own=-9))
-    assert pad.tracker.counts[2, 3, 3] == pytest.approx(15, abs=1e-4)
+    pad.blocks(4, level)
+    assert pad.tracker.counts[2, 1, 3] - before[2, 1, 3] == pytest.approx(
+        0 if event else level[2, 0, 0] + (0 if step else 3 * CREEP), abs=1e-4
+    )
 
 
 @pytest.mark.parametrize(
@@ -286,19 +272,10 @@ def test_half_of_a_step_is_not_yet_common(low, kept):
     assert pad.step == kept
 
 
-def test_all_taxels_alike_are_named_by_what_they_have_in_common():
-    pad = resting()
-    assert pad.touched(on_axes(3, -40, 30) + of_z(own=5))[-1] is True
-    assert pad.event == (
-        "rest level 40 counts below the one before on y (all taxels alike, as drift or another attitude) "
-        "after a contact: free the pad and zero again"
-    )
-
-
 def test_a_known_step_is_told_of_again_where_it_has_changed():
     pad = resting()
-    pad.touched(of_z(own=40))
-    assert pad.event
+    assert pad.touched(of_z(own=12)) == SETTLED, "too little to tell of"
+    assert pad.touched(of_z(own=40))[-1] is True and "rest level 40 counts above" in pad.event
     assert pad.touched(of_z(own=40)) == SETTLED and not pad.event, "the same"
     assert pad.touched(of_z(own=55))[-1] is True and not pad.event, "another note, and no event"
     assert pad.touched(of_z(own=71))[-1] is True and pad.event == pad.tracker.note
@@ -307,26 +284,25 @@ def test_a_known_step_is_told_of_again_where_it_has_changed():
     assert pad.touched() == SETTLED and not pad.event
 
 
-def test_a_silent_step_that_grows_is_told_of():
-    pad = resting()
-    assert pad.touched(of_z(own=12)) == SETTLED
-    assert pad.touched(of_z(own=20))[-1] is True and "rest level 20 counts above" in pad.event
-
-
-def test_a_change_of_dead_taxels_and_a_gap_are_causes():
-    for how, gap_ns, cause in [
+@pytest.mark.parametrize(
+    ("how", "gap_ns", "cause"),
+    [
         ("dead", PERIOD_NS, "after a taxel was out"),
         ("away", 6_000_000_000, "after a gap"),
         ("forgotten", PERIOD_NS, "after a gap"),
-    ]:
-        pad = resting()
-        if how == "dead":
-            pad.dead = NONE_DEAD.copy()
-        if how == "forgotten":
-            pad.tracker.forget()
-        pad.push(of_z(own=40), after_ns=gap_ns)
-        pad.blocks(6, of_z(own=40))
-        assert cause in pad.event
+        ("light", PERIOD_NS, "after a touch too light for a tap"),
+    ],
+)
+def test_the_cause_of_a_step_is_told(how, gap_ns, cause):
+    pad = resting()
+    if how == "dead":
+        pad.dead = NONE_DEAD.copy()
+    if how == "forgotten":
+        pad.tracker.forget()
+    if how != "light":
+        pad.push(of_z(own=-200), after_ns=gap_ns)
+    pad.blocks(6, of_z(own=-200))
+    assert cause in pad.event and pad.step == -200
 
 
 @pytest.mark.parametrize(("voting", "followed"), [((0, 0, 0, 4), True), ((0, 0, 0, 5), False)])
@@ -338,7 +314,7 @@ def test_four_taxels_without_a_step_tell_what_is_common(voting, followed):
     drift, behind = step.copy(), 0.5 * 0.65 * 2  # three counts/s by now, of which one is not shared
     drift[2, 6:10] += 6
     pad.blocks(2, drift.reshape(3, 4, 4))
-    np.testing.assert_allclose(pad.tracker.counts[2].ravel()[[0, 15]], 6 - behind if followed else 0, atol=1e-4)
+    assert (pad.z(), pad.z(15)) == pytest.approx((6 - behind, 6 - behind) if followed else (0, 0), abs=1e-4)
     if not followed:
         np.testing.assert_allclose(pad.tracker.counts, 0, atol=1e-4)  # beside a step no taxel creeps on its own
 
@@ -348,8 +324,7 @@ def test_beside_a_step_only_drift_that_is_faster_is_shared():
     pad, step = resting(), of_z(taxel=5, own=40)
     pad.touched(step)
     pad.blocks(2, step + of_z(10, own=9))
-    assert pad.tracker.counts[2, 0, 0] == pytest.approx(10 + 0.5 * 0.65 * 4, abs=1e-3)
-    assert pad.tracker.counts[2, 1, 1] == pytest.approx(10, abs=1e-3)
+    assert (pad.z(), pad.z(5)) == pytest.approx((10 + 0.5 * 0.65 * 4, 10), abs=1e-3)
 
 
 @pytest.mark.parametrize("dead_taxels", [1, 9, 16])
@@ -365,8 +340,7 @@ def test_dead_taxels_do_not_tell_what_is_common(dead_taxels):
 def test_a_taxel_that_was_not_zeroed_is_none_that_lives():
     counts = REST.astype(np.float32)
     counts[2, 2, 2] = np.nan
-    dead = NONE_DEAD.copy()
-    dead[0, 0] = True
+    dead = np.arange(16).reshape(4, 4) == 0
     pad = resting(baseline=Baseline.of("4", counts, 1000.0, 100, "file"), dead=dead)
     assert pad.touched(np.where(dead, 9000, of_z(taxel=1, own=20)))[-1] is True and pad.step == 20
     pad.blocks(2, np.where(dead, 9000, of_z(4, taxel=1, own=20)))

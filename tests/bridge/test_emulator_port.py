@@ -1,21 +1,16 @@
 """Emulated adapter on a pseudo-terminal, in this process and as a command."""
 
 import contextlib
-import os
-import select
 import signal
 import subprocess
 import sys
-import termios
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import serial
 from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_recording
-from serial_samples import wait_for
 
 from firmware_bridge.emulation.robot_main import main
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -53,56 +48,6 @@ def test_an_answer_waits_for_the_end_of_a_frame():
     decoder.feed(data, 0)
     counters = decoder.counters()
     assert (counters["frames"], counters["bad_lines"]) == (100 * 16, 0) and data.count(b"V") > 100
-
-
-def test_it_hangs_up_when_all_is_played_and_fetched():
-    recording = make_recording(20)
-    with Emulator([recording]) as emulator, SlcanSerialLink(emulator.port) as link:
-        wait_for(lambda: emulator.sent_frames == 20 * 16)  # nothing is fetched
-        assert not emulator.wait(0)
-        scans = read_until_lost(link)
-        assert emulator.wait(60)
-    assert (stacked(scans) == recording.tracks[0].counts).all()
-
-
-def test_a_link_replaces_links_alone(tmp_path):
-    """The user's files at its place and next to it are left alone."""
-    link, beside = tmp_path / "skin", tmp_path / "skin.new"
-    beside.write_text("mine")
-    for make in (lambda: link.write_text("mine"), link.mkdir):
-        make()
-        with pytest.raises(ValueError, match=r"link is .*skin, expected a path that is free or a link: a file"):
-            Emulator([make_recording(3)], link=link)
-        assert link.exists() and not link.is_symlink()
-        link.unlink() if link.is_file() else link.rmdir()
-    link.symlink_to("/nowhere")  # as one that was killed leaves it
-    with Emulator([make_recording(3)], link=link) as emulator:
-        assert emulator.port == str(link) and link.resolve() != Path("/nowhere")
-        link.unlink()
-        link.write_text("mine by now")
-    assert sorted(tmp_path.iterdir()) == [link, beside]
-    assert (link.read_text(), beside.read_text()) == ("mine by now", "mine")
-
-
-def test_nothing_stays_open():
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    with Emulator([make_recording(1)]) as emulator:
-        assert len(list(Path("/proc/self/fd").iterdir())) == before + 2
-    assert emulator.wait(0)
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
-
-
-@pytest.mark.parametrize(("latency_s", "fewest", "most"), [(0.001, 20, 10_000), (0.05, 2, 14)])
-def test_latency_bunches_what_arrives(latency_s, fewest, most):
-    emulator = Emulator([make_recording(40)], latency_s=latency_s, loop=True)
-    with emulator, open_raw(emulator.port) as port:
-        port.write(b"S8\rO\r")
-        port.timeout = 0.003
-        chunks, received = 0, 0
-        while received < 40 * 16 * 22:
-            data = port.read(1_000_000)
-            chunks, received = chunks + bool(data), received + len(data)
-    assert fewest <= chunks <= most
 
 
 # The command.
@@ -185,17 +130,6 @@ def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
     path = write_recording(tmp_path / "a.csv", make_counts(1))
     assert main([str(path), "--rate-hz", "100"]) == 130
     assert capsys.readouterr().err == ""
-
-
-def test_the_terminal_is_left_for_the_client_to_set_up():
-    """A serial port comes up cooked and slow; a client that relies on more would fail on a real one."""
-    with Emulator([make_recording(1)]) as emulator:
-        client = os.open(emulator.port, os.O_RDWR | os.O_NOCTTY)
-        flags = termios.tcgetattr(client)
-        assert flags[3] & termios.ICANON and flags[5] != termios.B3000000
-        os.write(client, b"S8\nO\n")
-        assert select.select([client], [], [], 0.2)[0] == []
-        os.close(client)
 
 
 def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():

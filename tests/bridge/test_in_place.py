@@ -1,14 +1,11 @@
 """Files are whole or not there, and the one before is kept."""
 
-import json
 from pathlib import Path
 
 import pytest
-from edge_samples import BASELINE
 
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.in_place import check_writable, write_in_place
-from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
 
 
 def listing(folder: Path) -> list[str]:
@@ -64,12 +61,3 @@ def test_what_is_no_plain_file_is_not_replaced(tmp_path):
         with pytest.raises(OSError, match=r"directory|plain file|No such file"):
             written(path, "1")
     assert Path("/dev/null").is_char_device() and listing(tmp_path / "folder") == []
-
-
-def test_baselines_that_would_not_load_again_replace_none(tmp_path, monkeypatch):
-    path = tmp_path / "zero.json"
-    save_baselines(path, [BASELINE])
-    monkeypatch.setattr("firmware_bridge.zeroing.baseline.MOST_FILE_BYTES", len(path.read_bytes()) + 10)
-    with pytest.raises(RecordingError, match="cannot be read: larger than"):
-        save_baselines(path, [BASELINE, type(BASELINE).of("6", BASELINE.counts, 1.7e9, 100, "file")])
-    assert list(load_baselines(path)) == ["4"] and len(json.loads(path.read_text())["baselines"]) == 1

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import make_counts, read_scans, read_until_lost, stacked, write_recording
+from edge_samples import wait_for
 from link_rigs import processes_playing
-from serial_samples import wait_for
 
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import demo

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import serial
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
-from serial_samples import SilentDevice, wait_for
+from edge_samples import wait_for
+from serial_samples import SilentDevice
 
 from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame

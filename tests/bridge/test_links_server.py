@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
-from server_samples import looping, lose, read_notices, wait_for
+from edge_samples import wait_for
+from server_samples import looping, lose, read_notices
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection
 from xela_server_emulator import ServerEmulator

@@ -5,7 +5,8 @@ import time
 
 import pytest
 from bridge_samples import make_recording, read_scans, read_until_lost
-from serial_samples import SilentDevice, wait_for
+from edge_samples import wait_for
+from serial_samples import SilentDevice
 
 from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CanFrame, encode_frame

@@ -18,7 +18,6 @@ from mcap_samples import (
     TURNED,
     arrays_of,
     make_results,
-    messages_alone,
     messages_of,
     odd_scans,
     record_into,
@@ -26,7 +25,6 @@ from mcap_samples import (
 )
 
 from edge.api import open_runtime, open_source
-from edge.perception.event import Event
 from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
@@ -204,16 +202,6 @@ class TestReplay:
         assert f"zeroed again while it was recorded ({BASELINE.id}, then other)" in note
         link = ReplayLink([path])
         assert [(one.kind, one.text) for one in link.notices()] == [("note", note)] and not link.notices()
-
-    def test_a_recording_of_an_emulated_sensor_says_so(self, tmp_path):
-        path, results = tmp_path / "out.mcap", make_results([make_scan()], source="emulated")
-        sink = McapSink(path, SURE, RunFacts(unix_offset_ns=OFFSET_NS))
-        sink.tell(Event(5, "silent", None, "nothing comes"), {})
-        sink.write(results[0], {})
-        sink.close()
-        assert load_recording(path).notes == (f"{path} was recorded from an emulated sensor",)
-        scans = messages_alone(path, tmp_path / "scans.mcap", topics="/s4/scan")
-        assert load_recording(scans).origin == "emulated", "a reader may take a single topic"
 
     @pytest.mark.parametrize(("named", "form"), [("", "mcap"), ("left=", "npz")])
     def test_it_sits_as_it_sat_however_it_is_played(self, tmp_path, named, form):

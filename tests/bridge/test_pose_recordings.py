@@ -102,7 +102,7 @@ def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
 
 @pytest.mark.parametrize("kind", ["mcap", "npz"])
 def test_a_recording_without_poses_has_none(tmp_path, kind):
-    assert load_recording(record(tmp_path / f"plain.{kind}", [])).poses is None
+    assert load_recording(record(tmp_path / f"plain.{kind}", [])).poses == []
 
 
 def test_poses_of_another_program_are_interpolated_in_time(tmp_path):

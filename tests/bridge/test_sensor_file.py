@@ -122,8 +122,8 @@ def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value, expe
     (tmp_path / "s.toml").write_text(text_of(**{key: value}))
     with pytest.raises(SensorFileError, match=re.escape(expected)) as refused:
         load_sensor_file(tmp_path / "s.toml")
-    assert f"{key}'" in str(refused.value) and "\n" not in str(refused.value)
-    assert str(refused.value).startswith(f"{tmp_path}/s.toml, '")
+    assert str(refused.value).startswith(f"{tmp_path}/s.toml, '") and f"{key}'" in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 HEAD = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n'

@@ -15,8 +15,8 @@ import termios
 import threading
 
 import pytest
-from cli_samples import EDGE_SR, TIMEOUT_S, base_options, files, records, run, start, wait_for
-from edge_samples import ROOT
+from cli_samples import EDGE_SR, TIMEOUT_S, base_options, files, records, run, start
+from edge_samples import ROOT, wait_for
 
 from edge.cli import main as cli
 from edge.cli import run_command

@@ -106,9 +106,7 @@ def test_scans_poses_mountings_and_baselines_survive_any_way(made, tmp_path, way
         assert (
             one.sensor == other.sensor and (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
         )
-    assert before.poses is not None and after.poses is not None
-    for name in ("time_ns", "values", "sensor", "holds", "used_from_ns"):
-        assert (getattr(before.poses, name) == getattr(after.poses, name)).all()
+    assert before.poses == after.poses != []
 
 
 def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp_path, capsys):
@@ -125,12 +123,8 @@ def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp
         assert (placed == counts).all() and again.origin == "emulated"
         assert f"{file}: {len(whole)} scans of sensor {sensor}, " in out
     assert out.count("scans are left out: a taxel gave no reading") == 1 and "not in it: all but counts, times" in out
-    poses = load_recording(files["4"]).poses
-    assert (
-        poses is not None
-        and poses.values[0, :3].tolist() == [0.0, 0.0, 0.0]
-        and load_recording(files["left/6"]).poses is None
-    )
+    assert load_recording(files["4"]).poses[0].pose == PadPose(0, 0, 0)
+    assert not load_recording(files["left/6"]).poses
 
 
 def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):

@@ -141,9 +141,7 @@ def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
     with np.load(demo_recording()) as demo:
         before = np.argmax(demo["scene"] == SLIDE)
         counts, tap, scene = (demo[name][:before] for name in ("counts", "tap", "scene"))
-    poses = load_recording(demo_recording()).poses
-    assert poses is not None
-    stated, results = [poses.at(row, 0) for row in range(len(poses))], []
+    stated, results = [*load_recording(demo_recording()).poses], []
     for n, one in enumerate(counts):
         while stated[0].time_ns <= n * 10_000_000:
             pose = stated.pop(0)
@@ -183,12 +181,11 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
     with np.load(demo_recording()) as demo:
         tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
     poses = load_recording(demo_recording()).poses
-    assert poses is not None
     series, sink = ScanSeries("4", USPA44), ListSink()
     link = FakeLink([[series.close(one, n * 10_000_000)] for n, one in enumerate([*counts, *counts])], kind="emulated")
     link.patient = link.states_poses = True
     length_ns = len(counts) * 10_000_000
-    waiting = [poses.at(row, again * length_ns) for again in (0, 1) for row in range(len(poses))]
+    waiting = [pose.later(again * length_ns) for again in (0, 1) for pose in poses]
 
     def stated():
         now_ns = link.reads * 10_000_000

@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 import pytest
-from cli_samples import base_options, files, records, run, start, wait_for, write_recording
-from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
+from cli_samples import base_options, files, records, run, start, write_recording
+from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
 from edge.api import MapSink, ObjectMap, Stream, open_recording, open_runtime

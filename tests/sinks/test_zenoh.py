@@ -16,7 +16,7 @@ import numpy as np
 import orjson
 import pytest
 from bridge_samples import write_recording
-from edge_samples import ROOT, ended, make_scan, write_model
+from edge_samples import ROOT, ended, make_scan, wait_for, write_model
 from test_listening import reachable
 from zenoh_samples import (
     CONTRACT,
@@ -27,7 +27,6 @@ from zenoh_samples import (
     hear_interrupts,
     listening,
     make_results,
-    wait_for,
 )
 
 from edge.errors import SinkError

@@ -6,13 +6,12 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, make_contract, make_scan, write_model
+from edge_samples import BASELINE, ROOT, make_contract, make_scan, wait_for, write_model
 
 from edge.cli import main as cli
 from edge.inference.timed_loading import unfinished_load
@@ -78,13 +77,6 @@ def start(*arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=s
 
 def records(text):
     return [json.loads(line) for line in text.splitlines()]
-
-
-def wait_for(condition):
-    end_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < end_s, "it did not come"
-        time.sleep(0.05)
 
 
 def assert_refused(done, code, *words):

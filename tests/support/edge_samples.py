@@ -153,15 +153,20 @@ def write_model(
         "doubt": np.array(doubt, dtype=np.float32),
         **({} if pad_width else {"stiffness": np.ones((1, 1, 1, 1), dtype=np.float32)}),
     }
+    return save_graph(path, nodes, inputs, outputs, constants, contract.to_metadata() if metadata is None else metadata)
+
+
+def save_graph(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict, metadata: dict) -> Path:
+    """Write a graph of nodes: inputs by name as type and shape, outputs as shape, constants as array."""
     graph = helper.make_graph(
         nodes,
         "tiny",
-        [helper.make_tensor_value_info(name, kind, of) for name, (kind, of) in inputs.items()],
+        [helper.make_tensor_value_info(name, kind, list(of)) for name, (kind, of) in inputs.items()],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, of) for name, of in outputs.items()],
         [numpy_helper.from_array(values, name) for name, values in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
-    helper.set_model_props(model, contract.to_metadata() if metadata is None else metadata)
+    helper.set_model_props(model, metadata)
     onnx.save(model, path)
     return path
 
@@ -255,14 +260,23 @@ class FakeModel:
         pads: Sequence[np.ndarray] | None = None,
         poses: Sequence[np.ndarray] | None = None,
     ) -> np.ndarray:
-        patterns, deviations, tractions = [], [], []
+        made = []
         for index, window in enumerate(windows):
-            patterns.append(self.run(window, None if pads is None else pads[index]))
-            deviations.append(self.deviation)
-            tractions.append(self.traction)
+            pad, rows = (None if more is None else more[index] for more in (pads, poses))
+            made.append((self.run(window, pad, rows), self.deviation, self.traction))
+        patterns, deviations, tractions = zip(*made, strict=True)
         self.deviation = None if deviations[0] is None else np.stack(deviations)
         self.traction = None if tractions[0] is None else np.stack(tractions)
         return np.stack(patterns)
+
+
+def wait_for(condition, within_s=60.0):
+    """Return the condition's value as soon as it is true."""
+    end_s = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.005)
+    return value
 
 
 def inferred(runtime, scans) -> list:

@@ -75,11 +75,6 @@ class GsUsbAdapter:
         """True while its cable is in."""
         return self._plugged
 
-    @property
-    def waiting_frames(self) -> int:
-        """Frames in its queue."""
-        return len(self._queue)
-
     def hear(self, *frames: CanFrame, stamp_us: int | None = None, channel: int = 0) -> None:
         """Receive frames from the bus, at `stamp_us` of its clock, by default now."""
         self._receive(frames, 0, stamp_us, channel)

@@ -1,12 +1,10 @@
 """Model that takes poses, as a real graph and without onnxruntime: each tap counts by a sum of its pose's numbers."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import onnx
-from edge_samples import FakeModel, make_contract, tiny_deviation, tiny_traction
-from onnx import TensorProto, helper, numpy_helper
+from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation, tiny_traction
+from onnx import TensorProto, helper
 
 from edge.inference.contract import (
     ANY_BATCH,
@@ -47,9 +45,9 @@ def write_posed_model(path: Path, contract: Contract | None = None, **properties
         helper.make_node("ConvTranspose", ["whole", "square"], ["squares"], strides=[scale, scale]),
         helper.make_node("Squeeze", ["squares", "taps"], [OUTPUT_NAME]),
     ]
-    outputs = [OUTPUT_NAME]
+    outputs = {OUTPUT_NAME: shape}
     if contract.interval_factor is not None:
-        outputs.append(DEVIATION_NAME)
+        outputs[DEVIATION_NAME] = shape
         nodes += [
             helper.make_node("Abs", [OUTPUT_NAME], ["size"]),
             helper.make_node("Add", ["size", "one"], ["doubted"]),
@@ -65,20 +63,8 @@ def write_posed_model(path: Path, contract: Contract | None = None, **properties
         "square": np.ones((1, 1, scale, scale), dtype=np.float32),
         "doubt": np.array(0.01, dtype=np.float32),
     }
-    graph = helper.make_graph(
-        nodes,
-        "posed",
-        [
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, list(of))
-            for name, of in contract.input_shapes.items()
-        ],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in outputs],
-        [numpy_helper.from_array(values, name) for name, values in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
-    helper.set_model_props(model, contract.to_metadata() | properties)
-    onnx.save(model, path)
-    return path
+    inputs = {name: (TensorProto.FLOAT, of) for name, of in contract.input_shapes.items()}
+    return save_graph(path, nodes, inputs, outputs, constants, contract.to_metadata() | properties)
 
 
 class PosedModel(FakeModel):
@@ -99,19 +85,3 @@ class PosedModel(FakeModel):
         if self.contract.traction_scale is not None:
             self.traction = tiny_traction(window, self.contract.traction_scale).astype(np.float32)
         return pattern
-
-    def run_together(
-        self,
-        windows: Sequence[np.ndarray],
-        pads: Sequence[np.ndarray] | None = None,
-        poses: Sequence[np.ndarray] | None = None,
-    ) -> np.ndarray:
-        assert poses is not None
-        made = []
-        for index, (window, rows) in enumerate(zip(windows, poses, strict=True)):
-            pattern = self.run(window, None if pads is None else pads[index], rows)
-            made.append((pattern, self.deviation, self.traction))
-        patterns, deviations, tractions = zip(*made, strict=True)
-        self.deviation = None if deviations[0] is None else np.stack(deviations)
-        self.traction = None if tractions[0] is None else np.stack(tractions)
-        return np.stack(patterns)

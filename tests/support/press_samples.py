@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from train.data.paper_taps import PaperTaps
 from train.data.presses import PressSet
-from train.physics.gripped import FRAMES
 from train.physics.pad_draws import INPUTS
 
 
@@ -33,22 +31,4 @@ def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:
         twist_nmm=rng.normal(0, 10, count).astype(np.float32),
         indentation_mm=depth_mm,
         config={"made": "by hand", "seed": seed},
-    )
-
-
-def make_taps(count=6, taps=4, seed=0) -> PaperTaps:
-    """Return whole taps in closed form: force, counts and patterns in proportion to the indentation."""
-    rng = np.random.default_rng(seed)
-    indentation_mm = rng.uniform(0.2, 0.5, (count, taps, 1)) * np.arange(1, FRAMES + 1) / FRAMES
-    slope = rng.uniform(-3000, 6000, (count, taps, 1, 3, 4, 4))
-    across = (np.arange(80) - 39.5) / 20
-    dome = np.exp(-(across[:, None] ** 2 + across**2)).astype(np.float32)
-    return PaperTaps(
-        surfaces=np.array(["small square", "C", "glyph:123456"])[np.arange(count) % 3],
-        poses=rng.uniform(-3, 3, (count, taps, 3)),
-        counts=(slope * indentation_mm[..., None, None, None]).astype(np.float32),
-        force_n=(rng.uniform(10, 20, (count, taps, 1)) * indentation_mm).astype(np.float32),
-        indentation_mm=indentation_mm.astype(np.float32),
-        unit_patterns=np.repeat(dome[None], count, axis=0),
-        touching=np.repeat(dome[None] > 0.4, count, axis=0),
     )

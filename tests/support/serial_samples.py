@@ -2,16 +2,7 @@
 
 import os
 import select
-import time
 import tty
-from collections.abc import Callable
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 class SilentDevice:

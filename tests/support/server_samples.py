@@ -41,13 +41,6 @@ def looping(**options) -> VendorServer:
     return VendorServer([make_recording(50)], loop=True, **options)
 
 
-def wait_for(condition, timeout_s=60.0):
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-
-
 def lose(link):
     """Read until the link is lost, and return its error's text."""
     end_s = time.monotonic() + 60

@@ -3,7 +3,6 @@
 import http.client
 import socket
 import threading
-import time
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -206,15 +205,6 @@ def frame(viewer, kind=None, sensor=None):
         header, maps = unpack(viewer.recv(TIMEOUT_S))
         if kind in (None, header["kind"]) and sensor in (None, header.get("sensor")):
             return header, maps
-
-
-def wait_for(condition):
-    """Return the condition's value as soon as it is true."""
-    end_s = time.monotonic() + TIMEOUT_S
-    while not (value := condition()):
-        assert time.monotonic() < end_s, "it did not come"
-        time.sleep(0.005)
-    return value
 
 
 @pytest.fixture

@@ -4,20 +4,30 @@ It is as strict as the real one: it sends its readings at its own pace, old or n
 until they are old, and restarts its count after a restart.
 """
 
+import asyncio
+import logging
 import math
+import socket
+import struct
 import threading
 import time
-from collections.abc import Callable
-from queue import Empty, SimpleQueue
-from typing import Final, Self
+from collections.abc import Coroutine
+from contextlib import suppress
+from typing import Any, Final, Self
 
-from websocket_server import WebSocketServer
+from websockets.asyncio.server import ServerConnection, broadcast, serve
+from websockets.exceptions import ConnectionClosed
 from xela_server_model import GARBAGE, VendorServer
 
-DEFAULT_MESSAGE_HZ: Final = 100.0
 HOST: Final = "127.0.0.1"
 """Address of this machine alone, so that no other one takes its messages for a sensor's."""
-_STOP_POLL_S: Final = 0.05
+MOST_QUEUED_BYTES: Final = 1 << 20
+"""Most unread bytes of a client; messages beyond are lost."""
+_RESET: Final = struct.pack("ii", 1, 0)
+"""Value of SO_LINGER that resets a connection, as the kernel does for a process that was killed."""
+_QUIET: Final = logging.getLogger("xela_server_emulator")
+_QUIET.addHandler(logging.NullHandler())
+_QUIET.propagate = False
 
 
 class ServerEmulator:
@@ -27,156 +37,119 @@ class ServerEmulator:
 
     Attributes:
         url: ws://HOST:PORT, once entered.
+        sent_messages: number of messages sent to a client, without greetings.
+        lost_messages: number of messages without room at a client.
     """
 
-    def __init__(
-        self,
-        server: VendorServer,
-        *,
-        message_hz: float = DEFAULT_MESSAGE_HZ,
-        port: int = 0,
-        garbage_every: int = 0,
-    ) -> None:
-        """Prepare to serve; nothing is opened yet.
-
-        Args:
-            server: source of the messages.
-            message_hz: messages a second, independent of the sensors.
-            port: port to listen on, 0 for a free one.
-            garbage_every: number of messages after which an invalid one follows; 0 for never.
-
-        Raises:
-            ValueError: an option is out of range.
-        """
-        if not 0 < message_hz < math.inf:
-            raise ValueError(f"messages a second are {message_hz}, expected a positive number")
+    def __init__(self, server: VendorServer, *, message_hz: float = 100.0, garbage_every: int = 0) -> None:
+        """Prepare to serve so many messages a second, with an invalid one after each `garbage_every`; 0 for none."""
         self.url = ""
-        self._vendor = server
-        self._message_hz = message_hz
-        self._garbage_every = garbage_every
+        self.sent_messages = self.lost_messages = 0
+        self._vendor, self._message_hz, self._garbage_every = server, message_hz, garbage_every
+        self._port = 0
         self._sequence = 0
-        self._ticks = 0
-        self._garbage = 0
-        self._start_s: float | None = None
-        self._frozen = False
-        self._asked: SimpleQueue[tuple[Callable[[], None], threading.Event]] = SimpleQueue()
-        self._server = WebSocketServer(HOST, port, self._welcome)
-        self._stop = threading.Event()
-        self._through = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="server-emulator", daemon=True)
+        self._greeted = asyncio.Event()
+        self._clients: set[ServerConnection] = set()
+        self._thawed = threading.Event()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="server-emulator", daemon=True)
 
     def __enter__(self) -> Self:
-        self._server.listen()
-        host, port = self._server.address
-        self.url = f"ws://{host}:{port}"
         self._thread.start()
+        self.start_again()
+        self.url = f"ws://{HOST}:{self._port}"
+        self._playing = asyncio.run_coroutine_threadsafe(self._play(), self._loop)
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._stop.set()
-        self._server.wake()
+        self.thaw()
+        self._playing.cancel()
+        self.kill()
+        self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
-        self._server.close()
-
-    @property
-    def sent_messages(self) -> int:
-        """Number of messages sent to a client, without greetings."""
-        return self._server.sent_messages
-
-    @property
-    def lost_messages(self) -> int:
-        """Number of messages without room at a client."""
-        return self._server.lost_messages
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; return False on time-out."""
-        return self._through.wait(timeout_s)
+        self._loop.close()
 
     def kill(self) -> None:
         """End as a killed process does: connections break, and the port is closed."""
-        self._ask(self._server.drop_dead)
+        self._ask(self._die())
 
     def start_again(self) -> None:
         """Listen again after `kill`, on the same port; messages are counted from 0."""
-        self._ask(self._begin_anew)
+        self._ask(self._listen())
 
     def freeze(self) -> None:
         """Stop sending and answering, with every connection open, as when it hangs or the network is gone."""
-        self._ask(lambda: setattr(self, "_frozen", True))
+        frozen = threading.Event()
+        self._thawed.clear()
+        self._loop.call_soon_threadsafe(lambda: (frozen.set(), self._thawed.wait()))
+        frozen.wait()
 
     def thaw(self) -> None:
         """Go on after `freeze`; the messages of the time between are never sent."""
-        self._ask(lambda: setattr(self, "_frozen", False))
+        self._thawed.set()
 
     def count_from(self, sequence: int) -> None:
         """Give the next message this number."""
-        self._ask(lambda: setattr(self, "_sequence", sequence))
+        self._sequence = sequence
 
     def say(self, text: str | bytes) -> None:
         """Send any text or bytes to every client; bytes as a binary message."""
-        self._ask(lambda: self._server.say(text))
+        self._ask(self._send(text))
 
-    def close_all(self, code: int = 1001, reason: str = "") -> None:
+    def close_all(self, code: int, reason: str) -> None:
         """Close every connection politely, and go on listening."""
-        self._ask(lambda: self._server.close_all(code, reason))
+        self._ask(self._close(code, reason))
 
-    def _ask(self, action: Callable[[], None]) -> None:
-        done = threading.Event()
-        self._asked.put((action, done))
-        self._server.wake()
-        while not done.wait(_STOP_POLL_S) and not self._through.is_set():
-            pass
+    def _ask(self, action: Coroutine[Any, Any, object]) -> None:
+        asyncio.run_coroutine_threadsafe(action, self._loop).result()
 
-    def _serve(self) -> None:
-        try:
-            while not self._stop.is_set():
-                self._server.poll(self._time_to_next_s(), attend=not self._frozen)
-                self._do_what_is_asked()
-                if self._frozen:
-                    # A select on unread data would not wait.
-                    self._stop.wait(1 / self._message_hz)
-                elif self._start_s is not None and self._time_to_next_s() == 0 and not self._tick(self._start_s):
-                    break
-            if not self._stop.is_set():
-                self._server.hang_up(self._stop)
-        finally:
-            self._server.drop_dead()
-            self._do_what_is_asked()
-            self._through.set()
-
-    def _do_what_is_asked(self) -> None:
-        while True:
-            try:
-                action, done = self._asked.get_nowait()
-            except Empty:
-                return
-            action()
-            done.set()
-
-    def _time_to_next_s(self) -> float:
-        if self._start_s is None:
-            return _STOP_POLL_S
-        return max(0.0, self._start_s + self._ticks / self._message_hz - time.monotonic())
-
-    def _tick(self, start_s: float) -> bool:
-        """Send the next message; return False if there is no more to send."""
-        elapsed_s = self._ticks / self._message_hz
-        if self._vendor.ended(elapsed_s):
-            return False
-        behind = math.floor((time.monotonic() - start_s) * self._message_hz) - self._ticks
-        self._ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
-        text = self._vendor.message(self._sequence, elapsed_s, time.time())
-        self._sequence += 1
-        self._server.say(text)
-        if self._garbage_every and self._sequence % self._garbage_every == 0:
-            self._server.say(GARBAGE[self._garbage % len(GARBAGE)])
-            self._garbage += 1
-        return True
-
-    def _begin_anew(self) -> None:
+    async def _listen(self) -> None:
         self._sequence = 0
-        self._server.listen()
+        settings = {"compression": None, "ping_interval": None, "logger": _QUIET}
+        self._server = await serve(self._attend, HOST, self._port, **settings)
+        self._port = next(iter(self._server.sockets)).getsockname()[1]
 
-    def _welcome(self) -> str:
-        self._start_s = time.monotonic() if self._start_s is None else self._start_s
-        return self._vendor.welcome(time.time())
+    async def _attend(self, client: ServerConnection) -> None:
+        """Greet a client, and drop what it sends."""
+        with suppress(ConnectionClosed):
+            await client.send(self._vendor.welcome(time.time()))
+            self._clients.add(client)
+            self._greeted.set()
+            async for _ in client:
+                pass
+        self._clients.discard(client)
+
+    async def _send(self, text: str | bytes) -> None:
+        for client in list(self._clients):
+            if client.transport.get_write_buffer_size() > MOST_QUEUED_BYTES:
+                self.lost_messages += 1
+            else:
+                self.sent_messages += 1
+                broadcast([client], text)
+
+    async def _close(self, code: int, reason: str) -> None:
+        await asyncio.gather(*(client.close(code, reason) for client in list(self._clients)))
+
+    async def _die(self) -> None:
+        self._server.close(close_connections=False)
+        for client in list(self._clients):
+            with suppress(OSError):  # the client may have gone just now
+                client.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            client.transport.abort()
+        await self._server.wait_closed()
+
+    async def _play(self) -> None:
+        """Send messages from the first greeting to the end of the recordings, then hang up."""
+        await self._greeted.wait()
+        start_s, ticks = time.monotonic(), 0
+        garbage = 0
+        while not self._vendor.ended(ticks / self._message_hz):
+            await asyncio.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
+            await self._send(self._vendor.message(self._sequence, ticks / self._message_hz, time.time()))
+            self._sequence += 1
+            if self._garbage_every and self._sequence % self._garbage_every == 0:
+                await self._send(GARBAGE[garbage % len(GARBAGE)])
+                garbage += 1
+            behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
+            ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
+        await self._close(1001, "")

@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from contextlib import suppress
 
 import pytest
@@ -119,13 +118,6 @@ def make_results(count, **of_the_scans):
     runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
     presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
     return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
-
-
-def wait_for(condition, within_s=10):
-    end_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def hear_interrupts():

@@ -15,8 +15,8 @@ from contextlib import contextmanager, suppress
 
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, write_model
-from view_samples import HANDSHAKE, LONG_PING, Swallowing, wait_for
+from edge_samples import ROOT, wait_for, write_model
+from view_samples import HANDSHAKE, LONG_PING, Swallowing
 from websockets.sync.client import connect
 
 from edge.cli import main as cli

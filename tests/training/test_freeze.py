@@ -112,7 +112,7 @@ def test_the_demo_taps_four_times_or_where_it_is_proposed_and_scores_none_of_the
     there = arrays["option_unit_patterns"][(places.round() == [2, 0]).all(axis=1)][0].astype(float)
     moved = arrays["unit_patterns"][0].astype(float)[:, 10:]
     assert np.abs(there[:, :-10] - moved).mean() < 0.05 < np.abs(there[:, 10:] - moved).mean()
-    assert series.poses is not None and (BUNDLE_DIR / "demo.npz").stat().st_size < 1_000_000
+    assert series.poses and (BUNDLE_DIR / "demo.npz").stat().st_size < 1_000_000
 
 
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path):

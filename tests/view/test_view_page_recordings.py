@@ -34,8 +34,7 @@ from browser_samples import (
     shares,
     word,
 )
-from edge_samples import ROOT
-from view_samples import wait_for
+from edge_samples import ROOT, wait_for
 from websockets.sync.client import connect
 
 from edge.terminal.progress_bar import Progress

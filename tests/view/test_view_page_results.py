@@ -24,10 +24,10 @@ from browser_samples import (
     resize,
     word,
 )
-from edge_samples import make_pad_contract
+from edge_samples import make_pad_contract, wait_for
 from map_samples import letter
 from matplotlib.image import imread
-from view_samples import CONTRACT, Mapped, Press, live_page, tell, wait_for
+from view_samples import CONTRACT, Mapped, Press, live_page, tell
 
 from edge.perception.event import Note
 from edge.perception.result import NextTap

@@ -35,7 +35,7 @@ from browser_samples import (
     then_held,
     word,
 )
-from view_samples import wait_for
+from edge_samples import wait_for
 
 from firmware_bridge.recording.formats import load_recording
 

@@ -7,7 +7,8 @@ import time
 
 import numpy as np
 import pytest
-from view_samples import CONTRACT, TIMEOUT_S, Press, wait_for
+from edge_samples import wait_for
+from view_samples import CONTRACT, TIMEOUT_S, Press
 
 from edge.errors import SinkError
 from edge.perception.event import Event

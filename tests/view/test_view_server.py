@@ -13,8 +13,9 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from edge_samples import wait_for
 from map_samples import letter, pixels_mm
-from view_samples import HANDSHAKE, TIMEOUT_S, Mapped, Press, frame, get, live_page, page, refused_with, tell, wait_for
+from view_samples import HANDSHAKE, TIMEOUT_S, Mapped, Press, frame, get, live_page, page, refused_with, tell
 from websockets.exceptions import ConnectionClosed
 
 from edge.view import server

@@ -6,7 +6,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
-from view_samples import HANDSHAKE, LONG_PING, Swallowing, frame, get, live_page, page, refused_with, wait_for
+from edge_samples import wait_for
+from view_samples import HANDSHAKE, LONG_PING, Swallowing, frame, get, live_page, page, refused_with
 from websockets.sync.client import connect
 
 from edge.pipeline.pump import uncollected

@@ -1,25 +1,35 @@
-"""Tables of the sensor file, read strictly: a misspelt key must not count as a missing one."""
+"""Tables of users' files, read strictly: a misspelt key must not count as a missing one."""
 
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from firmware_bridge.errors import SensorFileError
-
 LARGEST: Final = 1e12
 """Largest magnitude of a number in the file; a whole number can have more digits than any float."""
-REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
+LEAST_POSITIVE: Final = 1e-300
+"""Least number above 0: much smaller ones count as 0 where a library has made the processor faster."""
 
 
 class Table:
-    """One table of the file, whose keys are taken one by one; `end` refuses any left over."""
+    """One table of a file, whose keys are taken one by one; `end` refuses any left over.
 
-    def __init__(self, path: Path, name: str, values: Mapping[str, Any]) -> None:
-        self._path = path
-        self._name = name
+    Args:
+        path: of the file.
+        name: of the table, with a dot at its end, for messages.
+        values: of the table.
+        error: raised where a value cannot be used.
+        remedy: what a user can do then.
+    """
+
+    def __init__(self, path: Path, name: str, values: Mapping[str, Any], error: type[ValueError], remedy: str) -> None:
+        self._path, self._name, self._error, self._remedy = path, name, error, remedy
         self._values = dict(values)
         self._known: list[str] = []
+
+    def part(self, key: str, values: Mapping[str, Any]) -> "Table":
+        """Return a table in this one."""
+        return Table(self._path, f"{self._name}{key}.", values, self._error, self._remedy)
 
     def take(self, key: str, read: Callable[[Any], Any], *, required: bool = True) -> Any:
         """Return the value of a key, None if an optional one is missing; errors of `read` state what it expected."""
@@ -39,7 +49,7 @@ class Table:
 
     def refuse(self, key: str, got: str, expected: str) -> NoReturn:
         """Raise the error of a key, with its value, the expected one and the remedy."""
-        raise SensorFileError(f"{self._path}, '{self._name}{key}': {got}, expected {expected}: {REMEDY}")
+        raise self._error(f"{self._path}, '{self._name}{key}': {got}, expected {expected}: {self._remedy}")
 
 
 def _shown(value: Any) -> str:
@@ -54,10 +64,9 @@ def one_of(*values: str | int) -> Callable[[Any], Any]:
     """Return a reader that accepts one of these values, of its type."""
 
     def read(value: Any) -> Any:
-        for one in values:
-            if type(value) is type(one) and value == one:
-                return value
-        raise ValueError(" or ".join(map(repr, values)))
+        if not any(type(value) is type(one) and value == one for one in values):
+            raise ValueError(" or ".join(map(repr, values)))
+        return value
 
     return read
 
@@ -73,13 +82,6 @@ def a_table(value: Any) -> dict[str, Any]:
     """Read a table, whose keys a Table of its own checks."""
     if not isinstance(value, dict):
         raise ValueError("a table")
-    return value
-
-
-def sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
-    """Read the tables of the sensors."""
-    if not isinstance(value, dict) or not value or not all(isinstance(one, dict) for one in value.values()):
-        raise ValueError("a table for each sensor, such as [sensors.4]")
     return value
 
 
@@ -101,22 +103,38 @@ def between(low: float, high: float) -> Callable[[Any], float]:
     """Return a reader that accepts a number in this range, both ends included, in its written type."""
 
     def read(value: Any) -> float:
-        if not is_number(value) or not low <= value <= high:
+        if not is_number(value, low, high):
             raise ValueError(f"a number from {low:g} to {high:g}")
         return value  # not as a float: a baseline's id differs between 1000 and 1000.0
 
     return read
 
 
-def flat_cells(value: Any, shape: tuple[int, ...], expected: str) -> list[Any]:
-    """Flatten nested lists of this shape."""
-    if not isinstance(value, list) or len(value) != shape[0]:
-        raise ValueError(expected)
-    if len(shape) == 1:
-        return value
-    return [cell for part in value for cell in flat_cells(part, shape[1:], expected)]
+def cells(shape: tuple[int, ...], right: Callable[[list[Any]], bool], expected: str) -> Callable[[Any], Any]:
+    """Return a reader of nested lists of this shape, whose flat cells, a tuple, have to be `right`."""
+
+    def flat(value: Any, shape: tuple[int, ...]) -> list[Any]:
+        if not isinstance(value, list) or len(value) != shape[0]:
+            raise ValueError(expected)
+        return value if len(shape) == 1 else [cell for part in value for cell in flat(part, shape[1:])]
+
+    def read(value: Any) -> tuple[Any, ...]:
+        found = flat(value, shape)
+        if not right(found):
+            raise ValueError(expected)
+        return tuple(found)
+
+    return read
 
 
-def is_number(value: Any) -> bool:
-    """Return True for a number of at most LARGEST in magnitude."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
+def numbers(
+    shape: tuple[int, ...], expected: str, low: float = -LARGEST, high: float = LARGEST
+) -> Callable[[Any], tuple[float, ...]]:
+    """Return a reader of nested lists of numbers in a range, both ends included."""
+    read = cells(shape, lambda found: all(is_number(cell, low, high) for cell in found), expected)
+    return lambda value: tuple(map(float, read(value)))
+
+
+def is_number(value: Any, low: float, high: float) -> bool:
+    """Return True for a number in a range, both ends included."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
