@@ -22,7 +22,6 @@ from firmware_bridge.poses.pose_track import PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.scans.stillness import STILL_COUNTS
 from firmware_bridge.zeroing.baseline import Baseline
 
 _SMOOTHING: Final = 0.1
@@ -97,8 +96,6 @@ class Runtime:
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._options = options
-        # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
-        self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
         self._queue = WaitingSteps()
@@ -150,12 +147,6 @@ class Runtime:
             holds: the pad rests there until the next pose.
         """
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
-
-    def rests(self, result: Result) -> bool:
-        """Return True if no contact can begin while no reading of the sensor changes by more than noise."""
-        counts = result.force_counts
-        seen_counts = self._options.contact_on_counts - self._hidden_counts
-        return result.state == "idle" and counts is not None and counts < seen_counts
 
     def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
         """Forget all readings and taps after the link broke, since contacts may have been missed; zeroing stays.

@@ -16,7 +16,7 @@ import select
 import sys
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 try:
     import fcntl
@@ -38,6 +38,20 @@ LONGEST_REST_S: Final = 0.004
 """Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
 STEP_S: Final = 0.0003
 """Time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing."""
+
+
+class Piece(NamedTuple):
+    """Bytes received together.
+
+    Attributes:
+        data: the bytes.
+        time_ns: monotonic time at which they were read, in [ns].
+        empty_ns: latest monotonic time before it at which the port was empty, in [ns].
+    """
+
+    data: bytes
+    time_ns: int
+    empty_ns: int
 
 
 class BurstReader:
@@ -65,18 +79,7 @@ class BurstReader:
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
-        self._gathers = False
         self._wake_at(FULL_BYTES)
-
-    def gather(self, on: bool) -> None:
-        """Let the kernel return all bytes with one read, for `take_all`, whose caller waits between reads.
-
-        Raises:
-            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
-        """
-        if on != self._gathers:
-            self._gathers = on
-            self._wake_at(1 if on else FULL_BYTES)
 
     def _wake_at(self, least_bytes: int) -> None:
         if termios is not None:
@@ -141,21 +144,16 @@ class BurstReader:
         return bool(self._poll.poll(1000 * wait_s))
 
     def take_all(self) -> bytes:
-        """Return all bytes there, without waiting for more; `gather` was called before.
+        """Return all bytes there, without waiting for more.
 
         Raises:
             OSError: the port is gone, and all earlier bytes have been returned.
         """
         now_s = self._clock_s()
-        try:
-            data = os.read(self.descriptor, MOST_BYTES)
-        except BlockingIOError:
-            data = None
-        if data == b"":
-            raise OSError(errno.EIO, "hung up")
-        if data is None or len(data) < TERMINAL_BYTES:
+        data = self._take(b"", MOST_BYTES)
+        if len(data) < MOST_BYTES:
             self.empty_s = now_s
-        return data or b""
+        return data
 
     def look(self) -> None:
         """Update `empty_s` if no more than the beginning of a scan is waiting.

@@ -127,13 +127,6 @@ class ScanAssembler:
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
         return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
 
-    @property
-    def period_s(self) -> float | None:
-        """Shortest period of a sensor that exists, in [s]; None until one is measured."""
-        periods_ns = [sensor.wire.period_ns for sensor in self._sensors.values() if sensor.confirmed]
-        known_ns = [period_ns for period_ns in periods_ns if period_ns is not None]
-        return min(known_ns) / 1e9 if known_ns else None
-
     def counters(self) -> dict[str, int]:
         """Return the counters, summed over all sensors.
 

@@ -16,7 +16,6 @@ from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.mixed_cycles import BEFORE, MixedCycles
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
-from firmware_bridge.scans.stillness import Stillness
 from firmware_bridge.silence import SCAN_GIVEN_UP_NS
 
 _MOST_ORDERS: Final = 1024
@@ -45,7 +44,6 @@ class SlcanScans:
         self._mixed = MixedCycles(model)
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
-        self._stillness = Stillness()
         self._foreign = self._fed_ns = 0
         self.can_ids: set[int] = set()
 
@@ -103,19 +101,6 @@ class SlcanScans:
         for frames, _ in self._mixed.begun.values():
             missing = min(missing, self._taxels - len(frames) // STAMPED_BYTES)
         return max(1, missing * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
-
-    @property
-    def period_s(self) -> float | None:
-        """Shortest time between two scans of a sensor, in [s]; None until it is measured."""
-        return self._assembler.period_s
-
-    def level(self, data: bytes) -> None:
-        """Take the readings in `data`, read last, as the ones that `still` compares with."""
-        self._stillness.learn(data, self.decoder.usual_line_bytes)
-
-    def still(self, data: bytes) -> bool:
-        """Return True if `data`, which follows that of `level` or `still`, repeats its readings within noise."""
-        return self._stillness.holds(data, self.decoder.usual_line_bytes)
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
