@@ -15,8 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.scans.can_id_maps import Cycle, ModelMap, Reading
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, SHORTEST_PAUSE_NS, WireCycle
@@ -42,15 +43,31 @@ class ScanAssembler:
     flip in ids must not create a sensor. (Half, because the wrong id map shows half of the taxels.)
 
     Memory: one open scan per sensor name; a ModelMap has at most 16 names.
+
+    Attributes:
+        can_ids: the standard CAN ids received so far, of any device.
+        foreign: number of frames that are of no taxel of this model.
     """
 
-    def __init__(self, model: ModelMap) -> None:
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        self.can_ids: set[int] = set()
+        self.foreign = 0
         self._model = model
         self._geometry = model.geometry
         self._taxels = model.geometry.taxel_count
         self._readings = 0
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
+
+    def feed_frame(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+        """Return the scans that a frame closes, whatever it holds; otherwise as `feed`."""
+        if not frame.extended:  # bounded: there are at most 2048 of these
+            self.can_ids.add(frame.can_id)
+        reading = decode(frame, self._model)
+        if reading is None:
+            self.foreign += 1
+            return []
+        return self.feed(reading, time_ns, device)
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
         """Return the scans that this reading closes.
@@ -130,20 +147,16 @@ class ScanAssembler:
     def counters(self) -> dict[str, int]:
         """Return the counters, summed over all sensors.
 
-        readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that do not exist (yet);
-        abandoned: of scans that a broken link left open; resynchronised: left out, since the beginning or end of their
-        cycle was uncertain; scans; torn_wire: taxels missing; torn_source: complete, but only partly renewed; repeated:
-        nothing renewed; missing_taxels.
+        foreign: frames of no taxel; readings; duplicates: the same frame twice in a row; unconfirmed: readings of
+        sensors that do not exist (yet); abandoned: of scans that a broken link left open; resynchronised: left out,
+        since the beginning or end of their cycle was uncertain; scans; torn_wire: taxels missing; torn_source:
+        complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
         for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and add a sensor
             for name, count in sensor.counts.items():
                 totals[name] += count
-        return {"readings": self._readings} | totals
-
-    def sensor_counters(self) -> dict[str, dict[str, int]]:
-        """Return the same counters for each sensor that exists, by name."""
-        return {name: sensor.counts.copy() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
+        return {"foreign": self.foreign, "readings": self._readings} | totals
 
 
 class _Sensor:

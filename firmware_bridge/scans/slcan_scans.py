@@ -44,8 +44,8 @@ class SlcanScans:
         self._mixed = MixedCycles(model)
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
-        self._foreign = self._fed_ns = 0
-        self.can_ids: set[int] = set()
+        self.can_ids = self._assembler.can_ids
+        self._fed_ns = 0
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
@@ -57,7 +57,7 @@ class SlcanScans:
         for piece in self.decoder.cut(data):
             if head_ns < time_ns:
                 if isinstance(piece, PackedFrames) and self._is_joined(piece, head_ns):
-                    self._foreign += 1
+                    self._assembler.foreign += 1
                     piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
                 head_ns = time_ns
             if isinstance(piece, CanFrame):
@@ -104,28 +104,17 @@ class SlcanScans:
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
-        counters = self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
+        counters = self.decoder.counters() | self._assembler.counters()
         for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
             counters["readings"] += len(frames) // STAMPED_BYTES
         return counters
 
     def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
-        """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
-        start, cycle_bytes = 0, self._taxels * frame_bytes
-        stamped = frame_bytes == STAMPED_BYTES
-        waits = stamped and not self._clock.dropped
+        """Feed a run of usual frames, parted into the whole cycles of their sensors and single frames."""
+        waits = frame_bytes == STAMPED_BYTES and not self._clock.dropped
         if not waits:
             self._give_up_begun(time_ns, scans)
-        mixed = bool(self._mixed.begun)
-        while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
-            scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
-            if scan is None:
-                break
-            scans.append(scan)
-            start += cycle_bytes
-        if start == len(packed):
-            return
-        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=waits):
+        for place, frames in self._mixed.part(packed, frame_bytes, time_ns, waits=waits):
             if len(frames) > frame_bytes:
                 scan = self._feed_cycle(frames, frame_bytes, time_ns)
                 if scan is not None:
@@ -159,17 +148,11 @@ class SlcanScans:
                     self._clock.follow_order((stamp_ms - before_ms) * _MS_NS)
             self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
 
-    def _one_sensor(self, packed: bytes, start: int, frame_bytes: int) -> bool:
-        """Return whether two frames in a row are of one sensor; where scans of several mix, no cycle begins."""
-        taxels = self._model.taxels
-        first, second = (taxels.get(packed[at] << 4 | packed[at + 1] >> 4) for at in (start, start + frame_bytes))
-        return first is not None and second is not None and first[0] == second[0]
-
     def _feed_reading(
         self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan], *, late: bool = False
     ) -> None:
         if reading is None:
-            self._foreign += 1
+            self._assembler.foreign += 1
             return
         device = None
         if stamp_ms is not None and not self._clock.dropped:

@@ -7,14 +7,14 @@ import pytest
 from server_samples import message, sensor_entry
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS
 from firmware_bridge.scans.xela_server_scans import ServerScans
 
 FOUND = {
     ServerScans: [message(number, **{str(number): sensor_entry()}) for number in range(MOST_SENSORS)],
-    FrameScans: [CanFrame(can_id, bytes(8)) for can_id in USPA44_MAP.taxels],
+    ScanAssembler: [CanFrame(can_id, bytes(8)) for can_id in USPA44_MAP.taxels],
 }
 
 
@@ -30,7 +30,8 @@ def _threads_by_turns():
 def test_counters_are_asked_for_while_sensors_are_found(stage):
     for _ in range(5):
         scans = stage()
-        feeding = [lambda one=one, feed=scans.feed: feed(one, 1) for one in FOUND[stage]]
+        feed = scans.feed if stage is ServerScans else scans.feed_frame
+        feeding = [lambda one=one, feed=feed: feed(one, 1) for one in FOUND[stage]]
         reader = threading.Thread(target=lambda feeding=feeding: [feed() for feed in feeding])
         reader.start()
         while reader.is_alive():
