@@ -102,7 +102,7 @@ def test_what_is_read_does_not_depend_on_when(pace):
 @pytest.mark.parametrize("patience_s", [0.0, 0.2])
 def test_a_contact_that_waited_gets_all_its_patterns(patience_s):
     """Its scans come together after rest: none is dropped, nor late by its pattern."""
-    rested, scans = threading.Event(), [make_scan(n, noise=3, press_counts=max(0, n - 149) * 1000) for n in range(156)]
+    rested, scans = threading.Event(), [make_scan(n, noise=3, press_counts=(n >= 150) * (3000 + n)) for n in range(156)]
     stamped = [replace(scan, device_ns=scan.time_ns) for scan in scans]
     link = FakeLink([[scan] for scan in stamped[:150]] + [rested, stamped[150:]])
 
