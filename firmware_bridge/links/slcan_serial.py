@@ -21,9 +21,9 @@ from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SerialLine, SourceKind
 from firmware_bridge.links.fd_reader import BurstReader, Piece
-from firmware_bridge.links.holders import in_use
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
+from firmware_bridge.links.usb_devices import in_use
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
