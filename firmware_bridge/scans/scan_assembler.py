@@ -153,7 +153,7 @@ class ScanAssembler:
         complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
-        for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and add a sensor
+        for sensor in self._sensors.values():
             for name, count in sensor.counts.items():
                 totals[name] += count
         return {"foreign": self.foreign, "readings": self._readings} | totals

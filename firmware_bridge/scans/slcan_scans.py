@@ -184,7 +184,7 @@ class SlcanScans:
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
         counters = self.decoder.counters() | self._assembler.counters()
-        for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
+        for frames, _ in self._mixed.begun.values():
             counters["readings"] += len(frames) // STAMPED_BYTES
         return counters
 
