@@ -208,11 +208,7 @@ def _python_can() -> ModuleType:
 
 
 def _check_network(name: str) -> None:
-    """Refuse a network that is missing or down, which socketcan opens without an error.
-
-    Raises:
-        DeviceError: the network is missing or down.
-    """
+    """Refuse a network that is missing or down, which socketcan opens without an error."""
     networks = {network.name: network for network in can_networks()}
     if name not in networks:
         raise DeviceError(

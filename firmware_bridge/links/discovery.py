@@ -25,13 +25,7 @@ _PRETENDED: Final = ("vcan", "vxcan")
 
 
 class CanNetwork(NamedTuple):
-    """One CAN network.
-
-    Attributes:
-        name: name of the network, such as can0.
-        up: True if frames can come.
-        driver: driver of its adapter; None for a network of slcand or vcan, which has no device.
-    """
+    """One CAN network; `driver` is None for a network of slcand or vcan, which has no device."""
 
     name: str
     up: bool
@@ -50,11 +44,7 @@ class CanNetwork(NamedTuple):
 
 
 def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
-    """List the CAN networks of this machine, by name.
-
-    Args:
-        sys_root: folder of sysfs.
-    """
+    """List the CAN networks of this machine, by name."""
     return [
         CanNetwork(
             network.name,
@@ -120,15 +110,7 @@ def serial_devices(
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
     by_path: Path = Path("/dev/serial/by-path"),
 ) -> list[Found]:
-    """Describe the serial ports, in their order.
-
-    Args:
-        ports: ports from `serial_ports`.
-        sys_root: folder of sysfs.
-        proc_root: folder of procfs.
-        may_open: returns True if this user may read and write a path.
-        by_path: folder of links that are named by place.
-    """
+    """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
     for port in ports:
@@ -164,12 +146,7 @@ def serial_devices(
 
 
 def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | None] | None = None) -> list[Found]:
-    """List the CAN interfaces of the kernel, by name.
-
-    Args:
-        sys_root: folder of sysfs.
-        bitrate_hz: returns the bitrate of an interface, in [bit/s], None if not available; by default from `ip`.
-    """
+    """List the CAN interfaces of the kernel, by name; `bitrate_hz` returns the bitrate of one, by default from `ip`."""
     bitrate_hz = bitrate_hz or _bitrate_hz
     found: list[Found] = []
     for network in can_networks(sys_root):

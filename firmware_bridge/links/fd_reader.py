@@ -28,8 +28,6 @@ FULL_BYTES: Final = 255
 """Highest value of VMIN; a scan of sixteen taxels has 352 bytes."""
 MOST_BYTES: Final = 65536
 """Most bytes read at once: as many as a kernel keeps for a serial port."""
-TERMINAL_BYTES: Final = 4095
-"""Bytes of a kernel's terminal that is full, which may be followed by more."""
 KERNEL_BYTES: Final = 64
 """Bytes that the kernel returns a call where VMIN is set, however many there are; fewer only if no more are there."""
 LONGEST_WAIT_S: Final = 0.02
@@ -41,13 +39,7 @@ STEP_S: Final = 0.0003
 
 
 class Piece(NamedTuple):
-    """Bytes received together.
-
-    Attributes:
-        data: the bytes.
-        time_ns: monotonic time at which they were read, in [ns].
-        empty_ns: latest monotonic time before it at which the port was empty, in [ns].
-    """
+    """Bytes received together at `time_ns`, and the latest time before it at which the port was empty, in [ns]."""
 
     data: bytes
     time_ns: int
@@ -68,11 +60,7 @@ class BurstReader:
         *,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Configure the kernel to gather bytes.
-
-        Raises:
-            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
-        """
+        """Configure the kernel to gather bytes; it raises OSError, or termios.error, if the port is gone."""
         self.descriptor = descriptor
         self._clock_s = clock_s
         self._newest_s = self.empty_s = clock_s()
@@ -88,11 +76,7 @@ class BurstReader:
             termios.tcsetattr(self.descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
-        """Return the bytes received, once `wanted_bytes` have come, or no more come.
-
-        Args:
-            timeout_s: longest wait for the first byte, in [s].
-            wanted_bytes: number of bytes until a scan can close.
+        """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
 
         Raises:
             OSError: the port is gone, and all earlier bytes have been returned.
@@ -113,13 +97,7 @@ class BurstReader:
                 return data
 
     def _fetch(self, full: bool, wanted_bytes: int, now_s: float) -> bytes:
-        """Return the bytes there, after waiting for the end of a scan that has begun.
-
-        Args:
-            full: True if FULL_BYTES are waiting, or the port is gone.
-            wanted_bytes: as in `read`.
-            now_s: monotonic, in [s].
-        """
+        """Return the bytes there, after the end of a scan that has begun; `full` if FULL_BYTES are waiting."""
         whole = wanted_bytes >= FULL_BYTES
         early_bytes = wanted_bytes - FULL_BYTES if whole and full else wanted_bytes
         data = self._take(b"", early_bytes)
@@ -144,11 +122,7 @@ class BurstReader:
         return bool(self._poll.poll(1000 * wait_s))
 
     def take_all(self) -> bytes:
-        """Return all bytes there, without waiting for more.
-
-        Raises:
-            OSError: the port is gone, and all earlier bytes have been returned.
-        """
+        """Return all bytes there, without waiting for more; raises as `read` does."""
         now_s = self._clock_s()
         data = self._take(b"", MOST_BYTES)
         if len(data) < MOST_BYTES:
@@ -156,11 +130,7 @@ class BurstReader:
         return data
 
     def look(self) -> None:
-        """Update `empty_s` if no more than the beginning of a scan is waiting.
-
-        Raises:
-            OSError: the port is gone.
-        """
+        """Update `empty_s` if no more than the beginning of a scan is waiting; raises OSError if the port is gone."""
         looked_s = self._clock_s()  # from before the look: this thread may not run for long after it
         waiting = fcntl.ioctl(self.descriptor, termios.FIONREAD, bytes(4)) if fcntl and termios else bytes(4)
         if int.from_bytes(waiting, sys.byteorder) < FULL_BYTES:

@@ -30,7 +30,7 @@ class PoseLane:
         Args:
             poses: of the recording, with times.
             first_ns: time of the first scan of the recording, in [ns].
-            sensors: names of the sensors for which poses of all sensors are meant, where others are played as well.
+            sensors: those for which poses of all sensors are meant, where others are played as well.
         """
         self._poses = poses
         self._first_ns = first_ns
@@ -47,12 +47,7 @@ class PoseLane:
         self._row = int(later.argmax()) if later.any() else len(self._poses)
 
     def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
-        """Yield the next poses that a scan uses.
-
-        Args:
-            due_ns: time of the scan since the first one of the recording, in [ns].
-            start_ns: time of the first scan as it is played, in [ns].
-        """
+        """Yield the next poses that a scan uses, due at `due_ns` [ns] after the first, which is played at `start_ns`."""
         while self._row < len(self._poses) and self._due_ns[self._row] <= due_ns:
             pose = self._poses.at(self._row, start_ns - self._first_ns)
             self._row += 1

@@ -70,13 +70,7 @@ class ScanAssembler:
         return self.feed(reading, time_ns, device)
 
     def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Return the scans that this reading closes.
-
-        Args:
-            reading: reading of one taxel.
-            time_ns: monotonic time of its arrival, in [ns].
-            device: time at which it was on the bus, by the device's time stamps.
-        """
+        """Return the scans that this reading closes; `device` is when it was on the bus, by its time stamp."""
         self._readings += 1
         self._newest_ns = time_ns
         return self._sensor(reading.sensor).feed(reading, time_ns, device)
@@ -91,9 +85,7 @@ class ScanAssembler:
     def longest_cycle_ns(self, cycle: Cycle, arrival_ns: int | None = None) -> int:
         """Return the longest pause, in [ns], in a cycle that may be fed as one; 0: feed its readings one by one.
 
-        Args:
-            cycle: its sensor, and the order of its taxels.
-            arrival_ns: monotonic time of its arrival, in [ns], where it has no time stamps.
+        `arrival_ns` is given for a cycle without time stamps.
         """
         sensor = self._sensors.get(cycle.sensor)
         if sensor is None or not sensor.awaits(cycle):
@@ -105,11 +97,7 @@ class ScanAssembler:
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
         """Return the scan of a cycle that came as one, where `longest_cycle_ns` allows it.
 
-        Args:
-            cycle: its sensor, and the order of its taxels.
-            packed: its frames, as `SlcanDecoder.cut` packs them.
-            time_ns: monotonic time of its arrival, in [ns].
-            device: time at which its last frame was on the bus, by the device's time stamps.
+        Its frames are packed as `SlcanDecoder.cut` does; `device` is when the last of them was on the bus.
         """
         self._readings += len(cycle.taxels)
         self._newest_ns = time_ns

@@ -63,7 +63,7 @@ class MixedCycles:
         """Return whole cycles and single frames, each with the place of its last frame in `packed`, and by that order.
 
         Args:
-            packed: frames of a standard id, as `SlcanDecoder.cut` packs them.
+            packed: frames of a standard id, as `SlcanDecoder.cut` packs them, of `frame_bytes` each.
             frame_bytes: length of each.
             time_ns: monotonic time of their arrival, in [ns].
             waits: True to let begun cycles wait; those that came so far are returned if they do not go on.
