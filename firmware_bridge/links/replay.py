@@ -47,7 +47,7 @@ class PoseLane:
         self._row = int(later.argmax()) if later.any() else len(self._poses)
 
     def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
-        """Yield the next poses that a scan uses, due at `due_ns` [ns] after the first, which is played at `start_ns`."""
+        """Yield the next poses that a scan uses, at `due_ns` [ns] after the first, which is played at `start_ns`."""
         while self._row < len(self._poses) and self._due_ns[self._row] <= due_ns:
             pose = self._poses.at(self._row, start_ns - self._first_ns)
             self._row += 1
