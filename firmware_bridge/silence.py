@@ -39,10 +39,12 @@ SERVER_QUIET_S: Final = 0.75
 # ---- A person, or a program that waits ----
 
 SHOWN_SILENT_S: Final = 1.0
-"""Time without a scan after which the status line and the diagnostics report it: below, they would flicker."""
-SHOWN_AT_REST_S: Final = 0.25
-"""Longest time for which a scan without contact may wait until a person sees it: well below every silence."""
+"""Time without a scan after which the status line and the diagnostics report it, in [s]: below, they would flicker."""
+SHOWN_AT_REST_S: Final = 0.1
+"""Longest time for which the scans of sensors at rest may wait until a person sees them, in [s]: the status line is
+rewritten as seldom."""
 GIVEN_UP_S: Final = 10.0
 """Time without a scan after which zeroing and the doctor give up: a sensor just plugged in has come by then."""
 POLL_S: Final = 0.25
-"""Longest time until a stop, a command or a silent link is noticed: scans at rest come as seldom."""
+"""Longest time until a stop, a command or a silent link is noticed, in [s]: waits for scans are cut in such pieces.
+Scans at rest come more often, so that these waits seldom end before them: each end wakes two threads."""

@@ -21,7 +21,6 @@ from firmware_bridge.poses.pose_track import PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.scans.stillness import STILL_COUNTS
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_TOGETHER: Final = 4
@@ -96,8 +95,6 @@ class Runtime:
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
         self._options = options
-        # Twice what all taxels may change by unseen together, for sensors whose mounting has gains.
-        self._hidden_counts = 2.0 * STILL_COUNTS * geometry.taxel_count
         self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
         # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
@@ -144,12 +141,6 @@ class Runtime:
         Without a sensor it is of every sensor without poses of its own; a pose that holds is one until the next.
         """
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
-
-    def rests(self, result: Result) -> bool:
-        """Return True if no contact can begin while no reading of the sensor changes by more than noise."""
-        counts = result.force_counts
-        seen_counts = self._options.contact_on_counts - self._hidden_counts
-        return result.state == "idle" and counts is not None and counts < seen_counts
 
     def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
         """Forget readings and taps of sensors whose names begin so, after their link broke; zeroing stays.

@@ -12,30 +12,19 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.pace import PaceSetter
 from edge.pipeline.pose_intake import PoseIntake
 from edge.pipeline.pose_queue import PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from firmware_bridge.errors import BridgeError
-from firmware_bridge.links.base import Notice, Pace
+from firmware_bridge.links.base import Notice
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.silence import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
-TOGETHER_SENSORS: Final = 4
-"""Fewest sensors whose scans are read together."""
-READS_A_PERIOD: Final = 4
-"""Reads of many sensors in a period."""
-LONGEST_TOGETHER_S: Final = 0.05
-"""Period from which scans come too seldom to be read together, in [s]."""
-SAME_SHARE: Final = 0.1
-"""Share by which a measured period may change before links are asked for another pace."""
-RESTLESS_NS: Final = 1_000_000_000
-"""Time after a contact, in [ns], during which every scan is still handed on at once."""
-
-
 ALL_HEARD_SCANS: Final = 10
 """Scans of one sensor of a link after which all sensors of that link have sent some."""
 REFUSED_AGAIN_S: Final = 10.0
@@ -94,9 +83,7 @@ class Loop:
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
         self._received: dict[str, int] | None = None
-        self._pace: tuple[Pace, frozenset[str]] | None = None
-        self._patience_s = patience_s
-        self._restless_ns: dict[str, int] = {}
+        self._pace = PaceSetter(patience_s)
         path = None if source.kind == "replay" else source.sensor_file.path
         self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
 
@@ -132,6 +119,8 @@ class Loop:
             if isinstance(one, Scan):
                 for result in self._runtime.take(one, self._latency_clock):
                     self._follow(result)
+                if self._pace.waited(one):
+                    self._make_patterns()
             elif isinstance(one, Notice):
                 self._make_patterns()
                 self._heed(one)
@@ -145,7 +134,7 @@ class Loop:
         self.left = 0
         for event in self._cadences.look():
             self._tell(event)
-        self._set_pace()
+        self._source.pace = self._pace.choose(len(self._cadences), self._cadences.shortest_period_s)
         if not taken:
             self._rest(wait_s)
 
@@ -247,36 +236,14 @@ class Loop:
             self._follow(result)
         return len(results)
 
-    def _watch_rest(self, result: Result) -> None:
-        """Keep which sensors have been near contact of late."""
-        sensor, time_ns = result.scan.sensor, result.scan.time_ns
-        if not self._runtime.rests(result):
-            self._restless_ns[sensor] = time_ns
-        elif time_ns - self._restless_ns.get(sensor, time_ns) > RESTLESS_NS:
-            del self._restless_ns[sensor]
-
-    def _set_pace(self) -> None:
-        """Let the source read late where that costs nothing: many sensors together, and those at rest now and then."""
-        together_s = 0.0
-        if len(self._cadences) >= TOGETHER_SENSORS:
-            period_s = self._cadences.shortest_period_s
-            together_s = period_s / READS_A_PERIOD if period_s < LONGEST_TOGETHER_S else 0.0
-            before_s = 0.0 if self._pace is None else self._pace[0].together_s
-            if abs(together_s - before_s) < SAME_SHARE * together_s:
-                together_s = before_s
-        pace = Pace(together_s, self._patience_s if len(self._cadences) else 0.0), frozenset(self._restless_ns)
-        if pace != self._pace:
-            self._pace = pace
-            self._source.set_pace(*pace)
-
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""
         scan, statistics = result.scan, self.statistics
         back = self._cadences.follow(scan)
         if result.latency_us is not None:
-            statistics.late += self._cadences[scan.sensor].late(result.latency_us)
-        if self._patience_s:
-            self._watch_rest(result)
+            late = self._cadences[scan.sensor].late(result.latency_us)
+            statistics.late += late and not self._pace.waited(scan)
+        self._pace.follow(result)
         statistics.add(result)
         statistics.missed = self._cadences.missed
         if back is not None:

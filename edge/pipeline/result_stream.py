@@ -66,7 +66,7 @@ class Stream:
                 results are made, measured in the time of the recording.
             commands: polled between scans.
             statistics: filled on the way, so that they are available however the stream ends.
-            patience_s: longest time for which results of sensors at rest may wait, in [s]: contact ends that at once.
+            patience_s: longest time for which results may wait while all sensors are at rest, in [s].
             clock_s: monotonic, in [s].
             clock_ns: clock of the scans, in [ns].
 

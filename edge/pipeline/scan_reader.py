@@ -4,7 +4,7 @@ import atexit
 import threading
 import time
 import weakref
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
 from contextlib import ExitStack
 from functools import partial
@@ -12,9 +12,10 @@ from queue import Empty, SimpleQueue
 from typing import Final, Protocol, Self
 
 from edge.errors import SourceTakenError, UsageError
+from edge.pipeline.pace import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.base import Link, Notice, Pace, SourceKind, one_origin
+from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.scan import Scan
@@ -57,6 +58,7 @@ class Source:
         sensor_file: properties of its sensors.
         rate_hz: requested rate of each sensor, in [Hz]; None without.
         overruns: scans discarded.
+        pace: the times of reading its links; any thread may set it.
         thread_ids: system's numbers of the threads that read.
     """
 
@@ -89,6 +91,7 @@ class Source:
         self.rate_hz = rate_hz
         self._force = force
         self.overruns = 0
+        self.pace = Pace()
         self.thread_ids: tuple[int, ...] = ()
         self._links = links
         self._last_ns = 0
@@ -186,12 +189,6 @@ class Source:
         """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
         return next((asked for link in self._links if (asked := link.steer()) is not None), None)
 
-    def set_pace(self, pace: Pace, restless: Collection[str] = ()) -> None:
-        """Allow scans to come late, but none that repeats the one before on a link with a restless sensor."""
-        for link in self._links:
-            still_s = 0.0 if any(name.startswith(link.prefix) for name in restless) else pace.still_s
-            link.set_pace(pace._replace(still_s=still_s))
-
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
         counters = self._links[0].counters()
@@ -277,7 +274,7 @@ class Source:
 
     def _begin_reading(self) -> None:
         if len(self._links) > 1:
-            self.set_pace(Pace(UNASKED_S))
+            self.pace = Pace(UNASKED_S)
         for link in self._links:
             reading, thread = _started("scan-reader", partial(self._follow, link))
             self._threads.append(thread)
@@ -294,13 +291,23 @@ class Source:
         while not (self._stop.is_set() or link.ended):
             scans: Sequence[Scan] = ()
             try:
-                scans = link.read(POLL_S)
+                scans = self._read(link)
             finally:  # its notices come also before its end
                 notices: list[Notice | TimedPose] = [*link.notices()]
                 if link.kind != "device":  # recordings hold poses, and the demo's robot states some
                     notices += link.poses()
                 if notices or scans:
                     self._put(notices, scans)
+
+    def _read(self, link: Link) -> list[Scan]:
+        """Return the next scans of a link, which are read at this source's pace where the link can wait."""
+        pace = self.pace
+        for _ in range(pace.reads if pace.every_s and link.fetches else 0):
+            time.sleep(pace.every_s - time.monotonic() % pace.every_s)  # at the same times for all links
+            link.fetch()
+            if self.pace is not pace:
+                break
+        return link.read(POLL_S)
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")

@@ -9,19 +9,6 @@ from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
-
-class Pace(NamedTuple):
-    """Leave to read scans late, together with others, which costs less than to wake up for each.
-
-    Attributes:
-        together_s: time between two reads, in [s], the same for all links that are read together; 0: as bytes come.
-        still_s: longest time for which scans may wait that repeat the ones before within noise, in [s]; 0: none.
-    """
-
-    together_s: float = 0.0
-    still_s: float = 0.0
-
-
 SourceKind = Literal["device", "replay", "emulated"]
 NoticeKind = Literal["lost", "silent", "back", "trouble", "well", "note"]
 
@@ -70,6 +57,7 @@ class Link(Protocol):
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
         states_poses: True where poses of the sensors come with the scans.
         prefix: beginning of the names of all its sensors.
+        fetches: True if the system keeps for a while what is not read, and `fetch` takes it.
     """
 
     name: str
@@ -83,6 +71,7 @@ class Link(Protocol):
     mountings: Mapping[str, Mounting] = MappingProxyType({})
     states_poses: bool = False
     prefix: str = ""
+    fetches: bool = False
 
     def __enter__(self) -> "Link": ...
 
@@ -96,11 +85,10 @@ class Link(Protocol):
         """
         ...
 
-    def set_pace(self, pace: Pace) -> None:
-        """Allow scans to come late; any thread may call it.
+    def fetch(self) -> None:
+        """Take what the system has received, without waiting; the next `read` makes scans of it.
 
-        The scans of many sensors are then read together, and a sensor that nothing touches is read once a period and
-        decoded a few times a second. A link that cannot do so ignores it.
+        The thread that reads may call it, as often as it likes, where `fetches` is True.
         """
 
     def notices(self) -> list[Notice]:

@@ -15,12 +15,12 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.links.base import Link, SourceKind
-from firmware_bridge.links.can_networks import can_networks, is_pretended
+from firmware_bridge.links.discovery import can_networks, is_pretended
 from firmware_bridge.links.unread import Unread
-from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 SEND_TIMEOUT_S: Final = 1.0
 TICK_NS: Final = 1_000
@@ -81,7 +81,7 @@ class CanBusLink(Link):
         self._channel = channel
         self._triggers = tuple(triggers)
         self._clock_ns = clock_ns
-        self._scans = FrameScans(model)
+        self._scans = ScanAssembler(model)
         self._errors = BusErrors()
         self._unread = Unread()
         self._device_clock = DeviceClock(TICK_NS, None)
@@ -174,7 +174,7 @@ class CanBusLink(Link):
         # By the wall clock or the driver's own clock; zero where there is no stamp.
         stamp_us = round(message.timestamp * 1e6)
         device = self._device_clock.at(stamp_us, time_ns) if stamp_us else None
-        return self._scans.feed(frame, time_ns, device)
+        return self._scans.feed_frame(frame, time_ns, device)
 
     def _open(self) -> Any:
         settings: dict[str, Any] = {} if self._interface in _WITHOUT_BITRATE else {"bitrate": BITRATE_BIT_S}
@@ -208,11 +208,7 @@ def _python_can() -> ModuleType:
 
 
 def _check_network(name: str) -> None:
-    """Refuse a network that is missing or down, which socketcan opens without an error.
-
-    Raises:
-        DeviceError: the network is missing or down.
-    """
+    """Refuse a network that is missing or down, which socketcan opens without an error."""
     networks = {network.name: network for network in can_networks()}
     if name not in networks:
         raise DeviceError(

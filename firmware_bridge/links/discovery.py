@@ -11,12 +11,61 @@ from typing import Final, Literal, NamedTuple
 
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.links.can_networks import SYS_ROOT, can_networks
-from firmware_bridge.links.holders import holders
 from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
+from firmware_bridge.links.usb_devices import holders
 
 _IP_TIMEOUT_S: Final = 2.0
 SLOW_LATENCY_MS: Final = 16
+SYS_ROOT: Final = Path("/sys")
+_CAN_TYPE: Final = "280"
+"""Type of a CAN network in sysfs, ARPHRD_CAN."""
+_UP: Final = 1
+"""Flag of a network that is up, IFF_UP."""
+_PRETENDED: Final = ("vcan", "vxcan")
+
+
+class CanNetwork(NamedTuple):
+    """One CAN network; `driver` is None for a network of slcand or vcan, which has no device."""
+
+    name: str
+    up: bool
+    driver: str | None
+
+    @property
+    def problem(self) -> str | None:
+        """Message that the network is down, with the command that brings it up; None if it is up.
+
+        It sets restart-ms, since the kernel otherwise leaves a controller in bus-off.
+        """
+        if self.up:
+            return None
+        how = f" type can bitrate {BITRATE_BIT_S} restart-ms 100" if self.driver else ""
+        return f"is down: sudo ip link set {self.name} up{how}"
+
+
+def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
+    """List the CAN networks of this machine, by name."""
+    return [
+        CanNetwork(
+            network.name,
+            bool(int(_text(network / "flags") or "0", 16) & _UP),
+            (network / "device/driver").resolve().name if (network / "device/driver").exists() else None,
+        )
+        for network in sorted((sys_root / "class/net").glob("*"))
+        if _text(network / "type") == _CAN_TYPE
+    ]
+
+
+def is_pretended(name: str) -> bool:
+    """Return True if a network of this name has no wire, so that every device on it is emulated."""
+    return name.startswith(_PRETENDED)
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return None
 
 
 class Found(NamedTuple):
@@ -61,15 +110,7 @@ def serial_devices(
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
     by_path: Path = Path("/dev/serial/by-path"),
 ) -> list[Found]:
-    """Describe the serial ports, in their order.
-
-    Args:
-        ports: ports from `serial_ports`.
-        sys_root: folder of sysfs.
-        proc_root: folder of procfs.
-        may_open: returns True if this user may read and write a path.
-        by_path: folder of links that are named by place.
-    """
+    """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
     for port in ports:
@@ -105,12 +146,7 @@ def serial_devices(
 
 
 def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | None] | None = None) -> list[Found]:
-    """List the CAN interfaces of the kernel, by name.
-
-    Args:
-        sys_root: folder of sysfs.
-        bitrate_hz: returns the bitrate of an interface, in [bit/s], None if not available; by default from `ip`.
-    """
+    """List the CAN interfaces of the kernel, by name; `bitrate_hz` returns the bitrate of one, by default from `ip`."""
     bitrate_hz = bitrate_hz or _bitrate_hz
     found: list[Found] = []
     for network in can_networks(sys_root):

@@ -16,7 +16,7 @@ import select
 import sys
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 try:
     import fcntl
@@ -28,8 +28,6 @@ FULL_BYTES: Final = 255
 """Highest value of VMIN; a scan of sixteen taxels has 352 bytes."""
 MOST_BYTES: Final = 65536
 """Most bytes read at once: as many as a kernel keeps for a serial port."""
-TERMINAL_BYTES: Final = 4095
-"""Bytes of a kernel's terminal that is full, which may be followed by more."""
 KERNEL_BYTES: Final = 64
 """Bytes that the kernel returns a call where VMIN is set, however many there are; fewer only if no more are there."""
 LONGEST_WAIT_S: Final = 0.02
@@ -38,6 +36,14 @@ LONGEST_REST_S: Final = 0.004
 """Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
 STEP_S: Final = 0.0003
 """Time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing."""
+
+
+class Piece(NamedTuple):
+    """Bytes received together at `time_ns`, and the latest time before it at which the port was empty, in [ns]."""
+
+    data: bytes
+    time_ns: int
+    empty_ns: int
 
 
 class BurstReader:
@@ -54,29 +60,14 @@ class BurstReader:
         *,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Configure the kernel to gather bytes.
-
-        Raises:
-            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
-        """
+        """Configure the kernel to gather bytes; it raises OSError, or termios.error, if the port is gone."""
         self.descriptor = descriptor
         self._clock_s = clock_s
         self._newest_s = self.empty_s = clock_s()
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
-        self._gathers = False
         self._wake_at(FULL_BYTES)
-
-    def gather(self, on: bool) -> None:
-        """Let the kernel return all bytes with one read, for `take_all`, whose caller waits between reads.
-
-        Raises:
-            OSError: the port is gone. termios.error, which is no OSError, is possible as well.
-        """
-        if on != self._gathers:
-            self._gathers = on
-            self._wake_at(1 if on else FULL_BYTES)
 
     def _wake_at(self, least_bytes: int) -> None:
         if termios is not None:
@@ -85,11 +76,7 @@ class BurstReader:
             termios.tcsetattr(self.descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
-        """Return the bytes received, once `wanted_bytes` have come, or no more come.
-
-        Args:
-            timeout_s: longest wait for the first byte, in [s].
-            wanted_bytes: number of bytes until a scan can close.
+        """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
 
         Raises:
             OSError: the port is gone, and all earlier bytes have been returned.
@@ -110,13 +97,7 @@ class BurstReader:
                 return data
 
     def _fetch(self, full: bool, wanted_bytes: int, now_s: float) -> bytes:
-        """Return the bytes there, after waiting for the end of a scan that has begun.
-
-        Args:
-            full: True if FULL_BYTES are waiting, or the port is gone.
-            wanted_bytes: as in `read`.
-            now_s: monotonic, in [s].
-        """
+        """Return the bytes there, after the end of a scan that has begun; `full` if FULL_BYTES are waiting."""
         whole = wanted_bytes >= FULL_BYTES
         early_bytes = wanted_bytes - FULL_BYTES if whole and full else wanted_bytes
         data = self._take(b"", early_bytes)
@@ -141,28 +122,15 @@ class BurstReader:
         return bool(self._poll.poll(1000 * wait_s))
 
     def take_all(self) -> bytes:
-        """Return all bytes there, without waiting for more; `gather` was called before.
-
-        Raises:
-            OSError: the port is gone, and all earlier bytes have been returned.
-        """
+        """Return all bytes there, without waiting for more; raises as `read` does."""
         now_s = self._clock_s()
-        try:
-            data = os.read(self.descriptor, MOST_BYTES)
-        except BlockingIOError:
-            data = None
-        if data == b"":
-            raise OSError(errno.EIO, "hung up")
-        if data is None or len(data) < TERMINAL_BYTES:
+        data = self._take(b"", MOST_BYTES)
+        if len(data) < MOST_BYTES:
             self.empty_s = now_s
-        return data or b""
+        return data
 
     def look(self) -> None:
-        """Update `empty_s` if no more than the beginning of a scan is waiting.
-
-        Raises:
-            OSError: the port is gone.
-        """
+        """Update `empty_s` if no more than the beginning of a scan is waiting; raises OSError if the port is gone."""
         looked_s = self._clock_s()  # from before the look: this thread may not run for long after it
         waiting = fcntl.ioctl(self.descriptor, termios.FIONREAD, bytes(4)) if fcntl and termios else bytes(4)
         if int.from_bytes(waiting, sys.byteorder) < FULL_BYTES:

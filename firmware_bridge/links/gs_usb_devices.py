@@ -10,7 +10,7 @@ import usb.util
 from usb.backend import IBackend
 
 from firmware_bridge.errors import DeviceError, NoDeviceError
-from firmware_bridge.links.recognition import Recognised
+from firmware_bridge.links.usb_devices import Recognised
 
 GS_USB_IDS: Final = {
     (0x1D50, 0x606F): "candleLight",  # and most of its kin, CANable among them

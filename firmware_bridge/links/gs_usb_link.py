@@ -18,9 +18,8 @@ from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
-from firmware_bridge.links.holders import holders
-from firmware_bridge.links.recognition import Recognised
 from firmware_bridge.links.unread import Unread
+from firmware_bridge.links.usb_devices import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Final, TypeVar
 
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, Pace, SerialLine
+from firmware_bridge.links.base import Link, Notice, NoticeKind, SerialLine
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.scans.mounting import Mounting
@@ -65,6 +65,7 @@ class LastingLink(Link):
         self.unix_offset_ns = link.unix_offset_ns
         self.origin = link.origin
         self.states_poses = link.states_poses
+        self.fetches = link.fetches
         self.prefix = f"{name}/" if name else ""
         self.mountings = {f"{self.prefix}{sensor}": one for sensor, one in link.mountings.items()}
         self._told_as = f"{name}: " if name else ""
@@ -135,9 +136,10 @@ class LastingLink(Link):
             self._suspect()
         return scans
 
-    def set_pace(self, pace: Pace) -> None:
-        """Pass on how late scans may come."""
-        self._link.set_pace(pace)
+    def fetch(self) -> None:
+        """Take what the system has received of a link that is open."""
+        if self._open:
+            self._link.fetch()
 
     def notices(self) -> list[Notice]:
         """Return the events of the link since the last call, with the user's name for it."""

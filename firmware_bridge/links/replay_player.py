@@ -112,12 +112,7 @@ class PlayedReplay(ReplayLink):
         *,
         clock: Clock = time.monotonic_ns,
     ) -> None:
-        """Load the recordings; the arguments are those of ReplayLink.
-
-        Raises:
-            RecordingError: a file cannot be used.
-            SourceError: as ReplayLink.
-        """
+        """Load the recordings; arguments and errors are those of ReplayLink."""
         super().__init__(paths, rate_hz, paced=True, clock=clock)
         self.patient = True
         self.unix_offset_ns = self.recordings[0].unix_offset_ns

@@ -19,12 +19,11 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Pace, SerialLine, SourceKind
-from firmware_bridge.links.fd_reader import BurstReader
-from firmware_bridge.links.holders import in_use
-from firmware_bridge.links.paced_reader import PacedReader, Piece
+from firmware_bridge.links.base import Link, SerialLine, SourceKind
+from firmware_bridge.links.fd_reader import BurstReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.unread import Unread
+from firmware_bridge.links.usb_devices import in_use
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -110,7 +109,8 @@ class SlcanSerialLink(Link):
         self._unread = Unread()
         self._serial: serial.Serial | None = None
         self._bursts: BurstReader | None = None
-        self._paced = PacedReader(self._scans)
+        self.fetches = True
+        self._fetched: list[Piece] = []
 
     def __enter__(self) -> Self:
         self._begin_anew()
@@ -128,7 +128,7 @@ class SlcanSerialLink(Link):
         port, self._serial, self._bursts = self._serial, None, None
         if port is None:
             return
-        self._dropped_bytes += self._paced.reset()
+        self._drop_fetched()
         with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
             _wait_until_sent(port)
             for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
@@ -149,19 +149,15 @@ class SlcanSerialLink(Link):
         if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
         try:
-            self._bursts.gather(self._paced.due_s is not None)
-            pieces = self._receive(self._bursts, timeout_s)
+            pieces = self._take_fetched() or [self._receive(self._bursts, timeout_s)]
         except _PORT_ERRORS as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
-        if not pieces:
-            return []
         scans: list[Scan] = []
         for data, time_ns, self._unread.empty_ns in pieces:
             with self._counting:
                 self._received_bytes += len(data)
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock_begun_ns)
-        self._paced.follow(pieces[-1].data, scans)
         if self._questions.due(len(scans), self._scans.decoder.refusals, pieces[-1].time_ns):
             _ask(self._serial, STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
@@ -175,19 +171,29 @@ class SlcanSerialLink(Link):
             self._open_anew(self._serial, STAMPS_ON)
         return scans
 
-    def _receive(self, bursts: BurstReader, timeout_s: float) -> list[Piece]:
-        """Return the bytes to decode; an empty list while scans may wait."""
-        if self._paced.due_s is not None:
-            return self._paced.read(bursts, timeout_s)
+    def fetch(self) -> None:
+        """Take the bytes there, without waiting for more."""
+        if self._bursts is None:
+            return
+        with suppress(*_PORT_ERRORS):  # the next read reports it
+            data = self._bursts.take_all()
+            if data:
+                self._fetched.append(Piece(data, time.monotonic_ns(), round(self._bursts.empty_s * 1e9)))
+
+    def _take_fetched(self) -> list[Piece]:
+        pieces, self._fetched = self._fetched, []
+        return pieces
+
+    def _drop_fetched(self) -> None:
+        self._dropped_bytes += sum(len(piece.data) for piece in self._take_fetched())
+
+    def _receive(self, bursts: BurstReader, timeout_s: float) -> Piece:
+        """Return the bytes to decode, as soon as a scan may close."""
         data = bursts.read(timeout_s, self._scans.bytes_until_scan())
         empty_ns = round(bursts.empty_s * 1e9)
         with suppress(OSError):  # the next call reports an error after bytes
             bursts.look()
-        return [Piece(data, time.monotonic_ns(), empty_ns)]
-
-    def set_pace(self, pace: Pace) -> None:
-        """Set how late scans may come."""
-        self._paced.pace = pace
+        return Piece(data, time.monotonic_ns(), empty_ns)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
@@ -262,7 +268,7 @@ class SlcanSerialLink(Link):
     def _begin_anew(self) -> None:
         with self._counting:
             self._scans.begin_anew()
-            self._dropped_bytes += self._paced.reset()
+            self._drop_fetched()
 
     def _drop_old_bytes(self, port: serial.Serial) -> None:
         """Drop and count the bytes that arrive before the line falls silent."""

@@ -31,13 +31,9 @@ class Unread:
             self.empty_ns = begun_ns
 
     def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:
-        """Return the scans, each with the longest time it may have waited, if that is long.
+        """Return the scans read at `time_ns` [ns], each with the longest time it may have waited, if that is long.
 
-        Args:
-            scans: scans read at `time_ns`.
-            time_ns: monotonic time, in [ns].
-            clock_begun_ns: `begun_ns` of the `DeviceClock`. A clock that was set by data that may have waited has no
-                reliable times, so they are left out.
+        A clock that was set, at `clock_begun_ns`, by data that may have waited has no reliable times: it gives none.
         """
         if self.empty_ns is not None and time_ns - self.empty_ns > LONG_UNREAD_NS:
             self._stall_ns = self.empty_ns, time_ns

@@ -153,7 +153,7 @@ class XelaServerLink(Link):
                 return scans
             raise LinkLostError(f"{self.url}: link lost: {_ending(error)}") from error
         self.trouble = self._scans.trouble
-        if self._scans.foreign and not self._scans.any_sensor:
+        if not self._scans.usable:
             raise DeviceError(f"{self.url}: no sensor that can be used: {self.trouble}")
         return scans
 

@@ -4,10 +4,10 @@ from typing import Final
 
 from firmware_bridge.can.bus_errors import BusErrors
 from firmware_bridge.can.gs_usb import GsUsbDecoder
-from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 TICK_NS: Final = 1_000
 WRAP_TICKS: Final = 1 << 32
@@ -18,7 +18,7 @@ class GsUsbScans:
     """Stages from bytes to scans, over any number of starts of the adapter."""
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self._scans = FrameScans(model)
+        self._scans = ScanAssembler(model)
         self._errors = BusErrors()
         self._decoder_counts: dict[str, int] = {}
         self._start_decoder(GsUsbDecoder(stamped=False))
@@ -45,7 +45,7 @@ class GsUsbScans:
             self._errors.frame_heard()
             stamp_us = host_frame.stamp_us
             device = None if stamp_us is None else self._clock.at(stamp_us, time_ns)
-            scans += self._scans.feed(host_frame.frame, time_ns, device)
+            scans += self._scans.feed_frame(host_frame.frame, time_ns, device)
         return scans
 
     @property

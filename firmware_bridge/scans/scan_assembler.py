@@ -15,8 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.scans.can_id_maps import Cycle, ModelMap, Reading
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, SHORTEST_PAUSE_NS, WireCycle
@@ -42,9 +43,15 @@ class ScanAssembler:
     flip in ids must not create a sensor. (Half, because the wrong id map shows half of the taxels.)
 
     Memory: one open scan per sensor name; a ModelMap has at most 16 names.
+
+    Attributes:
+        can_ids: the standard CAN ids received so far, of any device.
+        foreign: number of frames that are of no taxel of this model.
     """
 
-    def __init__(self, model: ModelMap) -> None:
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        self.can_ids: set[int] = set()
+        self.foreign = 0
         self._model = model
         self._geometry = model.geometry
         self._taxels = model.geometry.taxel_count
@@ -52,14 +59,18 @@ class ScanAssembler:
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
 
-    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Return the scans that this reading closes.
+    def feed_frame(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+        """Return the scans that a frame closes, whatever it holds; otherwise as `feed`."""
+        if not frame.extended:  # bounded: there are at most 2048 of these
+            self.can_ids.add(frame.can_id)
+        reading = decode(frame, self._model)
+        if reading is None:
+            self.foreign += 1
+            return []
+        return self.feed(reading, time_ns, device)
 
-        Args:
-            reading: reading of one taxel.
-            time_ns: monotonic time of its arrival, in [ns].
-            device: time at which it was on the bus, by the device's time stamps.
-        """
+    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+        """Return the scans that this reading closes; `device` is when it was on the bus, by its time stamp."""
         self._readings += 1
         self._newest_ns = time_ns
         return self._sensor(reading.sensor).feed(reading, time_ns, device)
@@ -74,9 +85,7 @@ class ScanAssembler:
     def longest_cycle_ns(self, cycle: Cycle, arrival_ns: int | None = None) -> int:
         """Return the longest pause, in [ns], in a cycle that may be fed as one; 0: feed its readings one by one.
 
-        Args:
-            cycle: its sensor, and the order of its taxels.
-            arrival_ns: monotonic time of its arrival, in [ns], where it has no time stamps.
+        `arrival_ns` is given for a cycle without time stamps.
         """
         sensor = self._sensors.get(cycle.sensor)
         if sensor is None or not sensor.awaits(cycle):
@@ -88,11 +97,7 @@ class ScanAssembler:
     def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
         """Return the scan of a cycle that came as one, where `longest_cycle_ns` allows it.
 
-        Args:
-            cycle: its sensor, and the order of its taxels.
-            packed: its frames, as `SlcanDecoder.cut` packs them.
-            time_ns: monotonic time of its arrival, in [ns].
-            device: time at which its last frame was on the bus, by the device's time stamps.
+        Its frames are packed as `SlcanDecoder.cut` does; `device` is when the last of them was on the bus.
         """
         self._readings += len(cycle.taxels)
         self._newest_ns = time_ns
@@ -127,30 +132,19 @@ class ScanAssembler:
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
         return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
 
-    @property
-    def period_s(self) -> float | None:
-        """Shortest period of a sensor that exists, in [s]; None until one is measured."""
-        periods_ns = [sensor.wire.period_ns for sensor in self._sensors.values() if sensor.confirmed]
-        known_ns = [period_ns for period_ns in periods_ns if period_ns is not None]
-        return min(known_ns) / 1e9 if known_ns else None
-
     def counters(self) -> dict[str, int]:
         """Return the counters, summed over all sensors.
 
-        readings; duplicates: the same frame twice in a row; unconfirmed: readings of sensors that do not exist (yet);
-        abandoned: of scans that a broken link left open; resynchronised: left out, since the beginning or end of their
-        cycle was uncertain; scans; torn_wire: taxels missing; torn_source: complete, but only partly renewed; repeated:
-        nothing renewed; missing_taxels.
+        foreign: frames of no taxel; readings; duplicates: the same frame twice in a row; unconfirmed: readings of
+        sensors that do not exist (yet); abandoned: of scans that a broken link left open; resynchronised: left out,
+        since the beginning or end of their cycle was uncertain; scans; torn_wire: taxels missing; torn_source:
+        complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
         totals = dict.fromkeys(_COUNTED, 0)
-        for sensor in list(self._sensors.values()):  # another thread may read the link meanwhile, and add a sensor
+        for sensor in self._sensors.values():
             for name, count in sensor.counts.items():
                 totals[name] += count
-        return {"readings": self._readings} | totals
-
-    def sensor_counters(self) -> dict[str, dict[str, int]]:
-        """Return the same counters for each sensor that exists, by name."""
-        return {name: sensor.counts.copy() for name, sensor in list(self._sensors.items()) if sensor.confirmed}
+        return {"foreign": self.foreign, "readings": self._readings} | totals
 
 
 class _Sensor:

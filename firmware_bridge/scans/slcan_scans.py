@@ -1,7 +1,10 @@
 """Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
 from itertools import pairwise, starmap
+from operator import itemgetter
 from typing import Final
+
+import numpy as np
 
 from firmware_bridge.can.slcan import (
     LAST_TIMESTAMP_MS,
@@ -13,10 +16,8 @@ from firmware_bridge.can.slcan import (
 )
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode, decode_packed
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
-from firmware_bridge.scans.mixed_cycles import BEFORE, MixedCycles
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
-from firmware_bridge.scans.stillness import Stillness
 from firmware_bridge.silence import SCAN_GIVEN_UP_NS
 
 _MOST_ORDERS: Final = 1024
@@ -25,6 +26,83 @@ _MIXED_NS: Final = SCAN_GIVEN_UP_NS
 """Longest time for which frames wait while others are fed, in [ns]."""
 _JOINED_NS: Final = 5_000_000
 """Time before its stamp, in [ns], at which no frame can arrive: the error of stamps and of their offset."""
+
+FOREIGN: Final = 255
+"""Number of no sensor."""
+BEFORE: Final = -1
+"""Place of frames that came before the present ones."""
+_IDS: Final = 1 << 11
+_TWO_BYTES: Final = np.dtype(">u2")
+"""The first two of a frame: its id, and 4 bits of its length."""
+
+
+class MixedCycles:
+    """Frames of begun cycles, by sensor; the numbers of sensors are those of `names`.
+
+    A whole cycle is decoded at a fifth of the cost of its frames one by one, but on a bus with four sensors frames mix,
+    and a read ends within a cycle. So the frames of a cycle that has begun well wait for its end. Only time stamps show
+    afterwards that there was no pause in it, so without stamps nothing waits.
+
+    Attributes:
+        names: names of all sensors of the model.
+        begun: the frames that wait, and the time at which the first of them arrived, in [ns], by number of the sensor.
+    """
+
+    def __init__(self, model: ModelMap) -> None:
+        """Begin without a frame; cycles are expected in the order of the model's ids."""
+        self.names = sorted({sensor for sensor, _ in model.taxels.values()})
+        self.begun: dict[int, tuple[bytes, int]] = {}
+        self._sensors = np.full(_IDS, FOREIGN, dtype=np.uint8)
+        self._places = np.zeros(_IDS, dtype=np.uint8)
+        self._order = bytes(range(model.geometry.taxel_count))
+        for number, name in enumerate(self.names):
+            for place, (can_id, _) in enumerate(model.wire_order(name)):
+                self._sensors[can_id], self._places[can_id] = number, place
+
+    def part(self, packed: bytes, frame_bytes: int, time_ns: int, *, waits: bool) -> list[tuple[int, bytes]]:
+        """Return whole cycles and single frames, each with the place of its last frame in `packed`, and by that order.
+
+        Args:
+            packed: frames of a standard id, as `SlcanDecoder.cut` packs them, of `frame_bytes` each.
+            frame_bytes: length of each.
+            time_ns: monotonic time of their arrival, in [ns].
+            waits: True to let begun cycles wait; those that came so far are returned if they do not go on.
+        """
+        ids = np.frombuffer(packed, dtype=_TWO_BYTES)[:: frame_bytes // 2] >> 4
+        sensors = self._sensors[ids]
+        # Sorted once: to look for the frames of each sensor takes as long for every sensor as this for all.
+        by_sensor = sensors.argsort(kind="stable")
+        frames = np.frombuffer(packed, dtype=f"V{frame_bytes}")[by_sensor].tobytes()
+        all_places, all_at = self._places[ids[by_sensor]].tobytes(), by_sensor.tolist()
+        numbers = sensors[by_sensor].tobytes()
+        parted: list[tuple[int, bytes]] = []
+        end = 0
+        while end < len(numbers):
+            first, number = end, numbers[end]
+            end += numbers.count(number)
+            text, order, at = frames[first * frame_bytes : end * frame_bytes], all_places[first:end], all_at[first:end]
+            begun, since_ns = self.begun.pop(number, (b"", time_ns))
+            if begun:
+                count = len(begun) // frame_bytes
+                text, order, at = begun + text, self._order[:count] + order, [BEFORE] * count + at
+            start = 0
+            while (found := order.find(self._order, start)) >= 0 and number != FOREIGN:
+                parted += _singly(text, frame_bytes, at, start, found)
+                start = found + len(self._order)
+                parted.append((at[start - 1], text[found * frame_bytes : start * frame_bytes]))
+                since_ns = time_ns
+            last = order.rfind(b"\0", start) if waits and number != FOREIGN else -1
+            if last >= 0 and self._order.startswith(order[last:]):
+                self.begun[number] = text[last * frame_bytes :], time_ns if last > start else since_ns
+            else:
+                last = len(order)
+            parted += _singly(text, frame_bytes, at, start, last)
+        parted.sort(key=itemgetter(0))
+        return parted
+
+
+def _singly(text: bytes, frame_bytes: int, at: list[int], start: int, end: int) -> list[tuple[int, bytes]]:
+    return [(at[frame], text[frame * frame_bytes : (frame + 1) * frame_bytes]) for frame in range(start, end)]
 
 
 class SlcanScans:
@@ -45,9 +123,8 @@ class SlcanScans:
         self._mixed = MixedCycles(model)
         self.decoder = SlcanDecoder()
         self._assembler = ScanAssembler(model)
-        self._stillness = Stillness()
-        self._foreign = self._fed_ns = 0
-        self.can_ids: set[int] = set()
+        self.can_ids = self._assembler.can_ids
+        self._fed_ns = 0
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns]."""
@@ -59,7 +136,7 @@ class SlcanScans:
         for piece in self.decoder.cut(data):
             if head_ns < time_ns:
                 if isinstance(piece, PackedFrames) and self._is_joined(piece, head_ns):
-                    self._foreign += 1
+                    self._assembler.foreign += 1
                     piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
                 head_ns = time_ns
             if isinstance(piece, CanFrame):
@@ -104,43 +181,19 @@ class SlcanScans:
             missing = min(missing, self._taxels - len(frames) // STAMPED_BYTES)
         return max(1, missing * self.decoder.usual_line_bytes - self.decoder.pending_bytes)
 
-    @property
-    def period_s(self) -> float | None:
-        """Shortest time between two scans of a sensor, in [s]; None until it is measured."""
-        return self._assembler.period_s
-
-    def level(self, data: bytes) -> None:
-        """Take the readings in `data`, read last, as the ones that `still` compares with."""
-        self._stillness.learn(data, self.decoder.usual_line_bytes)
-
-    def still(self, data: bytes) -> bool:
-        """Return True if `data`, which follows that of `level` or `still`, repeats its readings within noise."""
-        return self._stillness.holds(data, self.decoder.usual_line_bytes)
-
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages; foreign: frames of no taxel of this model, or joined of two."""
-        counters = self.decoder.counters() | {"foreign": self._foreign} | self._assembler.counters()
-        for frames, _ in list(self._mixed.begun.values()):  # another thread may read the link meanwhile
+        counters = self.decoder.counters() | self._assembler.counters()
+        for frames, _ in self._mixed.begun.values():
             counters["readings"] += len(frames) // STAMPED_BYTES
         return counters
 
     def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
-        """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
-        start, cycle_bytes = 0, self._taxels * frame_bytes
-        stamped = frame_bytes == STAMPED_BYTES
-        waits = stamped and not self._clock.dropped
+        """Feed a run of usual frames, parted into the whole cycles of their sensors and single frames."""
+        waits = frame_bytes == STAMPED_BYTES and not self._clock.dropped
         if not waits:
             self._give_up_begun(time_ns, scans)
-        mixed = bool(self._mixed.begun)
-        while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
-            scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
-            if scan is None:
-                break
-            scans.append(scan)
-            start += cycle_bytes
-        if start == len(packed):
-            return
-        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=waits):
+        for place, frames in self._mixed.part(packed, frame_bytes, time_ns, waits=waits):
             if len(frames) > frame_bytes:
                 scan = self._feed_cycle(frames, frame_bytes, time_ns)
                 if scan is not None:
@@ -174,17 +227,11 @@ class SlcanScans:
                     self._clock.follow_order((stamp_ms - before_ms) * _MS_NS)
             self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
 
-    def _one_sensor(self, packed: bytes, start: int, frame_bytes: int) -> bool:
-        """Return whether two frames in a row are of one sensor; where scans of several mix, no cycle begins."""
-        taxels = self._model.taxels
-        first, second = (taxels.get(packed[at] << 4 | packed[at + 1] >> 4) for at in (start, start + frame_bytes))
-        return first is not None and second is not None and first[0] == second[0]
-
     def _feed_reading(
         self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan], *, late: bool = False
     ) -> None:
         if reading is None:
-            self._foreign += 1
+            self._assembler.foreign += 1
             return
         device = None
         if stamp_ms is not None and not self._clock.dropped:

@@ -79,10 +79,10 @@ class WireCycle:
         self._ended_ns, self._late, self._newest_order = None, 0, ()
 
     def goes_on(self, newest: int, place: int, *, came: bool, paused: bool, paced: bool) -> bool:
-        """Return True if a reading belongs to the open cycle.
+        """Return True if a reading at a place belongs to the open cycle, whose furthest place so far is `newest`.
 
         Args:
-            newest: the furthest place in the cycle so far.
+            newest: the furthest place so far.
             place: place of the reading.
             came: True if the cycle has a reading of this taxel already.
             paused: True if a pause came before the reading.

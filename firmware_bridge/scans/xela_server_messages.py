@@ -188,33 +188,36 @@ class ServerDecoder:
         return of_integer if of_data is None else of_data
 
     def _ups_hz(self, content: object) -> tuple[float, ...] | None:
-        ups_hz = _numbers(content, self._geometry.taxel_count)
-        if ups_hz is None or not 0 <= min(ups_hz) <= max(ups_hz) <= HIGHEST_UPS_HZ:
-            self._counted["bad_ups"] += content is not None
-            return None
-        return tuple(ups_hz)
+        ups_hz = self._in_range(content, self._geometry.taxel_count, (0, HIGHEST_UPS_HZ), "bad_ups")
+        return None if ups_hz is None else tuple(ups_hz)
 
     def _newtons(self, content: object) -> NDArray[np.float32] | None:
-        newtons = _numbers(content, 3 * self._geometry.taxel_count)
-        if newtons is None or max(max(newtons), -min(newtons)) > HIGHEST_NEWTONS:
-            self._counted["bad_calibrated"] += content is not None
+        size, range_n = 3 * self._geometry.taxel_count, (-HIGHEST_NEWTONS, HIGHEST_NEWTONS)
+        newtons = self._in_range(content, size, range_n, "bad_calibrated")
+        if newtons is None:
             return None
         by_axis = np.array(newtons, dtype=np.float32).reshape(-1, 3).T
         return np.ascontiguousarray(by_axis).reshape(self._geometry.scan_shape)
 
     def _temperature_k(self, content: object) -> NDArray[np.float32] | None:
-        kelvin = _numbers(content, self._geometry.taxel_count)
-        if kelvin is None:
-            self._counted["bad_temperature"] += content is not None
+        kelvin = self._in_range(content, self._geometry.taxel_count, (0, KELVIN[1]), "bad_temperature")
+        if kelvin is None or not any(kelvin):  # zeros: the sensor has no thermometer
             return None
-        measured = [one for one in kelvin if one]
-        if not measured:  # zeros: the sensor has no thermometer
-            return None
-        if not KELVIN[0] <= min(measured) <= max(measured) <= KELVIN[1]:
+        if min(one for one in kelvin if one) < KELVIN[0]:
             self._counted["bad_temperature"] += 1
             return None
         known = np.array([one or math.nan for one in kelvin], dtype=np.float32)
         return known.reshape(self._geometry.rows, self._geometry.cols)
+
+    def _in_range(
+        self, content: object, size: int, ends: tuple[float, float], counted_as: str
+    ) -> Sequence[float] | None:
+        """Return a list of `size` numbers in a range; None, and count it, if it is another thing than None."""
+        numbers = _numbers(content, size)
+        if numbers is not None and ends[0] <= min(numbers) <= max(numbers) <= ends[1]:
+            return numbers
+        self._counted[counted_as] += content is not None
+        return None
 
     def _time_s(self, content: object) -> float | None:
         if isinstance(content, bool) or not isinstance(content, (int, float)) or not 0 < content < LATEST_S:

@@ -73,11 +73,6 @@ class ServerScans:
         self.begin()
 
     @property
-    def foreign(self) -> dict[str, str]:
-        """Descriptions by the server of sensors that cannot be used, by name."""
-        return self._decoder.foreign
-
-    @property
     def trouble(self) -> str | None:
         """Trouble of the server and its sensors to report to the user, None if there is none."""
         wanted = f"expected {self._geometry.taxel_count}"
@@ -90,9 +85,9 @@ class ServerScans:
         return "; ".join(notes) or None
 
     @property
-    def any_sensor(self) -> bool:
-        """True if a sensor that can be used has sent a reading."""
-        return bool(self._sensors)
+    def usable(self) -> bool:
+        """False if the server has sensors, and none of them can be used."""
+        return bool(self._sensors) or not self._decoder.foreign
 
     def begin(self) -> None:
         """Begin again with the server, as after a connection: its count, its clock and its readings are new."""
@@ -143,7 +138,7 @@ class ServerScans:
         and as for every link scans, torn_wire, torn_source, repeated and missing_taxels.
         """
         totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
-        for sensor in list(self._sensors.values()):
+        for sensor in self._sensors.values():
             for name, count in sensor.counted.items():
                 totals[name] += count
         return self._decoder.counters() | self._counted | totals

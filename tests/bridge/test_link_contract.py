@@ -9,10 +9,10 @@ from gs_usb_samples import frames_of
 from link_rigs import DemoRig, GsUsbRig, PythonCanRig, ReplayRig, ServerRig, SlcanRig
 
 from edge.errors import UsageError
+from edge.pipeline.pace import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Pace
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -87,7 +87,7 @@ def test_it_is_closed_while_another_thread_waits_for_it(rig):
     link = rig.link()
     source = Source(link)
     with source:
-        source.set_pace(Pace(together_s=0.003, still_s=0.1))
+        source.pace = Pace(0.003, 20)
         readers = threading.active_count()
     assert threading.active_count() < readers
     source.close()

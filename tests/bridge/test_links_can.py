@@ -16,8 +16,7 @@ from link_rigs import PulledBus, message_of
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink
-from firmware_bridge.links.can_networks import can_networks
-from firmware_bridge.links.discovery import can_interfaces
+from firmware_bridge.links.discovery import can_interfaces, can_networks
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.scans.can_id_maps import trigger_frame
 

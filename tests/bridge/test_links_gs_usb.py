@@ -7,8 +7,6 @@ from functools import partial
 import can
 import pytest
 import usb.core
-from gs_usb.gs_usb import GsUsb
-from gs_usb.gs_usb_frame import GsUsbFrame
 from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from gs_usb_emulator import ACCESS, IO, PIPE, TIMEOUT, GsUsbBackend, GsUsbPort, libusb_error
 from gs_usb_samples import frames_of, opened
@@ -316,19 +314,6 @@ def public_port(monkeypatch):
     backend = GsUsbBackend()
     monkeypatch.setattr(libusb1, "get_backend", lambda **_: backend)
     return backend.ports[0]
-
-
-def test_the_public_package_never_sees_the_unplugging(public_port):
-    (device,) = GsUsb.scan()
-    assert device.serial_number == public_port.serial_number and device.device_info.icount == 0
-    assert device.set_bitrate(1_000_000)
-    device.start()
-    public_port.adapter.hear(CanFrame(0x334, b"abcdefgh"), stamp_us=77)
-    frame = GsUsbFrame()
-    assert device.read(frame, 100)
-    assert (frame.can_id, bytes(frame.data), frame.timestamp_us) == (0x334, b"abcdefgh", 77)
-    public_port.adapter.unplug()
-    assert device.read(frame, 100) is False
 
 
 def test_python_can_reads_it(public_port):

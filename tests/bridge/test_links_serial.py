@@ -253,19 +253,6 @@ def test_a_device_that_takes_nothing_holds_up_nobody(monkeypatch):
         serial.Serial(device.port, exclusive=True).close()  # the port is free again
 
 
-@pytest.mark.parametrize("unsent", [0, 5])
-def test_commands_are_thrown_away_only_if_they_are_not_taken(monkeypatch, unsent):
-    """Throwing them away always would throw away the closing as well."""
-    thrown = []
-    with SilentDevice() as device:
-        with SlcanSerialLink(device.port):
-            monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.02)
-            # A pseudo-terminal never reports unsent bytes.
-            monkeypatch.setattr(serial.Serial, "out_waiting", unsent)
-            monkeypatch.setattr(serial.Serial, "reset_output_buffer", lambda port: thrown.append(port))
-        assert bool(thrown) == bool(unsent)
-
-
 def test_a_stream_that_will_not_stop_holds_up_no_opening(monkeypatch):
     monkeypatch.setattr(slcan_serial, "LONGEST_SETTLE_S", 0.1)
     stop = threading.Event()

@@ -15,7 +15,7 @@ from server_samples import looping, lose, read_notices
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection
 from xela_server_emulator import ServerEmulator
-from xela_server_model import GARBAGE, VERSIONS, VendorServer
+from xela_server_model import VERSIONS, VendorServer
 
 from edge.cli import main as cli
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
@@ -40,16 +40,6 @@ def test_every_scan_comes_once_and_in_order(version):
         assert has_temperature == [version == "1.8.0"] * 30
     counters = {name: count for name, count in link.counters().items() if count and name != "received_bytes"}
     assert counters == {"messages": 31, "welcomes": 1, "scans": 60}
-
-
-def test_garbage_costs_itself_alone():
-    recording = make_recording(40)
-    with ServerEmulator(VendorServer([recording]), garbage_every=2) as server, XelaServerLink(server.url) as link:
-        scans = read_until_lost(link)
-        counters = link.counters()
-    assert (stacked(scans, "1") == recording.tracks[0].counts).all()
-    assert counters["bad_json"] >= 5 and counters["bad_sequence"] >= 2 and counters["duplicate_keys"] >= 1
-    assert counters["messages"] == 1 + 40 + 20 and len(GARBAGE) <= 20
 
 
 def test_a_client_that_does_not_read_is_told_what_is_old():
@@ -79,20 +69,6 @@ def test_a_server_with_none_that_fits_is_an_error_not_silence():
     ):
         read_scans(link, 1)
     assert not isinstance(refused.value, LinkLostError)  # another try would not help
-
-
-def test_taxels_that_fall_silent_are_absent():
-    vendor = looping()
-    with ServerEmulator(vendor) as server, XelaServerLink(server.url) as link:
-        read_scans(link, 3)
-        vendor.silent = frozenset({2, 3})
-        wait_for(lambda: any(not scan.complete for scan in link.read(0.05)))
-        assert all(np.flatnonzero(~scan.fresh).tolist() == [2, 3] for scan in read_scans(link, 5))
-        vendor.silent = frozenset(range(16))
-        wait_for(lambda: not link.read(0.05) and link.trouble)
-        assert link.trouble == "nothing arrives from sensor 1: check its cable and its power"
-        vendor.silent = frozenset()
-        wait_for(lambda: any(scan.whole for scan in link.read(0.05)))
 
 
 def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):

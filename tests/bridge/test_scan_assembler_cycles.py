@@ -74,7 +74,7 @@ def test_the_period_is_measured_by_stamps_if_there_are_any(first, stamped, pause
     first(assembler, readings(1) if first is feed else 1, 10 * MS, stamped=stamped)
     assert assembler.longest_cycle_ns(WHOLE) == SHORTEST_PAUSE_NS
     feed_cycle(assembler, 2, 110 * MS, stamped=stamped)
-    assert assembler.longest_cycle_ns(WHOLE) == pause_ns and assembler.period_s == 2 * pause_ns / 1e9
+    assert assembler.longest_cycle_ns(WHOLE) == pause_ns
 
 
 def test_the_period_is_half_known_by_half_a_scan():
@@ -138,9 +138,8 @@ def test_a_cycle_takes_doubts_of_the_order_away():
 def test_a_cycle_shows_its_sensor_and_where_the_next_begins():
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, readings(0)[5:])
-    assert assembler.sensor_counters() == {} and counters(assembler) == {"readings": 11, "resynchronised": 11}
+    assert counters(assembler) == {"readings": 11, "resynchronised": 11}
     feed_cycle(assembler, 1)
-    assert assembler.sensor_counters().keys() == {"4"}
     assembler.begin_anew()
     feed_cycle(assembler, 2)
     (torn,) = feed(assembler, readings(3)[1:])

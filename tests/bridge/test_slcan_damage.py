@@ -109,16 +109,6 @@ def test_every_byte_is_a_frame_a_reply_or_skipped(pieces):
     assert len(stream) == counters.get("skipped_bytes", 0) + 21 * len(got) + ends + lone_z
 
 
-def test_what_no_decoder_can_tell():
-    """The limits that the module states: well-formed frames that nobody sent."""
-    head_and_tail = GOLDEN[:9] + OTHER[9:]
-    assert decode(head_and_tail)[0] == [CanFrame(0x004, GOLDEN_FRAME.data[:2] + OTHER_FRAME.data[2:])]
-    stamped = STAMPED[2]
-    lost = stamped[:9] + stamped[13:]
-    assert decode(lost)[0] == [CanFrame(0x004, bytes.fromhex("937E 1593 120F 1234"))]
-    assert decode(stamped * 4, lost)[0] == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 4
-
-
 def test_no_loss_makes_a_frame_once_stamps_are_learnt():
     line = STAMPED[2]
     for start in range(len(line)):

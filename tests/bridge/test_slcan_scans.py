@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 ORDERS = {name: [can_id for can_id, _ in USPA44_MAP.wire_order(name)] for name in ("4", "6", "8", "10")}
@@ -126,10 +126,10 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
     others = [CanFrame(0x7F0, bytes(8)), CanFrame(0x123, b"ab"), CanFrame(0x456, b"", remote=True)]
     frames = [*whole, *whole, *others, CanFrame(0x12345, bytes(8), extended=True), *half]
     expected = {frame.can_id for frame in (*whole, *others, *half)}
-    text, by_frame = SlcanScans(), FrameScans()
+    text, by_frame = SlcanScans(), ScanAssembler()
     text.feed(b"".join(map(encode_frame, frames)), 1)
     for frame in frames:
-        by_frame.feed(frame, 1)
+        by_frame.feed_frame(frame, 1)
     assert text.can_ids == by_frame.can_ids == expected
     for known in ([frames[:0], half], [half[:3], *[whole] * 5], [whole[10:], *[whole] * 5]):
         alone = SlcanScans()

@@ -16,7 +16,7 @@ from edge.errors import SinkClosedError
 from edge.perception.contact_options import RuntimeOptions
 from edge.pipeline.run_statistics import Statistics
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.links.base import Notice, Pace
+from firmware_bridge.links.base import Notice
 
 MS = 1_000_000
 
@@ -186,34 +186,6 @@ class TestRecords:
         touch = ["lost touch"] if kind in ("lost", "silent", "back") else []
         assert order == [0, 1, 2, 3, *touch, (kind, "told"), *range(4, 10)]
         assert statistics.events == {kind: 1}
-
-
-class Patient(ListSink):
-    patience_s = 0.2
-
-
-class TestPace:
-    @pytest.mark.parametrize("impatient", [False, True])
-    def test_scans_may_wait_at_rest_where_every_sink_can(self, impatient):
-        """Close to contact they may not: changes too small to be seen could add up to one."""
-        begun, rested, paces = threading.Event(), threading.Event(), []
-        rest = [make_scan(n, noise=3) for n in range(120)]
-        link = FakeLink([rest[:1], begun, rest[1:], rested, [make_scan(120, noise=3, press_counts=1200)]])
-        link.set_pace = paces.append
-        gates = {0: begun, 119: rested}
-        sink = Patient(lambda result: gates.pop(result.scan.number, begun).set())
-        pumped(link, sink, ListSink() if impatient else Patient())
-        assert paces == ([Pace()] if impatient else [Pace(still_s=0.2), Pace()])
-
-    @pytest.mark.parametrize(("sensors", "every_ms"), [(3, 0.0), (4, 2.5)])
-    def test_many_sensors_are_read_together_four_times_a_period(self, sensors, every_ms):
-        paces, gates = [], [threading.Event() for _ in range(20)]
-        batches = [[make_scan(n, sensor=f"{name}", noise=3) for name in range(sensors)] for n in range(20)]
-        link = FakeLink([part for batch, gate in zip(batches, gates, strict=True) for part in (batch, gate)])
-        link.set_pace = paces.append
-        pumped(link, ListSink(lambda result: gates[result.scan.number].set()), runtime=make_runtime(baselines=None))
-        told = [pace._replace(together_s=round(1e3 * pace.together_s, 2)) for pace in paces]
-        assert told == [Pace(), *[Pace(every_ms)] * (every_ms > 0)]
 
 
 class TestDeadline:

@@ -12,10 +12,11 @@ from edge_samples import FakeLink, make_scan
 from runtime_samples import presses
 
 from edge.errors import UsageError
+from edge.pipeline.pace import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError, SourceError
-from firmware_bridge.links.base import Notice, Pace
+from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.scan import Scan
@@ -200,7 +201,7 @@ class TestPorts:
             links = [lasting(one.port, name) for one, name in zip(played, recordings, strict=True)]
             of_emulators = set(threading.enumerate())
             source = stack.enter_context(Source(*links))
-            source.set_pace(Pace(together_s))
+            source.pace = Pace(together_s)
             taken = take_all(source, lambda taken: len(numbers(taken, "left/4")) >= 10)
             assert {thread.name for thread in set(threading.enumerate()) - of_emulators} == {"scan-reader"}
             taken += take_all(source, lambda more: min(len(numbers(more, f"{name}/4")) for name in recordings) >= 30)

@@ -26,9 +26,9 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.xela_server import XelaServerLink
-from firmware_bridge.scans.can_frame_scans import FrameScans
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.scans.xela_server_scans import ServerScans
 
@@ -203,7 +203,7 @@ class PythonCanRig(CanRig):
     """The virtual bus of python-can, with somebody else on it."""
 
     lost, away = "link lost, the interface is gone or down: .*Network is down", "cannot be opened: no such channel"
-    decoder = FrameScans
+    decoder = ScanAssembler
 
     def __init__(self, folder: Path, monkeypatch) -> None:
         super().__init__()
