@@ -10,7 +10,6 @@ after the pressure, which it leaves unchanged (Goodman 1962).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -235,7 +234,7 @@ class GrippedPad:
         pressure = np.empty_like(cells_mm)
         open_ = np.arange(len(cells_mm))
         for _ in range(_MOST_TRIES):
-            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], cover=share[open_]).pressure_mpa
+            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_]).pressure_mpa
             force_n = pressure[open_].sum(axis=(1, 2)) * self.cell_mm**2
             over = force_n > most_force_n
             if not over.any():
@@ -291,8 +290,7 @@ class GrippedPad:
 
     def _solver(self, cover: Cover) -> ContactSolver:
         if cover not in self._solvers:
-            give = partial(cover.compliance, self.pad.layer)
             self._solvers[cover] = ContactSolver(
-                self.pad.layer, self.size, self.cell_mm, compliance=give, sides=self.pad.sides
+                self.pad.layer, self.size, self.cell_mm, cover=cover, sides=self.pad.sides
             )
         return self._solvers[cover]

@@ -112,14 +112,15 @@ class SideGive:
         falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
         return cls((falls, falls), (bells, bells))
 
-    def boxes(self, top: NDArray[np.integer], left: NDArray[np.integer], shape: tuple[int, int]) -> "SideGive":
-        """Return the part for boxes of one shape that begin at these rows and columns, (n,)."""
-        columns, rows = (
-            fall[0][:, :, torch.as_tensor(first[:, None] + np.arange(count))].permute(2, 0, 1, 3)
-            for fall, first, count in zip(self._across, (left, top), shape[::-1], strict=True)
+    def boxes(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> "SideGive":
+        """Return the part for boxes of one shape with these rows (n, height, 1) and columns (n, 1, width)."""
+        across = (
+            fall[0][:, :, torch.as_tensor(cells)].permute(2, 0, 1, 3)
+            for fall, cells in zip(self._across, (columns[:, 0], rows[:, :, 0]), strict=True)
         )
-        beside, below = (bell[:, :count, :count] for bell, count in zip(self._along, shape, strict=True))
-        return SideGive((columns, rows), (beside, below))
+        counts = (rows.shape[1], columns.shape[2])
+        along = (bell[:, :count, :count] for bell, count in zip(self._along, counts, strict=True))
+        return SideGive((next(across), next(across)), (next(along), next(along)))
 
     def __getitem__(self, which: torch.Tensor) -> "SideGive":
         """Return the part for some of the boxes."""
