@@ -15,9 +15,9 @@ from train.physics.elastic_layer import (
     surface_tensor,
 )
 from train.physics.friction import FrictionSolver
-from train.physics.magnet_response import traction_response
 from train.physics.magnets import Magnet
-from train.physics.taxel_response import Skin
+from train.physics.pad_draws import Pad
+from train.physics.taxel_response import Skin, traction_response
 from train.surfaces.depth_image import NOTHING_MM
 
 SIZE, CELL_MM = 42, 0.47
@@ -308,7 +308,7 @@ class TestMagnets:
             assert np.allclose(response[taxel], expected, atol=1e-5 * np.abs(expected).max())
 
     def test_readings_follow_the_traction_and_are_as_before_without(self):
-        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
+        skin = Skin(Pad(), SIZE, CELL_MM)
         pressure = np.full((1, 1, SIZE, SIZE), 0.01, dtype=np.float32)
         alone = skin.frames(pressure)
         right = np.zeros((1, 1, 2, SIZE, SIZE), dtype=np.float32)
@@ -320,11 +320,6 @@ class TestMagnets:
         back = right[:, :, ::-1].copy()
         turned = (skin.frames(pressure, back) - alone)[0, 0]
         assert np.allclose(turned[1], changed[0].T, atol=0.05)
-
-    def test_tractions_that_do_not_fit_are_refused(self):
-        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
-        with pytest.raises(ValueError, match=r"expected \(3, 2, 42, 42\): two for every pressure"):
-            skin.movement(np.zeros((3, SIZE, SIZE)), np.zeros((3, SIZE, SIZE)))
 
 
 @pytest.mark.parametrize(("thickness_mm", "poisson"), [(3.0, 0.4)])

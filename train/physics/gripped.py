@@ -112,18 +112,7 @@ class GrippedPad:
         self._beside = ~on_pad(geometry, self.size * SAMPLES, self.cell_mm / SAMPLES)
         self._solvers: dict[Cover, ContactSolver] = {}
         self._friction = FrictionSolver(pad.layer, self.size, self.cell_mm)
-        self.skin = Skin(
-            pad.geometry(),
-            pad.layer,
-            self.size,
-            self.cell_mm,
-            pad.magnet,
-            in_plane_share=pad.in_plane_share,
-            rest=pad.rest(geometry.taxel_count),
-            moments=pad.moments(geometry.taxel_count),
-            counts_per_newton=pad.counts_per_newton,
-            sides=pad.sides,
-        )
+        self.skin = Skin(pad, self.size, self.cell_mm)
         across = ((np.arange(self.size * SAMPLES) + 0.5) / SAMPLES - self.size / 2) * self.cell_mm
         self.places_mm = (across[None, :].astype(np.float32), across[:, None].astype(np.float32))
         self._uneven_mm = pad.uneven(*self.places_mm)
@@ -190,8 +179,9 @@ class GrippedPad:
             solvers, covers, depth_mm, cells_mm, pressure, pressure, pressed, self._pattern_cells
         )
         patterns = self._cut(heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2), FINE_SCALE)
+        unit = self.skin.movement(pressure / MAX_INDENTATION_MM)[:, None]
         return Taps(
-            counts=self.skin.flat_frames(pressure / MAX_INDENTATION_MM, end * MAX_INDENTATION_MM),
+            counts=self.skin.counts(unit * (end * MAX_INDENTATION_MM)[..., None, None].astype(unit.dtype)),
             force_n=(most_n[:, None] * end).astype(np.float32),
             indentation_mm=(end * MAX_INDENTATION_MM).astype(np.float32),
             unit_patterns=patterns / np.float32(MAX_INDENTATION_MM),
