@@ -49,18 +49,6 @@ def test_flat_punch_on_a_thick_layer_is_boussinesqs():
     assert force_n(result, 0.1) == pytest.approx(expected, rel=0.02)
 
 
-def test_sphere_on_a_thick_layer_is_hertzs():
-    layer = Layer(thickness_mm=8.0, poisson=0.3)
-    solver = ContactSolver(layer, 128, 0.1, torch.float64)
-    modulus_mpa = 2 * layer.shear_modulus_mpa / (1 - layer.poisson)
-    for indentation_mm in (0.02, 0.04):
-        expected = 4 / 3 * modulus_mpa * np.sqrt(2.0) * indentation_mm**1.5
-        # Measured 2.3 % and 3.1 % above: a layer stiffens as the contact grows.
-        assert force_n(solver.solve(sphere(2.0, 0.1, 128), indentation_mm, 1e-6), 0.1) == pytest.approx(
-            expected, rel=0.05
-        )
-
-
 def test_one_cell_and_full_face():
     solver = ContactSolver(Layer(), SIZE, CELL_MM)
     one = np.full((1, SIZE, SIZE), NOTHING_MM, dtype=np.float32)
@@ -147,12 +135,3 @@ def test_the_pad_bulges_against_what_it_has_not_been_pressed_into():
     result = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64).solve(depth, press_mm, tolerance=1e-6)
     assert result.pressure_mpa[0][depth[0] == np.float32(floor_mm)].any()
     assert (result.displacement_mm - (press_mm - depth)).min() > -1e-5
-
-
-def test_the_work_done_is_the_energy_stored():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    press_mm = np.linspace(0.1, 0.4, 31)
-    result = solver.solve(np.repeat(sphere(15.0, CELL_MM, SIZE), 31, axis=0), press_mm, tolerance=1e-6)
-    energy = (result.pressure_mpa * result.displacement_mm).sum(axis=(1, 2)) * CELL_MM**2 / 2
-    # Force is the derivative of the energy, whatever the contact's area does.
-    assert np.trapezoid(result.force_n, press_mm) == pytest.approx(energy[-1] - energy[0], rel=1e-3)

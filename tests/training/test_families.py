@@ -7,7 +7,7 @@ import trimesh
 from train.errors import MeshError, SurfaceError
 from train.families import catalogue
 from train.families.catalogue import FIGURES, SHARES, draw_shape
-from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, SOLIDS, Lie, drawn, flat, log_uniform
+from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, SOLIDS, Lie, drawn, flat
 from train.physics.contact import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.physics.pad_draws import NOMINAL
@@ -160,10 +160,3 @@ def test_a_users_mesh_is_a_family(pad, tmp_path):
         draw(pad, f"mesh:{tmp_path / 'ring.stl'}")
     with pytest.raises(MeshError, match="No such file"):
         draw(pad, f"mesh:{tmp_path / 'absent.stl'}")
-
-
-def test_numbers_are_drawn_evenly_by_their_size():
-    rng = np.random.default_rng(0)
-    drawn = np.array([log_uniform(rng, 1, 100) for _ in range(4000)])
-    assert drawn.min() >= 1 and drawn.max() <= 100
-    assert np.median(drawn) == pytest.approx(10, rel=0.1)

@@ -28,12 +28,10 @@ _REMEMBERED: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class FrictionResult:
-    """Tractions of a batch of poses.
+    """Tractions on the pad to the right and back, (n, 2, size, size), in [MPa].
 
-    Attributes:
-        traction_mpa: on the pad, to the right and back, (n, 2, size, size), in [MPa].
-        residual: (n,) root mean square error over the contact of the movement, which should vanish where cells
-            stick, and oppose the traction where they slip, as a share of the surface's movement.
+    `residual` is the root mean square error (n,) over the contact of the movement, which should vanish where cells
+    stick, and oppose the traction where they slip, as a share of the surface's movement.
     """
 
     traction_mpa: NDArray[np.float32]
@@ -77,10 +75,6 @@ class FrictionSolver:
             tolerance: residual at which a pose is done.
         """
         count = len(pressure_mpa)
-        found = (pressure_mpa.shape, np.shape(slide_mm), np.shape(twist_rad), np.shape(friction))
-        expected = ((count, self.size, self.size), (count, 2), (count,), (count,))
-        if found != expected:
-            raise ValueError(f"pressure, slide, twist and friction of shapes {found}, expected {expected}")
         if not (np.asarray(friction) >= 0).all():
             raise ValueError(f"friction is {np.min(friction)}, expected 0 or more")
         for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):

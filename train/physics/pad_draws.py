@@ -145,9 +145,9 @@ KNOWN: Final = 2 * len(INPUTS) + 1
 def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
     """Draw a pad with each constant within its range; a `spread` below 1 moves all towards the nominal pad."""
     drawn = {}
-    for name, (low, high) in RANGES.items():
+    for name, bounds in RANGES.items():
         nominal = getattr(NOMINAL, name)
-        drawn[name] = nominal + spread * (rng.uniform(low, high) - nominal)
+        drawn[name] = nominal + spread * (rng.uniform(*bounds) - nominal)
     return Pad(**drawn, uneven_mm=spread * rng.uniform(0, _UNEVEN_MM), seed=int(rng.integers(2**31)))
 
 
@@ -158,21 +158,17 @@ def input_scale() -> list[tuple[str, float, float]]:
 
 def constants(pad: Pad) -> NDArray[np.float32]:
     """Return the constants that a network takes, each over its spread, (len(INPUTS),)."""
-    return np.array(
-        [(getattr(pad, name) - centre) / spread for name, centre, spread in input_scale()], dtype=np.float32
-    )
+    scaled = [(getattr(pad, name) - centre) / spread for name, centre, spread in input_scale()]
+    return np.array(scaled, dtype=np.float32)
 
 
 def known_numbers(
     scaled: NDArray[np.float32], known: NDArray[np.bool_], certainty: NDArray[np.floating] | NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Return the pad inputs (n, KNOWN) of a network; all zeros without any constant.
+    """Return the pad inputs (n, KNOWN) of a network, of constants over their spread and flags of those to pass on.
 
-    Args:
-        scaled: constants over their spread, (n, len(INPUTS)).
-        known: flags of the constants to pass on, same shape.
-        certainty: (n,) of the gains that readings were divided by: 1 less their deviation over the spread of a new
-            sensor's, 1 for the true gains and 0 for none.
+    The certainty (n,) of the gains that readings were divided by is 1 less their deviation over the spread of a new
+    sensor's: 1 for the true gains, 0 for none.
     """
     flags = known.astype(np.float32)
     return np.concatenate([scaled * flags, flags, certainty.astype(np.float32)[:, None]], axis=1)
