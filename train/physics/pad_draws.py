@@ -12,7 +12,7 @@ from train.physics.magnets import Magnet
 from train.physics.side_correction import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085
-"""Of the sum of z, by the data sheet."""
+"""By the data sheet, for the sum of z."""
 
 _UNEVEN_MM: Final = 0.015
 """Largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]."""
