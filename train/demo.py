@@ -26,9 +26,8 @@ from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
 from train.surfaces.depth_image import Pose
-from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
 from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, TEST_POSITION, over_surface, position_mm
-from train.surfaces.random_figures import figure
 
 SURFACE: Final = "glyph:1"
 """A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""

@@ -40,6 +40,6 @@ def test_a_broken_row_ends_the_command_with_its_name(tmp_path, monkeypatch):
 
 def test_a_thick_layer_needs_a_wide_grid(monkeypatch):
     """The row that detected it: on twice the pad, copies of the pad had an effect."""
-    monkeypatch.setattr("train.physics.contact._DIES_WITHIN", 0)
+    monkeypatch.setattr("train.physics.pad_grid._DIES_WITHIN", 0)
     holds = [stability.against_a_wide_grid(Layer(thickness_mm=h), f"{h} mm").holds for h in (4.5, 50)]
     assert holds == [True, False]

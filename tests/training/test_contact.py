@@ -49,32 +49,6 @@ def test_flat_punch_on_a_thick_layer_is_boussinesqs():
     assert force_n(result, 0.1) == pytest.approx(expected, rel=0.02)
 
 
-def test_sphere_on_a_thick_layer_is_hertzs():
-    layer = Layer(thickness_mm=8.0, poisson=0.3)
-    solver = ContactSolver(layer, 128, 0.1, torch.float64)
-    modulus_mpa = 2 * layer.shear_modulus_mpa / (1 - layer.poisson)
-    for indentation_mm in (0.02, 0.04):
-        expected = 4 / 3 * modulus_mpa * np.sqrt(2.0) * indentation_mm**1.5
-        # Measured 2.3 % and 3.1 % above: a layer stiffens as the contact grows.
-        assert force_n(solver.solve(sphere(2.0, 0.1, 128), indentation_mm, 1e-6), 0.1) == pytest.approx(
-            expected, rel=0.05
-        )
-
-
-def test_flat_contact_is_linear_in_the_indentation():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM)
-    unit = solver.solve(punch(5.0), 1.0)
-    deep = solver.solve(punch(5.0), 0.3)
-    assert np.allclose(deep.pressure_mpa, 0.3 * unit.pressure_mpa, atol=2e-3 * unit.pressure_mpa.max())
-
-
-def test_a_pose_is_solved_alike_alone_and_in_company():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    alone = solver.solve(punch(3.0), tolerance=1e-7)
-    company = solver.solve(np.concatenate([sphere(100.0, CELL_MM, SIZE), punch(3.0), punch(9.0)]), tolerance=1e-7)
-    assert np.allclose(alone.pressure_mpa[0], company.pressure_mpa[1], atol=1e-6)
-
-
 def test_one_cell_and_full_face():
     solver = ContactSolver(Layer(), SIZE, CELL_MM)
     one = np.full((1, SIZE, SIZE), NOTHING_MM, dtype=np.float32)
@@ -90,7 +64,7 @@ def test_a_cell_carries_as_much_as_it_is_covered():
     one, cover = np.full((3, SIZE, SIZE), NOTHING_MM, dtype=np.float32), np.zeros((3, SIZE, SIZE), dtype=np.float32)
     one[:, 20, 20] = 0
     cover[:, 20, 20] = 1, 0.5, 1 / 16
-    whole, half, corner = solver.solve(one, cover=cover, tolerance=1e-9).pressure_mpa[:, 20, 20]
+    whole, half, corner = solver.solve(one, covered=cover, tolerance=1e-9).pressure_mpa[:, 20, 20]
     assert whole == pytest.approx(1 / solver.cell_compliance_mm_per_mpa)
     assert (half / whole, corner / whole) == pytest.approx((0.5, 1 / 16))
 
@@ -98,7 +72,7 @@ def test_a_cell_carries_as_much_as_it_is_covered():
 def test_cells_that_are_whole_are_solved_as_without_cover():
     solver = ContactSolver(Layer(), SIZE, CELL_MM)
     depth = scenes()
-    covered = solver.solve(depth, 0.3, cover=np.ones_like(depth))
+    covered = solver.solve(depth, 0.3, covered=np.ones_like(depth))
     assert np.array_equal(covered.pressure_mpa, solver.solve(depth, 0.3).pressure_mpa)
 
 
@@ -119,8 +93,8 @@ def test_wrong_input_is_refused():
         solver.solve(punch(2.0), 0.0)
     with pytest.raises(ValueError, match="positive depth"):
         solver.solve(np.concatenate([punch(2.0)] * 2), np.array([0.1, np.nan]))
-    with pytest.raises(ValueError, match=r"cover of shape \(42, 42\), expected .* \(1, 42, 42\)"):
-        solver.solve(punch(2.0), cover=np.ones((SIZE, SIZE)))
+    with pytest.raises(ValueError, match=r"covered shares of .*\(42,\).*, expected \(n, 42, 42\)"):
+        solver.solve(punch(2.0), covered=np.ones((SIZE, SIZE)))
     out_of_reach = np.full((1, SIZE, SIZE), 0.4, dtype=np.float32)
     with pytest.raises(ValueError, match=r"depth image 1 begins 0.4 mm down, pressed in by 0.3 mm: no cell"):
         solver.solve(np.concatenate([punch(2.0), out_of_reach]), 0.3)
@@ -155,47 +129,9 @@ def test_tolerances_bound_the_error():
     assert np.abs(solver.solve(scenes(), 0.3).force_n / exact.force_n - 1).max() < 5e-3
 
 
-def test_each_pose_may_have_its_own_indentation():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    depth, indentation_mm = np.repeat(sphere(20.0, CELL_MM, SIZE), 3, axis=0), np.array([0.05, 0.2, 0.5])
-    together = solver.solve(depth, indentation_mm, tolerance=1e-7).pressure_mpa
-    for i, press in enumerate(indentation_mm):
-        assert np.allclose(solver.solve(depth[:1], press, tolerance=1e-7).pressure_mpa[0], together[i], atol=1e-6)
-
-
 def test_the_pad_bulges_against_what_it_has_not_been_pressed_into():
     floor_mm, press_mm = 0.24, 0.2
     depth = punch(7.0) + np.where(punch(4.5) == 0, floor_mm, 0).astype(np.float32)
     result = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64).solve(depth, press_mm, tolerance=1e-6)
     assert result.pressure_mpa[0][depth[0] == np.float32(floor_mm)].any()
     assert (result.displacement_mm - (press_mm - depth)).min() > -1e-5
-
-
-def test_the_work_done_is_the_energy_stored():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    press_mm = np.linspace(0.1, 0.4, 31)
-    result = solver.solve(np.repeat(sphere(15.0, CELL_MM, SIZE), 31, axis=0), press_mm, tolerance=1e-6)
-    energy = (result.pressure_mpa * result.displacement_mm).sum(axis=(1, 2)) * CELL_MM**2 / 2
-    # Force is the derivative of the energy, whatever the contact's area does.
-    assert np.trapezoid(result.force_n, press_mm) == pytest.approx(energy[-1] - energy[0], rel=1e-3)
-
-
-@pytest.mark.parametrize("thickness_mm", [1e-3, 300.0])
-def test_extreme_layers_stay_finite(thickness_mm):
-    # Every third cell: the response of so thick a layer takes a grid as wide, which is worked out cell by cell.
-    depth = np.ascontiguousarray(scenes()[:, ::3, ::3])
-    result = ContactSolver(Layer(thickness_mm), SIZE // 3, 3 * CELL_MM).solve(depth, 0.3)
-    assert np.isfinite(result.pressure_mpa).all()
-    assert np.isfinite(result.displacement_mm).all()
-    assert result.residual.max() < 1e-3
-
-
-def test_a_spheres_contact_is_as_wide_as_hertz_says():
-    layer = Layer(thickness_mm=8.0, poisson=0.3)
-    pressure = ContactSolver(layer, 128, 0.1, torch.float64).solve(sphere(8.0, 0.1, 128), 0.04, 1e-6).pressure_mpa[0]
-    along = (np.arange(128) - 63.5) * 0.1
-    square = along[None, :] ** 2 + along[:, None] ** 2
-    # Hertz's pressure, an ellipsoid, has a mean square radius of 2/5 of the contact's. Measured 2.3 % above.
-    radius_mm = np.sqrt(2.5 * (pressure * square).sum() / pressure.sum())
-    assert radius_mm == pytest.approx(np.sqrt(8.0 * 0.04), rel=0.03)
-    assert not pressure[square > (1.1**2) * 8.0 * 0.04].any()

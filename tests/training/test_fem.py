@@ -6,8 +6,7 @@ pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import FemPad, NoEquilibriumError
-from train.physics.mooney_rivlin import MooneyRivlin
+from train.physics.fem_reference import FemPad, MooneyRivlin, NoEquilibriumError
 
 NOTHING_MM = 1e3
 
@@ -31,26 +30,56 @@ def test_nodes_lie_on_the_patterns_pixels_and_reach_the_rim(scale):
     assert np.diff(pad.nodes_mm).max() < 1.5 * pad.cell_mm
 
 
-@pytest.mark.parametrize("c2_share", [0.0, 0.6])
-def test_a_plate_on_a_thin_slab_presses_as_in_closed_form_at_large_strain(c2_share):
+def energy(rubber, gradient):
+    """Energy of the shape alone per volume, of gradients F (3, 3, ...)."""
+    right = np.einsum("ki...,kj...->ij...", gradient, gradient)
+    volume = np.linalg.det(np.moveaxis(gradient, (0, 1), (-2, -1)))
+    i1 = np.einsum("ii...->...", right)
+    i2 = (i1**2 - np.einsum("ij...,ij...->...", right, right)) / 2
+    return rubber.c1_mpa * (i1 * volume ** (-2 / 3) - 3) + rubber.c2_mpa * (i2 * volume ** (-4 / 3) - 3)
+
+
+def slope(function, gradient, step=1e-6):
+    """Central differences of function(F) by F, the tensor's axes last but one before the points."""
+    pieces = []
+    for k in range(9):
+        nudge = np.zeros((3, 3, 1))
+        nudge[k // 3, k % 3] = step
+        pieces.append((function(gradient + nudge) - function(gradient - nudge)) / (2 * step))
+    return np.moveaxis(np.stack(pieces), 0, -2).reshape(*pieces[0].shape[:-1], 3, 3, -1)
+
+
+@pytest.mark.parametrize("rubber", [MooneyRivlin(0.05, 0.02, 6.0), MooneyRivlin(0.0, 0.06, 6.0)])
+def test_stress_is_the_slope_of_the_energy_and_stiffness_that_of_the_stress(rubber):
+    gradient = np.eye(3)[:, :, None] + 0.3 * np.random.default_rng(0).uniform(-1, 1, (3, 3, 5))
+    assert np.allclose(rubber.stress(gradient), slope(lambda given: energy(rubber, given), gradient), atol=1e-9)
+    assert np.allclose(rubber.stiffness(gradient), slope(rubber.stress, gradient), atol=1e-8)
+
+
+def test_the_rubber_is_the_layer_at_small_strain():
+    rubber = MooneyRivlin.of_layer(Layer(shear_modulus_mpa=0.12, poisson=0.49))
+    stiffness = rubber.stiffness(np.eye(3))
+    assert [stiffness[0, 1, 0, 1], stiffness[0, 1, 1, 0]] == pytest.approx([0.12, 0.12])
+    assert stiffness[0, 0, 0, 0] == pytest.approx(4 / 3 * 0.12)
+    assert rubber.bulk_mpa / 0.12 == pytest.approx(49.67, abs=0.01)
+
+
+def test_a_plate_on_a_thin_slab_presses_as_in_closed_form_at_large_strain():
     # Far from the rim a bonded slab only gets thinner: F = diag(1, 1, s), whose stress is d psi / ds.
     layer = Layer(thickness_mm=1.0, poisson=0.3)
-    rubber = MooneyRivlin.of_layer(layer, c2_share)
-    pad = FemPad(2, 2, layer, c2_share)
+    rubber = MooneyRivlin.of_layer(layer)
+    pad = FemPad(2, 2, layer)
     steps_mm = np.array([0.001, 0.1, 0.25])
     presses = pad.press(np.zeros((pad.size, pad.size)), steps_mm)
     middle = pad.size // 2
 
     def stored(stretch):
-        thinner = np.eye(3)
-        thinner[2, 2] = stretch
-        return rubber.energy(thinner) + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
+        return energy(rubber, np.diag([1, 1, stretch])) + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
 
     for step_mm, push_n in zip(steps_mm, presses.push_n, strict=True):
         stretch = 1 - step_mm
         expected_mpa = -(stored(stretch + 1e-5) - stored(stretch - 1e-5)) / 2e-5
         assert push_n[middle, middle] / pad.cell_mm**2 == pytest.approx(expected_mpa, rel=1e-3)
-    assert (presses.residual < 1e-6).all()
 
 
 @pytest.mark.parametrize(("thickness_mm", "poisson"), [(4.5, 0.3), (2.0, 0.49)])
@@ -88,22 +117,13 @@ def test_nothing_pulls_nothing_sinks_in_and_contact_grows():
 
 
 def test_a_press_has_the_figures_symmetry_and_grows_stiffer():
-    pad = FemPad(4, 2)
+    pad = FemPad(4, 2, Layer())
     presses = pad.press(disc(pad.nodes_mm, 3.5), np.array([0.1, 0.5]))
     surface = presses.displacement_mm[-1]
     assert np.allclose(surface, surface[::-1], atol=1e-6)
     assert np.allclose(surface, surface.T, atol=1e-6)
     assert surface.min() < -0.01  # rubber makes way upwards
     assert presses.force_n[1] > 5.2 * presses.force_n[0]
-
-
-def test_steps_lead_where_one_leap_leads():
-    pad = FemPad(3, 2)
-    depth_mm = bowl(pad.nodes_mm - 1.0, 15.0)  # off the middle
-    stepped = pad.press(depth_mm, np.array([0.1, 0.2, 0.3]))
-    leap = pad.press(depth_mm, np.array([0.3]))
-    assert np.allclose(stepped.displacement_mm[-1], leap.displacement_mm[-1], atol=1e-6)
-    assert stepped.force_n[-1] == pytest.approx(leap.force_n[-1], rel=1e-5)
 
 
 def test_patterns_are_the_nodes_or_lie_straight_between_them():
@@ -115,18 +135,6 @@ def test_patterns_are_the_nodes_or_lie_straight_between_them():
 
 
 def test_a_leap_too_far_is_named():
-    pad = FemPad(3, 2)
-    with pytest.raises(NoEquilibriumError, match=r"step 2 of 2, indentation 4\.4 mm.*other steps"):
+    pad = FemPad(3, 2, Layer())
+    with pytest.raises(NoEquilibriumError, match=r"at an indentation of 4\.4 mm; press in other steps"):
         pad.press(disc(pad.nodes_mm, 3.0), np.array([0.1, 4.4]))
-
-
-def test_wrong_input_is_refused():
-    pad = FemPad(3, 1)
-    flat = np.zeros((pad.size, pad.size))
-    with pytest.raises(ValueError, match=r"depth \(5, 5\), expected"):
-        pad.press(np.zeros((5, 5)), np.array([0.1]))
-    for steps in ([0.0, 0.1], [0.2, 0.1]):
-        with pytest.raises(ValueError, match="expected rising"):
-            pad.press(flat, np.array(steps))
-    with pytest.raises(ValueError, match=r"nothing lies within 0\.1 mm"):
-        pad.press(flat + NOTHING_MM, np.array([0.1]))

@@ -5,6 +5,7 @@ import torch
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
+from train.physics.pad_draws import Pad
 from train.physics.side_correction import FreeSides
 from train.physics.taxel_response import Skin
 
@@ -40,19 +41,10 @@ def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
     pressure = corrected.pressure_mpa[0].astype(np.float64)
     found = np.interp([0.235, 7.05, 9.635], CELLS_MM, pressure[SIZE // 2]) / pressure.mean()
     assert np.abs(found - shape).max() < 0.09
-    skin = Skin(USPA44, layer, SIZE, CELL_MM, in_plane_share=1.0, sides=FreeSides())
+    skin = Skin(Pad(poisson=poisson, in_plane_share=1.0, free_sides=1.0), SIZE, CELL_MM)
     quarter = skin.movement(pressure).reshape(4, 4, 5)[2:, 2:].reshape(4, 5)[[0, 1, 3]]
     assert quarter[:, 2] == pytest.approx(down, rel=0.2)
     assert quarter[:, 0] == pytest.approx(out, rel=0.12)
-
-
-def test_without_amplitude_nothing_changes():
-    layer, none = Layer(), FreeSides(0.0)
-    depths_mm = discs(5)
-    pressures = [solver(layer, sides).solve(depths_mm).pressure_mpa for sides in (None, none)]
-    assert np.allclose(*pressures, atol=1e-7)
-    skins = [Skin(USPA44, layer, SIZE, CELL_MM, sides=sides) for sides in (None, none)]
-    assert np.array_equal(*(skin.frames(pressures[0][:, None]) for skin in skins))
 
 
 def test_boxes_give_what_the_whole_pad_gives():

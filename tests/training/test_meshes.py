@@ -73,13 +73,6 @@ def test_every_format_comes_to_rest_under_the_sensor(tmp_path, name):
     assert mesh.volume == pytest.approx(10 * 8 * 3)
 
 
-def test_the_mesh_is_used_as_it_stands(tmp_path):
-    cone = trimesh.creation.cone(radius=3, height=4, sections=64)
-    mesh = load_mesh(saved(tmp_path, "cone.stl", binary_stl(cone.triangles)))
-    top = mesh.vertices[mesh.vertices[:, 2] > -1e-6]
-    assert top == pytest.approx(np.zeros((1, 3)), abs=1e-6)
-
-
 @pytest.mark.parametrize(("unit_mm", "scale"), [(25.4, 1 / 25.4), (1000, 1e-3), (0.001, 1e3)])
 def test_a_file_in_another_unit(tmp_path, unit_mm, scale):
     path = saved(tmp_path, "part.stl", binary_stl(box().triangles * scale))

@@ -8,16 +8,13 @@ from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import (
     Layer,
-    inner_displacement,
     inner_tangential,
-    surface_compliance,
     surface_tangential_compliance,
-    surface_tensor,
 )
 from train.physics.friction import FrictionSolver
-from train.physics.magnet_response import traction_response
 from train.physics.magnets import Magnet
-from train.physics.taxel_response import Skin
+from train.physics.pad_draws import Pad
+from train.physics.taxel_response import Skin, traction_response
 from train.surfaces.depth_image import NOTHING_MM
 
 SIZE, CELL_MM = 42, 0.47
@@ -84,28 +81,6 @@ class TestLayer:
             if height_mm == 0:
                 assert np.allclose([inside.along, inside.across, inside.sunk], 0, atol=1e-9 * along[0])
 
-    @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.4999])
-    def test_down_under_traction_is_along_under_pressure(self, poisson):
-        layer = Layer(poisson=poisson)
-        q = np.linspace(0.01, 20, 300)
-        _, spread = inner_displacement(layer, q, layer.thickness_mm)
-        assert np.allclose(
-            inner_tangential(layer, q, layer.thickness_mm).sunk, -spread, atol=1e-9 * np.abs(spread).max()
-        )
-
-    def test_limits_of_thin_and_thick(self):
-        layer = Layer(poisson=0.3)
-        along, across = surface_tangential_compliance(layer, np.array([0.0, 1e-9, 100.0]))
-        shear = layer.thickness_mm / layer.shear_modulus_mpa
-        assert np.allclose([along[:2], across[:2]], shear)
-        assert along[2] == pytest.approx(0.7 / (layer.shear_modulus_mpa * 100.0))
-        assert across[2] == pytest.approx(1 / (layer.shear_modulus_mpa * 100.0))
-        assert along[2] == pytest.approx(surface_compliance(layer, np.array([100.0]))[0])
-        # Even traction shears the layer evenly.
-        inside = inner_tangential(layer, np.array([0.0]), 1.5)
-        assert np.allclose([inside.along, inside.across], 1.5 / layer.shear_modulus_mpa)
-        assert abs(inside.sunk[0]) < 1e-5
-
     def test_inside_obeys_equilibrium(self):
         layer, q, step = Layer(poisson=0.45), np.array([0.5]), 1e-3
         u, across, down = np.array(
@@ -123,33 +98,6 @@ class TestLayer:
         assert abs(along_x) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
         assert abs(along_z) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
         assert bend_across == pytest.approx(q[0] ** 2 * across[1], rel=1e-4)
-
-    def test_a_turned_wave_is_the_wave_turned(self):
-        layer, angle = Layer(), 0.7
-        q_x, q_y = np.array([0.3, 1.0, 4.0]), np.array([0.5, -0.2, 3.0])
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        turned_x, turned_y = turn @ np.stack([q_x, q_y])
-
-        def tensor(right, back):
-            xx, yy, xy = surface_tensor(layer, right, back)
-            return np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
-
-        assert np.allclose(tensor(turned_x, turned_y), turn @ tensor(q_x, q_y) @ turn.T)
-
-    def test_far_from_a_load_on_a_thick_layer_it_is_cerrutis(self):
-        layer = Layer(thickness_mm=100.0, poisson=0.3)
-        solver = FrictionSolver(layer, 64, 0.5, torch.float64)
-        load = np.zeros((1, 2, 64, 64))
-        load[0, 0, 10, 10] = 1.0
-        moved = solver.displacement_mm(load)[0]
-        for right, back in ((6, 0), (0, 6), (4, 4), (3, 5)):
-            x_mm, y_mm = 0.5 * right, 0.5 * back
-            r_mm = np.hypot(x_mm, y_mm)
-            unit = 0.25 / (2 * np.pi * layer.shear_modulus_mpa * r_mm)
-            expected = unit * np.array([1 - 0.3 + 0.3 * (x_mm / r_mm) ** 2, 0.3 * x_mm * y_mm / r_mm**2])
-            found = moved[:, 10 + back, 10 + right]
-            # Measured 3.8 %: a layer 30 distances thick is stiffer than a half-space, by about r / h.
-            assert np.abs(found - expected).max() < 0.05 * unit
 
 
 class TestFriction:
@@ -230,15 +178,6 @@ class TestFriction:
             assert there == pytest.approx((solver.displacement_mm(traction[None])[0] * other[0]).sum(), rel=1e-3)
         assert 0 < sticking < 5 * (pressure > 0).sum()
 
-    def test_a_turned_push_is_the_push_turned(self):
-        pressure = 0.1 * (radius_mm(centre_mm=(3.0, -2.0)) < 4.0)
-        solver = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64)
-        first = push(solver, pressure, (0.1, 0.04), 0.01, 0.5).traction_mpa
-        # np.rot90 turns from back to right: (x, y) to (y, -x).
-        turned = push(solver, np.rot90(pressure).copy(), (0.04, -0.1), 0.01, 0.5).traction_mpa
-        assert np.allclose(turned[0], np.rot90(first[1]), atol=1e-4)
-        assert np.allclose(turned[1], -np.rot90(first[0]), atol=1e-4)
-
     def test_a_batch_in_boxes_is_each_pose_on_the_whole_pad_and_the_residual_tells_the_error(self):
         rng = np.random.default_rng(0)
         pressure = np.stack(
@@ -261,8 +200,6 @@ class TestFriction:
     def test_what_does_not_fit_is_refused(self):
         solver = FrictionSolver(Layer(), SIZE, CELL_MM)
         pressure = np.ones((2, SIZE, SIZE))
-        with pytest.raises(ValueError, match=r"slide, twist and friction of shapes .* expected .*\(2, 2\)"):
-            solver.solve(pressure, np.zeros(2), np.zeros(2), np.ones(2))
         with pytest.raises(ValueError, match=r"friction is -1\.0, expected 0 or more"):
             solver.solve(pressure, np.zeros((2, 2)), np.zeros(2), np.array([1.0, -1.0]))
         with pytest.raises(ValueError, match="a slide is not finite"):
@@ -308,7 +245,7 @@ class TestMagnets:
             assert np.allclose(response[taxel], expected, atol=1e-5 * np.abs(expected).max())
 
     def test_readings_follow_the_traction_and_are_as_before_without(self):
-        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
+        skin = Skin(Pad(), SIZE, CELL_MM)
         pressure = np.full((1, 1, SIZE, SIZE), 0.01, dtype=np.float32)
         alone = skin.frames(pressure)
         right = np.zeros((1, 1, 2, SIZE, SIZE), dtype=np.float32)
@@ -320,11 +257,6 @@ class TestMagnets:
         back = right[:, :, ::-1].copy()
         turned = (skin.frames(pressure, back) - alone)[0, 0]
         assert np.allclose(turned[1], changed[0].T, atol=0.05)
-
-    def test_tractions_that_do_not_fit_are_refused(self):
-        skin = Skin(USPA44, Layer(), SIZE, CELL_MM)
-        with pytest.raises(ValueError, match=r"expected \(3, 2, 42, 42\): two for every pressure"):
-            skin.movement(np.zeros((3, SIZE, SIZE)), np.zeros((3, SIZE, SIZE)))
 
 
 @pytest.mark.parametrize(("thickness_mm", "poisson"), [(3.0, 0.4)])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import MeshError, SurfaceError
-from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, log_uniform
+from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
 from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.surfaces.depth_image import Pose, Relief, depth_image
@@ -45,11 +45,14 @@ SHARES: Final[Mapping[str, float]] = {
 }
 """Relative frequency of each family in training."""
 
+_PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")
+"""Shapes of which two may be under the pad at once."""
 _LEVEL: Final = 0.3
 """Share of shapes that lie level; the others tilt by up to three degrees, most of them by less than one."""
 _REACH_MM: Final = 6.0
 _FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
 _FIGURES_PER_SEED: Final = 1_000_000
+_MOST_TRIES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,28 +83,27 @@ def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: ND
     """
     if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
-    if family == "soft":
-        inner = draw_shape(rng, _another(rng), pad, poses)
-        return replace(inner, cover=Cover(soft_mpa=round(log_uniform(rng, 0.05, 2), 3)))
-    if family == "glove":
-        inner = draw_shape(rng, _another(rng), pad, poses)
-        return replace(inner, cover=Cover(0.0, rng.uniform(0.2, 1.0), log_uniform(rng, 0.3, 3)))
-    parts = [SHAPES[family]] if family != "two" else [SHAPES[name] for name in rng.choice(_PAIRED, 2)]
-    heights = [maker(rng) for maker in parts]
-    places = [_lie(rng, family, index) for index in range(len(parts))]
+    if family in ("soft", "glove"):
+        rigid = draw_shape(rng, str(rng.choice([name for name in SHARES if name not in ("soft", "glove")])), pad, poses)
+        if family == "soft":
+            return replace(rigid, cover=Cover(soft_mpa=round(log_uniform(rng, 0.05, 2), 3)))
+        return replace(rigid, cover=Cover(cloth_mm=rng.uniform(0.2, 1.0), cloth_mpa=log_uniform(rng, 0.3, 3)))
+    names = rng.choice(_PAIRED, 2) if family == "two" else [family]
+    heights = [drawn(rng, SHAPES[name]) for name in names]
+    lies = [_lie(rng, family, index) for index in range(len(names))]
     x, y = np.broadcast_arrays(*pad.places_mm)
 
     def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:
-        seen = [_under(lie, pose).seen(height, x, y) for height, lie in zip(heights, places, strict=True)]
+        seen = [_under(lie, pose).seen(height, x, y) for height, lie in zip(heights, lies, strict=True)]
         return np.maximum.reduce(seen)
 
     maps, met = _that_meet(poses, seen_from)
-    return Tapped(np.stack(maps), BARE, met, -met[:, 2])
+    return Tapped(maps, BARE, met, -met[:, 2])
 
 
 def _that_meet(
     poses: NDArray[np.float64], seen_from: Callable[[NDArray[np.float64]], NDArray[np.float32]]
-) -> tuple[list[NDArray[np.float32]], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Return the heights from each pose, and the poses: one that misses the shape moves half-way to the newest."""
     maps, met = [], poses.copy()
     for pose in met:
@@ -112,23 +114,12 @@ def _that_meet(
             pose[:2] /= 2
             heights_mm = seen_from(pose)
         maps.append(heights_mm)
-    return maps, met
-
-
-_MOST_TRIES: Final = 6
-_PAIRED: Final = ("block", "edge", "dome", "cylinder", "wire", "cone", "solid")
-"""Shapes of which two may be under the pad at once."""
-
-
-def _another(rng: np.random.Generator) -> str:
-    names = [name for name in SHARES if name not in ("soft", "glove")]
-    return str(rng.choice(names))
+    return np.stack(maps), met
 
 
 def _lie(rng: np.random.Generator, family: str, index: int) -> Lie:
     """Draw the place of a shape; the second of two lies on the pad's other side, at nearly the same height."""
-    reach = _REACH_MM
-    x_mm, y_mm = rng.uniform(-reach, reach, 2)
+    x_mm, y_mm = rng.uniform(-_REACH_MM, _REACH_MM, 2)
     if family == "two":
         x_mm = (4 + rng.uniform(0, 4)) * (1 if index else -1)
     slope = np.zeros(2)
@@ -169,8 +160,7 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
                 return np.full((pad.size * SAMPLES,) * 2, NOWHERE_MM, dtype=np.float32)
             raise SurfaceError(f"{error}; tap a surface that has no hole as wide as the pad") from error
 
-    maps, met = _that_meet(poses, seen_from)
-    heights = np.stack(maps)
+    heights, met = _that_meet(poses, seen_from)
     if rng.random() > _LEVEL:
         slope = rng.uniform(-_FIGURE_SLOPE, _FIGURE_SLOPE, 2).astype(np.float32)
         heights = heights + slope[0] * pad.places_mm[0] + slope[1] * pad.places_mm[1]

@@ -1,17 +1,12 @@
 """Contact of a rigid surface with the pad: contact area and pressure.
 
 Pressure >= 0, gap >= 0, and one of them zero in every cell (Polonsky and Keer 1999: conjugate gradients on the touching
-cells, which change from step to step). Displacement from pressure is a convolution, done by FFT on a padded grid. Only
-the bounding box of the cells that a press can reach is computed: the kernel is the whole pad's, cut to the box, so the
-result is that of the whole pad. Poses with boxes of one shape are solved in a batch.
-
-The load of a cell at a surface's edge is proportional to its covered share: readings then change continuously while the
-surface moves, where whole cells alone make them jump by 1 to 2 % (docs/decisions.md).
+cells, which change from step to step). The load of a cell at a surface's edge is proportional to its covered share:
+readings then change continuously while the surface moves, where whole cells alone make them jump by 1 to 2 %
+(docs/decisions.md).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil
 from typing import Final
 
 import numpy as np
@@ -20,16 +15,17 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.elastic_layer import Layer, surface_compliance
+from train.physics.pad_grid import PadGrid, waves
 from train.physics.side_correction import FreeSides, SideGive
 
 
 @dataclass(frozen=True, slots=True)
 class Cover:
-    """Compliance of the object, and a cloth between it and the pad.
+    """Compliance of the object, and a cloth or glove between it and the pad.
 
     Attributes:
         soft_mpa: shear modulus of a soft object, thick and incompressible; 0 for a rigid one.
-        cloth_mm: thickness of a cloth or glove over the pad; 0 for no cloth.
+        cloth_mm: thickness of the cloth; 0 for none.
         cloth_mpa: its modulus under even pressure.
     """
 
@@ -51,11 +47,10 @@ class Cover:
         if not self.cloth_mm:
             return pressure
         size = len(pressure)
-        padded = 2 * size
-        q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
-        q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
-        spectrum = np.fft.rfft2(pressure, s=(padded, padded))
-        spread = np.fft.irfft2(spectrum * self._spread(np.hypot(q_x[None], q_y[:, None])), s=(padded, padded))
+        padded = (2 * size, 2 * size)
+        q_x, q_y = waves(2 * size, cell_mm)
+        spectrum = np.fft.rfft2(pressure, s=padded)
+        spread = np.fft.irfft2(spectrum * self._spread(np.hypot(q_x, q_y)), s=padded)
         return np.maximum(spread[:size, :size], 0).astype(np.float32)
 
     def _spread(self, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,13 +64,7 @@ class Cover:
 
 BARE: Final = Cover()
 
-
 _MAX_STEPS: Final = 200
-_DIES_WITHIN: Final = 8
-"""Least period of the kernel's grid, in thicknesses, which limits the error of a punch's force to 5e-4.
-
-On a period of twice the pad the error was .8 % for a layer of 10 mm and 9 % for one of 50 mm.
-"""
 REACH: Final = 1.5
 """Depth in indentations up to which cells may touch.
 
@@ -118,8 +107,7 @@ class ContactSolver:
         size: cells along a side.
         cell_mm: cell size, in [mm].
         dtype: torch.float32 or torch.float64.
-        compliance: surface displacement per pressure at wave numbers, in [mm/MPa], for a pad with a cover; the layer's
-            alone if None.
+        cover: of the surface or the pad.
         sides: the pad's free sides; None for an infinite layer.
     """
 
@@ -129,26 +117,19 @@ class ContactSolver:
         size: int,
         cell_mm: float,
         dtype: torch.dtype = torch.float32,
-        compliance: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
+        cover: Cover = BARE,
         sides: FreeSides | None = None,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
-        padded = period_cells(layer, size, cell_mm)
-        q_x = 2 * np.pi * np.fft.rfftfreq(padded, cell_mm)
-        q_y = 2 * np.pi * np.fft.fftfreq(padded, cell_mm)
-        q = np.hypot(q_x[None, :], q_y[:, None])
-        answers = surface_compliance(layer, q) if compliance is None else compliance(q)
-        self._kernel = np.fft.irfft2(answers, s=(padded, padded))
+        self._grid = PadGrid(layer, size, cell_mm, dtype, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
         self._dtype = dtype
-        self._sides = [*box_sides(size), size]
-        self._spectra: dict[tuple[int, int], torch.Tensor] = {}
         self._side_give = None if sides is None else SideGive.of(sides, layer, size, cell_mm, dtype)
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
         """Displacement of a cell under its own pressure alone, in [mm/MPa]."""
-        return float(self._kernel[0, 0])
+        return self._grid.cell_mm_per_mpa
 
     def displacement_mm(self, pressure_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement downwards under pressures (n, size, size), in [mm]."""
@@ -160,7 +141,7 @@ class ContactSolver:
         depth_mm: NDArray[np.floating],
         indentation_mm: float | NDArray[np.floating] = 1.0,
         tolerance: float = 1e-3,
-        cover: NDArray[np.floating] | None = None,
+        covered: NDArray[np.floating] | None = None,
     ) -> ContactResult:
         """Press surfaces into the pad, with depth images as input.
 
@@ -170,13 +151,12 @@ class ContactSolver:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
             tolerance: residual at which a pose is done.
-            cover: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
+            covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
         """
-        if depth_mm.shape[1:] != (self.size, self.size):
-            raise ValueError(f"depth images of shape {depth_mm.shape}, expected (n, {self.size}, {self.size})")
-        if cover is not None and cover.shape != depth_mm.shape:
-            raise ValueError(f"cover of shape {cover.shape}, expected that of the depth images, {depth_mm.shape}")
+        shapes = {depth_mm.shape[1:], depth_mm.shape[1:] if covered is None else covered.shape[1:]}
+        if shapes != {(self.size, self.size)}:
+            raise ValueError(f"depth images and covered shares of {shapes}, expected (n, {self.size}, {self.size})")
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         if not (indentation > 0).all():
             raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")
@@ -190,40 +170,33 @@ class ContactSolver:
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
         steps = 0
-        for (height, width), poses, top, left in boxes(depth_mm < REACH * indentation[:, None, None], self._sides):
-            rows = (top[:, None] + np.arange(height))[:, :, None]
-            columns = (left[:, None] + np.arange(width))[:, None, :]
-            place = (poses[:, None, None], rows, columns)
+        for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):
             press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
             depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
-            give = None if cover is None else self._give(torch.as_tensor(cover[place], dtype=self._dtype))
-            sides = None if self._side_give is None else self._side_give.boxes(top, left, (height, width))
+            share = torch.ones(()) if covered is None else torch.as_tensor(covered[place], dtype=self._dtype)
+            # The pressure on the covered share is 1 / share times the cell's mean.
+            give = self.cell_compliance_mm_per_mpa * torch.where(share > 0, 1 / share - 1, 0.0)
+            sides = None if self._side_give is None else self._side_give.boxes(*place[1:])
             found, error, taken = self._conjugate_gradients(depth, press, tolerance, give, sides)
             pressure_mpa[place] = found.numpy()
             residual[poses] = error.numpy()
             steps = max(steps, taken)
         return ContactResult(pressure_mpa, steps, residual, self)
 
-    def _give(self, cover: torch.Tensor) -> torch.Tensor:
-        """Return the additional displacement of a cell under its own pressure due to partial cover, in [mm/MPa].
-
-        The pressure on the covered share is 1 / cover times the cell's mean.
-        """
-        return self.cell_compliance_mm_per_mpa * torch.where(cover > 0, 1 / cover - 1, 0.0)
-
     def _conjugate_gradients(
         self,
         depth: torch.Tensor,
         press: torch.Tensor,
         tolerance: float,
-        give: torch.Tensor | None,
+        give: torch.Tensor,
         sides: SideGive | None,
     ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """Return pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1)."""
+        """Return pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1).
+
+        `give` is the additional displacement per pressure of partly covered cells, in [mm/MPa].
+        """
         reachable = depth < REACH * press
         wanted = torch.where(reachable, press - depth, 0.0)
-        if give is None:
-            give = torch.zeros(())
         pressure = wanted.clamp_min(0) / (self.cell_compliance_mm_per_mpa + give)
         give = give.expand_as(pressure)
         result, residual = pressure.clone(), torch.zeros(len(pressure), dtype=self._dtype)
@@ -272,54 +245,11 @@ class ContactSolver:
 
     def _respond(self, pressure: torch.Tensor, give: torch.Tensor, sides: SideGive | None) -> torch.Tensor:
         """Return the displacement including the partial cells' compliance and the free sides."""
-        displacement = self._displace(pressure) + give * pressure
-        return displacement if sides is None else displacement + sides.displacement_mm(pressure)
-
-    def _displace(self, pressure: torch.Tensor) -> torch.Tensor:
-        """Return the displacement within boxes (n, height, width) under pressures in them."""
         height, width = pressure.shape[1:]
         padded = (2 * height, 2 * width)
-        if (height, width) not in self._spectra:
-            rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
-            kernel = torch.as_tensor(self._kernel[np.ix_(rows, columns)], dtype=self._dtype)
-            self._spectra[height, width] = torch.fft.rfft2(kernel).real
-        spectrum = torch.fft.rfft2(pressure, s=padded) * self._spectra[height, width]
-        return torch.fft.irfft2(spectrum, s=padded)[:, :height, :width]
-
-
-def period_cells(layer: Layer, size: int, cell_mm: float) -> int:
-    """Return the period of the grid on which the kernels of a pad are computed, in cells."""
-    return 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
-
-
-def box_sides(size: int) -> list[int]:
-    """Return sides of boxes on a pad: powers of two, which suit the FFT, and few, so that many poses share one."""
-    return [side for side in (8, 16, 32, 64, 128, 256) if side < size]
-
-
-def boxes(
-    within: NDArray[np.bool_], sides: list[int]
-) -> list[tuple[tuple[int, int], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-    """Group poses by shape of their bounding box: (shape, their indices, first row and first column of each box).
-
-    Args:
-        within: (n, size, size), the cells that a box must hold.
-        sides: allowed sides of boxes, rising; the last is the pad's.
-    """
-    size = within.shape[-1]
-    shapes, starts = [], []
-    for axis in (1, 2):
-        used = np.asarray(within.any(axis=3 - axis))
-        first, last = used.argmax(axis=1), size - 1 - used[:, ::-1].argmax(axis=1)
-        side = np.array(sides)[np.searchsorted(sides, last - first + 1)]
-        shapes.append(side)
-        starts.append(np.minimum(first, size - side))
-    kinds, kind = np.unique(np.stack(shapes, axis=1), axis=0, return_inverse=True)
-    groups = [np.flatnonzero(kind.reshape(-1) == i) for i in range(len(kinds))]
-    return [
-        ((int(height), int(width)), poses, starts[0][poses], starts[1][poses])
-        for (height, width), poses in zip(kinds, groups, strict=True)
-    ]
+        wave = torch.fft.rfft2(pressure, s=padded) * self._grid.spectrum(height, width)
+        displacement = torch.fft.irfft2(wave, s=padded)[:, :height, :width] + give * pressure
+        return displacement if sides is None else displacement + sides.displacement_mm(pressure)
 
 
 def _total(maps: torch.Tensor) -> torch.Tensor:

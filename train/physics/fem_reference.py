@@ -7,10 +7,13 @@ determines the touching nodes: no node may be pulled, and none may overlap the s
 
 Each surface takes minutes, so results are kept in a folder. FElupe is required, which is GPL and therefore a separate
 extra; only this module imports it.
+
+Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (the split of shape and volume).
 """
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -26,7 +29,6 @@ from firmware_bridge.extras import how_to_install
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
-from train.physics.mooney_rivlin import C2_SHARE, MooneyRivlin
 from train.surfaces.depth_image import Pose, Relief, depth_image
 from train.surfaces.named_surfaces import surface_mesh
 
@@ -42,6 +44,8 @@ CENTRE: Final = Pose(0.0, 0.0, 0.0)
 """Position 5, rotation 0 of the paper."""
 LAYER: Final = replace(Layer(), poisson=0.495)
 """Layer of rubber: the solver's own Poisson's ratio is lower to account for free sides, which the elements have."""
+C2_SHARE: Final = 0.2
+"""Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
 _EDITION: Final = 1
 """Edition of kept results; raise it when the results of the elements change."""
 _RESIDUAL: Final = 1e-6
@@ -50,14 +54,13 @@ _MAX_NEWTON: Final = 12
 _MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
 """Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
-_SOLVER_RESIDUAL: Final = 1e-6
-_SOLVER_STEPS: Final = 30
-_REMEDY: Final = "press in other steps: smaller ones or, near a Poisson's ratio of .5, larger"
-"""Advice in errors. A step starts from the last field scaled up, a poor start near incompressibility."""
+
+Tensors = NDArray[np.floating]
+"""Tensors (3, 3, ...) as in finite-element codes: the tensor's axes first, the points last."""
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
-    """Failure of the elements to converge; the message names step and indentation."""
+    """Failure of the elements to converge; the message names the indentation."""
 
 
 class Mesh(NamedTuple):
@@ -98,7 +101,7 @@ def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floatin
     path = folder / f"fem-{hashlib.sha256(json.dumps(question).encode()).hexdigest()[:16]}.npz"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        pad = FemPad(*mesh, LAYER)
+        pad = FemPad(*mesh)
         found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
         pattern, forces, times = pad.pattern(found.displacement_mm), found.force_n, found.run_s
         unfinished = path.with_suffix(".part.npz")  # a run that is stopped leaves no half result under the name
@@ -115,15 +118,11 @@ def relief(surface: str) -> Relief:
 
 
 class FemPresses(NamedTuple):
-    """Equilibria of one press at its steps (s,): force down and displacement of each node (s, size, size).
-
-    `residual` is the force out of balance as a share of the reactions.
-    """
+    """Equilibria of one press at its steps (s,): force down and displacement of each node (s, size, size)."""
 
     push_n: NDArray[np.float64]
     displacement_mm: NDArray[np.float64]
     touching: NDArray[np.bool_]
-    residual: NDArray[np.float64]
     run_s: NDArray[np.float64]
 
     @property
@@ -139,27 +138,18 @@ class FemPad:
         scale: nodes per taxel pitch: they lie on the pixels of the pattern at this scale, and on the pad's rim.
         cells_high: elements over the thickness.
         layer: thickness, and the material at small strain.
-        c2_share: C2 / (C1 + C2).
     """
 
-    def __init__(
-        self,
-        scale: int = 10,
-        cells_high: int = 8,
-        layer: Layer = Layer(),  # noqa: B008 - frozen
-        c2_share: float = C2_SHARE,
-    ) -> None:
+    def __init__(self, scale: int, cells_high: int, layer: Layer = LAYER) -> None:
         self.cell_mm = USPA44.pixel_pitch_mm(scale)
-        self.nodes_mm = _nodes_mm(scale)
-        self._rubber = MooneyRivlin.of_layer(layer, c2_share)
-        heights_mm = np.linspace(0, layer.thickness_mm, cells_high + 1)
-        self._mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, heights_mm)
-        self._region = felupe.RegionHexahedron(self._mesh)
-
-    @property
-    def size(self) -> int:
-        """Number of nodes along a side."""
-        return len(self.nodes_mm)
+        pixels = USPA44.cols * scale
+        inner = pixels + 2 * int((USPA44.width_mm / self.cell_mm - pixels) // 2)
+        places_mm = (np.arange(inner) - (inner - 1) / 2) * self.cell_mm
+        self.nodes_mm = np.concatenate([[-USPA44.width_mm / 2], places_mm, [USPA44.width_mm / 2]])
+        self.size = len(self.nodes_mm)
+        self._rubber = MooneyRivlin.of_layer(layer)
+        mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, np.linspace(0, layer.thickness_mm, cells_high + 1))
+        self._region = felupe.RegionHexahedron(mesh)
 
     def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
         """Press a surface in, each step starting from the last one's equilibrium.
@@ -170,20 +160,10 @@ class FemPad:
             indentation_mm: (s,), rising, in [mm].
 
         Raises:
-            ValueError: shapes do not fit, indentations do not rise, or nothing lies within reach.
+            NoEquilibriumError: the elements do not converge.
         """
-        steps_mm = np.asarray(indentation_mm, dtype=np.float64)
-        if depth_mm.shape != (self.size, self.size) or not (np.diff(steps_mm, prepend=0.0) > 0).all():
-            raise ValueError(
-                f"depth {depth_mm.shape}, expected {self.size} squared; steps {steps_mm} mm, expected rising"
-            )
-        if not (depth_mm < steps_mm[0]).any():
-            raise ValueError(f"nothing lies within {steps_mm[0]:.3g} mm of the pad, the first indentation")
         press = _Press(self._region, self._rubber, self.size)
-        found = [
-            press.advance(step_mm, step_mm - depth_mm, f"step {i + 1} of {len(steps_mm)}, indentation {step_mm:.3g} mm")
-            for i, step_mm in enumerate(steps_mm)
-        ]
+        found = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]
         return FemPresses(*map(np.array, zip(*found, strict=True)))
 
     def pattern(self, displacement_mm: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -197,95 +177,74 @@ class FemPad:
 class _Press:
     """State of a press: the current equilibrium and its touching nodes."""
 
-    def __init__(self, region: Any, rubber: MooneyRivlin, size: int) -> None:
+    def __init__(self, region: Any, rubber: "MooneyRivlin", size: int) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
-        self._body = _body(self._field, rubber)
-        self._solver = _TangentSolver()
+        material = felupe.Material(
+            stress=lambda x: [rubber.stress(x[0]), x[-1]], elasticity=lambda x: [rubber.stiffness(x[0])]
+        )
+        # The mixed elements add the volumetric part.
+        self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
+        self._factors: SuperLU | None = None
         self._touching = np.zeros((size, size), dtype=bool)
         self._indentation_mm = 0.0
         points = region.mesh.npoints
         self._top = np.arange(points - size**2, points)
         self._board = np.arange(size**2)
 
-    def advance(self, indentation_mm: float, wanted_mm: NDArray[np.floating], name: str) -> tuple[Any, ...]:
+    def advance(self, indentation_mm: float, wanted_mm: NDArray[np.floating]) -> tuple[Any, ...]:
         """Advance to the surface at `wanted_mm` below the pad's face, (size, size)."""
         start = perf_counter()
-        moved = self._field[0].values
         if self._indentation_mm:
             # Nearly linear: the last step's field, scaled up, is close to the next one's.
-            moved *= indentation_mm / self._indentation_mm
-        down_mm = self._down_mm()
-        self._touch(self._touching | (wanted_mm > down_mm))
+            self._field[0].values *= indentation_mm / self._indentation_mm
+        self._touch(self._touching | (wanted_mm > self._down_mm()))
         for _ in range(_MAX_SETS):
-            result = self._balance(wanted_mm, name)
-            upwards_n = result.fun.reshape(-1, 3)[:, 2]
-            out_of_balance_n = upwards_n[self._top].reshape(self._touching.shape)
-            push_n = np.where(self._touching, -out_of_balance_n, 0.0)
+            upwards_n = self._balance(wanted_mm, indentation_mm).reshape(-1, 3)[:, 2]
+            push_n = np.where(self._touching, -upwards_n[self._top].reshape(self._touching.shape), 0.0)
             down_mm = self._down_mm()
             pulled = push_n < -_SLACK * push_n.sum() / self._touching.sum()
             sunk = ~self._touching & (wanted_mm - down_mm > _SLACK * indentation_mm)
             if not (pulled | sunk).any():
-                break
+                self._indentation_mm = indentation_mm
+                return push_n, down_mm, self._touching.copy(), perf_counter() - start
             self._touch(self._touching & ~pulled | sunk)
-        else:
-            raise NoEquilibriumError(f"{name}: what touches still changes after {_MAX_SETS} rounds; {_REMEDY}")
-        self._indentation_mm = indentation_mm
-        return push_n, down_mm, self._touching.copy(), float(result.fnorms[-1]), perf_counter() - start
+        raise _none_at(indentation_mm)
 
     def _down_mm(self) -> NDArray[np.float64]:
         return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
 
     def _touch(self, touching: NDArray[np.bool_]) -> None:
         if (touching != self._touching).any():
-            self._solver.forget()
+            self._factors = None  # other nodes are held
         self._touching = touching
 
-    def _balance(self, wanted_mm: NDArray[np.floating], name: str) -> Any:
-        """Run Newton's iterations with the touching nodes held at their height."""
-        pressed = self._top[self._touching.ravel()]
+    def _balance(self, wanted_mm: NDArray[np.floating], indentation_mm: float) -> NDArray[np.float64]:
+        """Run Newton's iterations with the touching nodes held at their height; return the nodes' forces."""
         held = np.full(self._field[0].values.shape, np.nan)
         held[self._board] = 0.0
-        held[pressed, 2] = -wanted_mm[self._touching]
+        held[self._top[self._touching.ravel()], 2] = -wanted_mm[self._touching]
         fixed = ~np.isnan(held.ravel())
         try:
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-                return felupe.newtonraphson(
+                balance = felupe.newtonraphson(
                     items=[self._body],
                     dof0=np.flatnonzero(fixed),
                     dof1=np.flatnonzero(~fixed),
                     ext0=held.ravel()[fixed],
-                    solver=self._solver,
+                    solver=self._solve,
                     tol=_RESIDUAL,
                     maxiter=_MAX_NEWTON,
                     verbose=False,
                 )
         except felupe.NewtonConvergenceError as error:
-            raise NoEquilibriumError(f"{name}: no equilibrium within {_MAX_NEWTON} Newton steps; {_REMEDY}") from error
+            raise _none_at(indentation_mm) from error
+        return np.asarray(balance.fun)
 
-
-def _body(field: Any, rubber: MooneyRivlin) -> Any:
-    """Return the pad's mixed elements, which add the volumetric part."""
-    material = felupe.Material(
-        stress=lambda x: [rubber.stress(x[0]), x[-1]],
-        elasticity=lambda x: [rubber.stiffness(x[0])],
-    )
-    return felupe.SolidBodyNearlyIncompressible(material, field, bulk=rubber.bulk_mpa)
-
-
-class _TangentSolver:
-    """Conjugate gradients preconditioned by the last factors, because a tangent changes little from step to step."""
-
-    def __init__(self) -> None:
-        self._factors: SuperLU | None = None
-
-    def forget(self) -> None:
-        """Discard the factors, because other nodes touch."""
-        self._factors = None
-
-    def __call__(self, tangent: csr_matrix, load: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _solve(self, tangent: csr_matrix, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solve by conjugate gradients with the last factors, because a tangent changes little from step to step."""
         if self._factors is not None:
             before = LinearOperator(tangent.shape, self._factors.solve)  # pyright: ignore[reportCallIssue] - its __new__ differs
-            solution, unfinished = cg(tangent, load, rtol=_SOLVER_RESIDUAL, maxiter=_SOLVER_STEPS, M=before)
+            solution, unfinished = cg(tangent, load, rtol=1e-6, maxiter=30, M=before)
             if not unfinished:
                 return solution
         try:
@@ -298,9 +257,73 @@ class _TangentSolver:
         return factors.solve(load)
 
 
-def _nodes_mm(scale: int) -> NDArray[np.float64]:
-    """Return the pixels of the pattern, continued to the pad's rim in the same steps, the last at least half a step."""
-    cell_mm, pixels = USPA44.pixel_pitch_mm(scale), USPA44.cols * scale
-    inner = pixels + 2 * int((USPA44.width_mm / cell_mm - pixels) // 2)
-    places_mm = (np.arange(inner) - (inner - 1) / 2) * cell_mm
-    return np.concatenate([[-USPA44.width_mm / 2], places_mm, [USPA44.width_mm / 2]])
+def _none_at(indentation_mm: float) -> NoEquilibriumError:
+    # A step starts from the last field scaled up, a poor start near incompressibility.
+    return NoEquilibriumError(
+        f"no equilibrium at an indentation of {indentation_mm:.3g} mm; press in other steps: smaller ones or, near a "
+        "Poisson's ratio of .5, larger"
+    )
+
+
+class MooneyRivlin(NamedTuple):
+    """Distortional part of a solid, whose volumetric part is K (J - 1)^2 / 2, in [MPa].
+
+    psi(F) = C1 (I1 J^(-2/3) - 3) + C2 (I2 J^(-4/3) - 3), with I1, I2 the invariants of C = F^T F and J = det F.
+    """
+
+    c1_mpa: float
+    c2_mpa: float
+    bulk_mpa: float
+
+    @classmethod
+    def of_layer(cls, layer: Layer) -> "MooneyRivlin":
+        """Return the solid that equals the layer at small strain: G = 2 (C1 + C2), K/G = 2 (1+nu) / (3 (1-2nu))."""
+        shear, nu = layer.shear_modulus_mpa, layer.poisson
+        bulk = shear * 2 * (1 + nu) / (3 * (1 - 2 * nu))
+        return cls((1 - C2_SHARE) * shear / 2, C2_SHARE * shear / 2, bulk)
+
+    def stress(self, gradient: Tensors) -> Tensors:
+        """Return the first Piola-Kirchhoff stress d psi / dF, (3, 3, ...) in [MPa]."""
+        volume, inverse = _volume_and_inverse(gradient)
+        first, second = (
+            weight * volume**-power * (slope - power * invariant * inverse)
+            for weight, power, invariant, slope in self._terms(gradient)
+        )
+        return first + second
+
+    def stiffness(self, gradient: Tensors) -> Tensors:
+        """Return the stiffness d^2 psi / dF dF, (3, 3, 3, 3, ...) in [MPa], with dJ/dF = J F^-T."""
+        volume, inverse = _volume_and_inverse(gradient)
+        one = np.eye(3).reshape(3, 3, *(1,) * (gradient.ndim - 2))
+        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
+        left = np.einsum("im...,km...->ik...", gradient, gradient)
+        curve1 = 2 * np.einsum("ik...,jl...->ijkl...", one, one)
+        curve2 = 4 * _outer(gradient, gradient) + np.einsum("ii...->...", right) * curve1
+        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", one, right)
+        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", left, one)
+        curve2 -= 2 * np.einsum("il...,kj...->ijkl...", gradient, gradient)
+        pair, parts = _outer(inverse, inverse), []
+        for (weight, power, invariant, slope), curve in zip(self._terms(gradient), (curve1, curve2), strict=True):
+            mixed = _outer(slope, inverse)
+            by_volume = power * invariant * (power * pair + np.swapaxes(pair, 1, 3))
+            by_both = power * (mixed + np.moveaxis(mixed, (0, 1), (2, 3)))
+            parts.append(weight * volume**-power * (curve - by_both + by_volume))
+        return parts[0] + parts[1]
+
+    def _terms(self, gradient: Tensors) -> Iterator[tuple[float, float, Tensors, Tensors]]:
+        """Yield the weight of I1 and I2, their power of 1/J, their value, and their derivative by F."""
+        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
+        i1 = np.einsum("ii...->...", right)
+        yield self.c1_mpa, 2 / 3, i1, 2 * gradient
+        i2 = (i1**2 - np.einsum("ij...,ij...->...", right, right)) / 2
+        yield self.c2_mpa, 4 / 3, i2, 2 * (i1 * gradient - np.einsum("ik...,kj...->ij...", gradient, right))
+
+
+def _volume_and_inverse(gradient: Tensors) -> tuple[Tensors, Tensors]:
+    """Return J and F^-T."""
+    turned = np.moveaxis(gradient, (0, 1), (-1, -2))
+    return np.linalg.det(turned), np.moveaxis(np.linalg.inv(turned), (-2, -1), (0, 1))
+
+
+def _outer(a: Tensors, b: Tensors) -> Tensors:
+    return np.einsum("ij...,kl...->ijkl...", a, b)

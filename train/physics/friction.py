@@ -6,13 +6,9 @@ moves with the surface, or slips, and bears the traction mu p against its slip (
 
 That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <= mu p in each cell, C the pad's
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
-2000): one product with C per step, by FFT on a padded grid and bounding boxes, as in train.physics.contact.
-
-Pressure alone spreads the surface too, which friction does not resist here. The effect of traction on pressure is left
-out (Goodman 1962). That is
-exact in the limit of a thick layer of nu = .5; a bonded layer's surface rises ahead of a slide and sinks at its back,
-by a quarter of the slide at most at nu = .45, and the pressure under a wide contact would lean by some tens of per
-cent. Slopes of the surface are taken as small.
+2000), with one product with C per step. Slopes of the surface are taken as small. Friction does not resist here that
+pressure alone spreads the surface, and the effect of traction on pressure is left out (Goodman 1962): exact for a thick
+layer of nu = .5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
 
 from dataclasses import dataclass
@@ -22,8 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.physics.contact import box_sides, boxes, period_cells
 from train.physics.elastic_layer import Layer, surface_tensor
+from train.physics.pad_grid import PadGrid
 
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
@@ -32,12 +28,10 @@ _REMEMBERED: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class FrictionResult:
-    """Tractions of a batch of poses.
+    """Tractions on the pad to the right and back, (n, 2, size, size), in [MPa].
 
-    Attributes:
-        traction_mpa: on the pad, to the right and back, (n, 2, size, size), in [MPa].
-        residual: (n,) root mean square error over the contact of the movement, which should vanish where cells
-            stick, and oppose the traction where they slip, as a share of the surface's movement.
+    `residual` is the root mean square error (n,) over the contact of the movement, which should vanish where cells
+    stick, and oppose the traction where they slip, as a share of the surface's movement.
     """
 
     traction_mpa: NDArray[np.float32]
@@ -45,22 +39,19 @@ class FrictionResult:
 
 
 class FrictionSolver:
-    """Solver of poses on a square grid over one pad.
-
-    Args:
-        layer: the pad.
-        size: cells along a side.
-        cell_mm: cell size, in [mm].
-        dtype: torch.float32 or torch.float64.
-    """
+    """Solver of poses on a square grid over one pad, with the arguments of `train.physics.contact.ContactSolver`."""
 
     def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
+        def compliance(q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
+            xx, yy, xy = surface_tensor(layer, q_x, q_y)
+            # The highest wave is its own mirror image, so an odd transfer is zero there.
+            xy[len(xy) // 2] = xy[:, -1] = 0.0
+            return np.stack([xx, yy, xy])
+
         self.size = size
         self.cell_mm = cell_mm
         self._dtype = dtype
-        self._sides = [*box_sides(size), size]
-        self._kernels = _kernels(layer, period_cells(layer, size, cell_mm), cell_mm)
-        self._spectra: dict[tuple[int, int], torch.Tensor] = {}
+        self._grid = PadGrid(layer, size, cell_mm, dtype, compliance)
 
     def displacement_mm(self, traction_mpa: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the surface displacement (n, 2, size, size) under tractions of that shape, in [mm]."""
@@ -84,35 +75,28 @@ class FrictionSolver:
             tolerance: residual at which a pose is done.
         """
         count = len(pressure_mpa)
-        found = (pressure_mpa.shape, np.shape(slide_mm), np.shape(twist_rad), np.shape(friction))
-        expected = ((count, self.size, self.size), (count, 2), (count,), (count,))
-        if found != expected:
-            raise ValueError(f"pressure, slide, twist and friction of shapes {found}, expected {expected}")
         if not (np.asarray(friction) >= 0).all():
             raise ValueError(f"friction is {np.min(friction)}, expected 0 or more")
         for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):
             if not np.isfinite(given).all():
                 raise ValueError(f"a {name} is not finite, expected numbers")
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
-        moved_mm = np.empty((count, 2, self.size, self.size))
-        moved_mm[:, 0] = slide_mm[:, 0, None, None] - twist_rad[:, None, None] * along_mm[:, None]
-        moved_mm[:, 1] = slide_mm[:, 1, None, None] + twist_rad[:, None, None] * along_mm
+        turn = twist_rad[:, None, None] * along_mm
+        moved_mm = (
+            np.broadcast_to(slide_mm[:, 0, None, None] - turn.mT, pressure_mpa.shape),
+            np.broadcast_to(slide_mm[:, 1, None, None] + turn, pressure_mpa.shape),
+        )
         limit_mpa = np.maximum(pressure_mpa, 0) * friction[:, None, None]
         traction_mpa = np.zeros((count, 2, self.size, self.size), dtype=np.float32)
         residual = np.zeros(count, dtype=np.float32)
-        bears = (limit_mpa > 0).any(axis=(1, 2))  # else there is nothing to solve
-        working = np.flatnonzero(bears)
-        for (height, width), rows, top, left in boxes(limit_mpa[working] > 0, self._sides) if len(working) else ():
-            poses = working[rows]
-            down = (top[:, None] + np.arange(height))[:, :, None]
-            across = (left[:, None] + np.arange(width))[:, None, :]
-            in_box = (poses[:, None, None, None], np.arange(2)[:, None, None], down[:, None], across[:, None])
+        for poses, place in self._grid.boxes(limit_mpa > 0):
             found, error = self._projected_gradients(
-                torch.as_tensor(limit_mpa[poses[:, None, None], down, across], dtype=self._dtype)[:, None],
-                torch.as_tensor(moved_mm[in_box], dtype=self._dtype),
+                torch.as_tensor(limit_mpa[place], dtype=self._dtype)[:, None],
+                torch.as_tensor(np.stack([part[place] for part in moved_mm], axis=1), dtype=self._dtype),
                 tolerance,
             )
-            traction_mpa[in_box] = found.numpy()
+            for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
+                part[place] = found[:, axis].numpy()
             residual[poses] = error.numpy()
         return FrictionResult(traction_mpa, residual)
 
@@ -124,7 +108,7 @@ class FrictionSolver:
         wanted = torch.where(touching, moved, 0.0)
         cells = touching.sum(dim=(1, 2, 3)).clamp_min(1)
         scale = torch.sqrt(_dot(wanted, wanted)[:, 0, 0, 0] / cells).clamp_min(1e-30)
-        cell = float(self._kernels[0, 0, 0])  # [mm/MPa]: displacement of a cell under its own traction
+        cell = self._grid.cell_mm_per_mpa
         # The start takes the contact as moving together, with a response close to that of an even traction.
         response = self._displace(wanted)
         length = _dot(wanted, wanted) / _dot(wanted, response).clamp_min(1e-30)
@@ -167,33 +151,10 @@ class FrictionSolver:
         """Return the displacement within boxes (n, 2, height, width) under tractions in them."""
         height, width = traction.shape[2:]
         padded = (2 * height, 2 * width)
-        if (height, width) not in self._spectra:
-            rows, columns = (np.fft.ifftshift(np.arange(-side, side)) for side in (height, width))
-            kernels = torch.as_tensor(self._kernels[:, rows[:, None], columns], dtype=self._dtype)
-            # Even, or odd in both axes: their transforms are real.
-            self._spectra[height, width] = torch.fft.rfft2(kernels).real
-        xx, yy, xy = self._spectra[height, width]
-        wave = torch.fft.rfft2(traction, s=padded)
-        right, back = wave[:, 0], wave[:, 1]
+        xx, yy, xy = self._grid.spectrum(height, width)
+        right, back = torch.fft.rfft2(traction, s=padded).unbind(dim=1)
         moved = torch.stack([xx * right + xy * back, xy * right + yy * back], dim=1)
         return torch.fft.irfft2(moved, s=padded)[:, :, :height, :width]
-
-
-def _kernels(layer: Layer, period: int, cell_mm: float) -> NDArray[np.float64]:
-    """Return the displacement around one cell under its traction, (3, period, period) in [mm/MPa]: xx, yy and xy."""
-    q_x, q_y = _waves(period, cell_mm)
-    xx, yy, xy = surface_tensor(layer, q_x, q_y)
-    # The highest wave is its own mirror image, so an odd transfer is zero there.
-    xy[period // 2] = xy[:, -1] = 0.0
-    return np.fft.irfft2(np.stack([xx, yy, xy]), s=(period, period))
-
-
-def _waves(period: int, cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return wave numbers to the right (1, m) and back (period, 1), in [1/mm]."""
-    q_x, q_y = np.fft.rfftfreq(period, cell_mm), np.fft.fftfreq(period, cell_mm)
-    return 2 * np.pi * np.asarray(q_x, dtype=np.float64)[None, :], 2 * np.pi * np.asarray(q_y, dtype=np.float64)[
-        :, None
-    ]
 
 
 def _project(traction: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:

@@ -1,16 +1,12 @@
-"""Presses of any shape onto one pad, at one moment: pressure, traction, readings, and truth.
+"""Presses of any shape onto one pad: pressure, traction, readings, and truth.
 
-Each press is one moment, with its own pad, tilt, tangential load and twist. Shapes are heights at any place
-(`train.families`), sampled on a grid of SAMPLES x SAMPLES places a cell, which give each cell's depth and covered
-share. The paper's taps are followed from first contact to their end (`GrippedPad.tap`).
-
-A soft object deforms like a thick layer; a cloth or glove on the pad deforms and spreads the load. Friction is solved
-after the pressure, which it leaves unchanged (Goodman 1962).
+Shapes are heights at any place (`train.families`), sampled on SAMPLES x SAMPLES places a cell, which give each cell's
+depth and covered share. A press is one moment; the paper's taps are followed from first contact to their end
+(`GrippedPad.tap`). Friction is solved after the pressure, which it leaves unchanged (Goodman 1962).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -40,10 +36,7 @@ SCALE: Final = 10
 TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
 _CELLS_PER_PITCH: Final = 10
-_LIGHTER: Final = 0.9
-"""Power of the force's excess by which depth is lowered; force grows faster than depth."""
 _MOST_TRIES: Final = 6
-
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
@@ -113,18 +106,7 @@ class GrippedPad:
         self._beside = ~on_pad(geometry, self.size * SAMPLES, self.cell_mm / SAMPLES)
         self._solvers: dict[Cover, ContactSolver] = {}
         self._friction = FrictionSolver(pad.layer, self.size, self.cell_mm)
-        self.skin = Skin(
-            pad.geometry(),
-            pad.layer,
-            self.size,
-            self.cell_mm,
-            pad.magnet,
-            in_plane_share=pad.in_plane_share,
-            rest=pad.rest(geometry.taxel_count),
-            moments=pad.moments(geometry.taxel_count),
-            counts_per_newton=pad.counts_per_newton,
-            sides=pad.sides,
-        )
+        self.skin = Skin(pad, self.size, self.cell_mm)
         across = ((np.arange(self.size * SAMPLES) + 0.5) / SAMPLES - self.size / 2) * self.cell_mm
         self.places_mm = (across[None, :].astype(np.float32), across[:, None].astype(np.float32))
         self._uneven_mm = pad.uneven(*self.places_mm)
@@ -169,7 +151,22 @@ class GrippedPad:
             pressure[which], depth[which] = self._pressed(
                 cover, cells_mm[which], share[which], depth[which], most_force_n
             )
-        return self._result(covers, depth_mm, cells_mm, pressure, depth, slide_mm, twist_rad, friction, scale)
+        pressed_mm = depth.astype(np.float32)
+        on_pad_mpa = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
+        sideways_mpa = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction).traction_mpa
+        loads = np.concatenate([sideways_mpa, on_pad_mpa[:, None]], axis=1)
+        across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
+        moments = loads[:, 1] * across[None, :] - loads[:, 0] * across[:, None]
+        patterns, touching = self._truth(covers, depth_mm, cells_mm, pressure, on_pad_mpa, pressed_mm)
+        return Presses(
+            counts=self.skin.frames(on_pad_mpa[:, None], sideways_mpa[:, None])[:, 0],
+            patterns=resample(patterns, FINE_SCALE, scale),
+            touching=resample_touching(touching, FINE_SCALE, scale),
+            traction_kpa=self._cut(self._coarse(loads) * 1e3, TRACTION_SCALE),
+            force_n=loads.sum(axis=(2, 3)) * np.float32(self.cell_mm**2),
+            twist_nmm=(moments.sum(axis=(1, 2)) * self.cell_mm**2).astype(np.float32),
+            indentation_mm=pressed_mm,
+        )
 
     def tap(self, heights_mm: NDArray[np.float32], force_n: NDArray[np.floating] | float) -> Taps:
         """Press flat figures straight down until the set force or MAX_INDENTATION_MM, whichever comes first.
@@ -185,18 +182,15 @@ class GrippedPad:
         pressure, _ = self._pressed(BARE, cells_mm, share, most_mm.copy(), np.inf)
         most_n = pressure.sum(axis=(1, 2)) * self.cell_mm**2
         end = np.minimum(force_n / most_n, 1.0)[:, None] * (np.arange(FRAMES) + 1) / FRAMES
-        pressed = most_mm.astype(np.float32)
-        covers, solvers = [BARE] * len(heights_mm), {BARE: self._solver(BARE)}
-        fine_mm, touching = pressed_in(
-            solvers, covers, depth_mm, cells_mm, pressure, pressure, pressed, self._pattern_cells
-        )
-        patterns = self._cut(heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2), FINE_SCALE)
+        covers, pressed_mm = [BARE] * len(heights_mm), most_mm.astype(np.float32)
+        patterns, touching = self._truth(covers, depth_mm, cells_mm, pressure, pressure, pressed_mm)
+        unit = self.skin.movement(pressure / MAX_INDENTATION_MM)[:, None]
         return Taps(
-            counts=self.skin.flat_frames(pressure / MAX_INDENTATION_MM, end * MAX_INDENTATION_MM),
+            counts=self.skin.counts(unit * (end * MAX_INDENTATION_MM)[..., None, None].astype(unit.dtype)),
             force_n=(most_n[:, None] * end).astype(np.float32),
             indentation_mm=(end * MAX_INDENTATION_MM).astype(np.float32),
             unit_patterns=patterns / np.float32(MAX_INDENTATION_MM),
-            touching=self._cut(touching, FINE_SCALE),
+            touching=touching,
         )
 
     def _cut(self, maps: NDArray[_Kind], scale: int) -> NDArray[_Kind]:
@@ -231,55 +225,36 @@ class GrippedPad:
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return pressures on the shape, and the indentations at which no force exceeds the limit."""
         solver = self._solver(cover)
-        indentation_mm = np.maximum(indentation_mm, cells_mm.min(axis=(1, 2)) + 1e-3)
+        least_mm = cells_mm.min(axis=(1, 2)) + 1e-3
+        indentation_mm = np.maximum(indentation_mm, least_mm)
         pressure = np.empty_like(cells_mm)
         open_ = np.arange(len(cells_mm))
         for _ in range(_MOST_TRIES):
-            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], cover=share[open_]).pressure_mpa
+            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_]).pressure_mpa
             force_n = pressure[open_].sum(axis=(1, 2)) * self.cell_mm**2
             over = force_n > most_force_n
             if not over.any():
                 break
             open_, excess = open_[over], force_n[over] / most_force_n
-            indentation_mm[open_] = np.maximum(
-                indentation_mm[open_] * 0.98 / excess**_LIGHTER, cells_mm[open_].min(axis=(1, 2)) + 1e-3
-            )
+            lighter_mm = indentation_mm[open_] * 0.98 / excess**0.9  # force grows faster than depth
+            indentation_mm[open_] = np.maximum(lighter_mm, least_mm[open_])
         return pressure, indentation_mm
 
-    def _result(
+    def _truth(
         self,
         covers: Sequence[Cover],
         depth_mm: NDArray[np.float32],
         cells_mm: NDArray[np.float32],
         pressure: NDArray[np.float32],
-        indentation_mm: NDArray[np.float64],
-        slide_mm: NDArray[np.floating],
-        twist_rad: NDArray[np.floating],
-        friction: NDArray[np.floating],
-        scale: int,
-    ) -> Presses:
-        on_pad = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
-        sideways = self._friction.solve(on_pad, slide_mm, twist_rad, friction).traction_mpa
-        counts = self.skin.frames(on_pad[:, None], sideways[:, None])[:, 0]
-        pressed = indentation_mm.astype(np.float32)
-        solvers = {cover: self._solver(cover) for cover in (BARE, *covers)}
+        on_pad_mpa: NDArray[np.float32],
+        pressed_mm: NDArray[np.float32],
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Return patterns and contact areas at FINE_SCALE, of loads as in `pressed_in`."""
         fine_mm, touching = pressed_in(
-            solvers, covers, depth_mm, cells_mm, pressure, on_pad, pressed, self._pattern_cells
+            self._solver, covers, depth_mm, cells_mm, pressure, on_pad_mpa, pressed_mm, self._pattern_cells
         )
-        patterns = self._cut(heights_pattern(fine_mm, touching, pressed, self.cell_mm / 2), FINE_SCALE)
-        loads = np.concatenate([sideways, on_pad[:, None]], axis=1)
-        force = loads.sum(axis=(2, 3)) * np.float32(self.cell_mm**2)
-        across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
-        twist = (loads[:, 1] * across[None, :] - loads[:, 0] * across[:, None]).sum(axis=(1, 2)) * self.cell_mm**2
-        return Presses(
-            counts=counts,
-            patterns=resample(patterns, FINE_SCALE, scale),
-            touching=resample_touching(self._cut(touching, FINE_SCALE), FINE_SCALE, scale),
-            traction_kpa=self._cut(self._coarse(loads) * 1e3, TRACTION_SCALE),
-            force_n=force,
-            twist_nmm=twist.astype(np.float32),
-            indentation_mm=pressed,
-        )
+        patterns = heights_pattern(fine_mm, touching, pressed_mm, self.cell_mm / 2)
+        return self._cut(patterns, FINE_SCALE), self._cut(touching, FINE_SCALE)
 
     def _coarse(self, loads: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return means of loads (n, 3, size, size) on the traction's grid, whose outer pixels include loads outside."""
@@ -291,8 +266,6 @@ class GrippedPad:
 
     def _solver(self, cover: Cover) -> ContactSolver:
         if cover not in self._solvers:
-            give = partial(cover.compliance, self.pad.layer)
-            self._solvers[cover] = ContactSolver(
-                self.pad.layer, self.size, self.cell_mm, compliance=give, sides=self.pad.sides
-            )
+            pad = self.pad
+            self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.sides)
         return self._solvers[cover]

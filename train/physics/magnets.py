@@ -16,15 +16,15 @@ from firmware_bridge.pad_geometry import SensorGeometry
 MOVEMENT: Final = ("right_mm", "back_mm", "down_mm", "lean_x", "lean_y")
 """Components of a magnet's movement: along x and y, towards the board, and the slopes dx/dz and dy/dz of its axis."""
 _DOWN: Final = MOVEMENT.index("down_mm")
+_DIPOLE_CLEARANCE: Final = 0.75
+"""Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %; see docs/decisions.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class Magnet:
-    """Small axial magnet in the pad and the chip under it; no data sheet states them, so the sizes are plausible ones.
+    """Small axial cylinder in the pad and the chip under it; no data sheet states their sizes.
 
     Attributes:
-        diameter_mm: of the cylinder.
-        thickness_mm: of the cylinder.
         remanence_t: of the material; 1.2 is common neodymium.
         height_mm: of the magnet's centre above the board.
         chip_height_mm: of the sensitive spot above the board, under the magnet's centre.
@@ -73,12 +73,9 @@ Vectors = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]
 
 
 def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
-    """Return the flux density of magnets taken as dipoles, B = k (3 (m r) r / r^5 - m / r^3), in [mT].
+    """Return the flux density of dipoles, B = k (3 (m r) r / r^5 - m / r^3), in [mT], at r from the magnets' centres.
 
-    Args:
-        magnet: its size and material; k is its strength.
-        away_mm: vector from the magnet's centre to the evaluation point, in [mm].
-        axis: unit vectors m from south to north.
+    k is the magnet's strength, m are unit vectors from south to north.
 
     Source: Jackson, Classical Electrodynamics, Eq. 5.56.
     """
@@ -87,13 +84,6 @@ def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
     fall = magnet.strength_mt_mm3 / (square * np.sqrt(square))
     pull = 3 * fall * (x * m_x + y * m_y + z * m_z) / square
     return pull * x - fall * m_x, pull * y - fall * m_y, pull * z - fall * m_z
-
-
-_DIPOLE_CLEARANCE: Final = 0.75
-"""Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %.
-
-At the default magnet's rest it is off by 7 %, pressed by .5 mm by 12 % (docs/decisions.md).
-"""
 
 
 class MagnetArray:
@@ -124,14 +114,7 @@ class MagnetArray:
         self._apart_mm = (centres_mm[:, :, None] - centres_mm[:, None, :]).astype(np.float32)
 
     def change_mt(self, movement: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the change of the field at the chips by the magnets' movement; exactly zero without movement.
-
-        Args:
-            movement: (..., taxels, 5), each magnet's MOVEMENT.
-
-        Returns:
-            (..., taxels, 3), x, y, z in [mT].
-        """
+        """Return the change of the field at the chips (..., taxels, 3), in [mT], by MOVEMENT (..., taxels, 5)."""
         rest = self._rest.astype(movement.dtype)
         placed = movement + rest
         self._check_clear(self.magnet.clearance_mm - float(placed[..., _DOWN].max(initial=0.0)))

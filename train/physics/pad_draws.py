@@ -10,7 +10,9 @@ from firmware_bridge.pad_geometry import PADS, USPA44, SensorGeometry
 from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 from train.physics.side_correction import FreeSides
-from train.physics.taxel_response import IN_PLANE_SHARE, NEWTONS_PER_COUNT_Z
+
+NEWTONS_PER_COUNT_Z: Final = 0.00085
+"""By the data sheet, for the sum of z."""
 
 _UNEVEN_MM: Final = 0.015
 """Largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]."""
@@ -20,8 +22,7 @@ _TILT_RAD: Final = 0.05
 _SEAT_MM: Final = 0.02
 """Standard deviation of one magnet's height about the pad's, in [mm].
 
-With the moment it makes a gain of .04, and with the chips' .075 the 15 % either way that is seen on devices; .05 mm
-would make a tenth alone.
+With the moment it makes a gain of .04, and with the chips' .075 the 15 % either way that is seen on devices.
 """
 _MOMENT: Final = 0.015
 """Standard deviation of one magnet's moment, relative to the nominal one, within one batch."""
@@ -35,7 +36,8 @@ class Pad:
         thickness_mm: of the soft layer.
         shear_modulus_mpa: of its material.
         poisson: effective Poisson ratio.
-        in_plane_share: factor on the in-plane movement that pressure alone gives the magnets.
+        in_plane_share: factor on the in-plane movement that pressure alone gives the magnets, which in reality
+            friction holds: grips have an in-plane to normal ratio of .18 to .26, without the factor it would be .57.
         magnet_height_mm: of the magnets' centres above the board.
         counts_per_newton: summed z under an even load.
         pitch_mm: distance of neighbouring taxels, of another model in proportion to its own.
@@ -48,7 +50,7 @@ class Pad:
     thickness_mm: float = 4.5
     shear_modulus_mpa: float = 0.12
     poisson: float = 0.45
-    in_plane_share: float = IN_PLANE_SHARE
+    in_plane_share: float = 0.4
     magnet_height_mm: float = 2.5
     counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z
     pitch_mm: float = USPA44.pitch_mm
@@ -143,9 +145,9 @@ KNOWN: Final = 2 * len(INPUTS) + 1
 def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
     """Draw a pad with each constant within its range; a `spread` below 1 moves all towards the nominal pad."""
     drawn = {}
-    for name, (low, high) in RANGES.items():
+    for name, bounds in RANGES.items():
         nominal = getattr(NOMINAL, name)
-        drawn[name] = nominal + spread * (rng.uniform(low, high) - nominal)
+        drawn[name] = nominal + spread * (rng.uniform(*bounds) - nominal)
     return Pad(**drawn, uneven_mm=spread * rng.uniform(0, _UNEVEN_MM), seed=int(rng.integers(2**31)))
 
 
@@ -156,21 +158,17 @@ def input_scale() -> list[tuple[str, float, float]]:
 
 def constants(pad: Pad) -> NDArray[np.float32]:
     """Return the constants that a network takes, each over its spread, (len(INPUTS),)."""
-    return np.array(
-        [(getattr(pad, name) - centre) / spread for name, centre, spread in input_scale()], dtype=np.float32
-    )
+    scaled = [(getattr(pad, name) - centre) / spread for name, centre, spread in input_scale()]
+    return np.array(scaled, dtype=np.float32)
 
 
 def known_numbers(
     scaled: NDArray[np.float32], known: NDArray[np.bool_], certainty: NDArray[np.floating] | NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Return the pad inputs (n, KNOWN) of a network; all zeros without any constant.
+    """Return the pad inputs (n, KNOWN) of a network, of constants over their spread and flags of those to pass on.
 
-    Args:
-        scaled: constants over their spread, (n, len(INPUTS)).
-        known: flags of the constants to pass on, same shape.
-        certainty: (n,) of the gains that readings were divided by: 1 less their deviation over the spread of a new
-            sensor's, 1 for the true gains and 0 for none.
+    The certainty (n,) of the gains that readings were divided by is 1 less their deviation over the spread of a new
+    sensor's: 1 for the true gains, 0 for none.
     """
     flags = known.astype(np.float32)
     return np.concatenate([scaled * flags, flags, certainty.astype(np.float32)[:, None]], axis=1)

@@ -13,20 +13,13 @@ from numpy.typing import NDArray
 def resample(
     patterns: NDArray[np.floating] | NDArray[np.bool_], from_scale: float, to_scale: float
 ) -> NDArray[np.float32]:
-    """Resample maps (n, H, W) from `from_scale` to `to_scale` pixels per pitch: (n, H', W'), in the same unit.
+    """Resample maps (n, H, W) from one number of pixels per pitch to another: (n, H', W'), in the same unit.
 
-    Towards a finer scale a pixel is repeated: no detail is added.
-
-    Args:
-        patterns: (n, H, W); of a mask, the share of each pixel that is set.
-        from_scale: pixels per pitch of the maps.
-        to_scale: pixels per pitch of the result; it must give a whole number of pixels.
+    Towards a finer scale a pixel is repeated: no detail is added. Of a mask, the share of each pixel that is set.
 
     Raises:
-        ValueError: shapes or scales do not fit.
+        ValueError: the scales do not give a whole number of pixels.
     """
-    if patterns.ndim != 3:
-        raise ValueError(f"patterns of shape {patterns.shape}, expected (n, H, W)")
     maps = np.asarray(patterns, dtype=np.float32)
     if from_scale == to_scale:
         return maps.copy()

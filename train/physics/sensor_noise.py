@@ -1,8 +1,8 @@
 """Nuisances that real sensors add to the physics: named, seeded with independent streams, each can be switched off.
 
-The order is that of the signal's path. The pad lags (hysteresis), neighbours are visible (cross-talk), the chip has its
-gain; a warming pad and the earth's field add to it; then noise, the end of the range, dead taxels, and rounding to
-whole counts. Cross-talk comes before gain, because it is a field, which the chip amplifies with the rest.
+The order is that of the signal's path. The pad lags (hysteresis), neighbours are visible (cross-talk, a field, which
+the chip amplifies with the rest), the chip has its gain; a warming pad and the earth's field add to it; then noise, the
+end of the range, dead taxels, and rounding to whole counts.
 
 Of the lag: with c the elastic reading, a reading is (1 - share) c + share q with dq/dt = (c - q) / relaxation_s: the
 standard linear solid, a spring parallel to one Maxwell element.
@@ -28,14 +28,8 @@ LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
 """Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
 TAP_S: Final = (0.2, 2.5)
 """Bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15."""
-
-_LEAST_SHARE: Final = 0.01
 _RELAXATION_S: Final = (0.2, 5.0)
 _OFF: Final = {"saturation_counts": (inf, inf, inf)}
-_DRIFT_OF_AXIS: Final = np.array([1 / 8, 1 / 8, 1.0])
-_DRIFT_OF_TAXEL: Final = 0.25
-_REST_COUNTS: Final = (32700.0, 32800.0, 37400.0)
-_REST_SPREAD_COUNTS: Final = 300.0
 
 
 class NuisanceError(TrainError, ValueError):
@@ -46,21 +40,18 @@ class NuisanceError(TrainError, ValueError):
 class Nuisances:
     """Strength of each nuisance, with defaults observed on devices in the field; 0 is off, for saturation infinity.
 
-    Nuisances of every sensor are on. Spreads are cut at two standard deviations. One sensor reads all taps of a window.
+    Spreads are cut at two standard deviations. One sensor reads all taps of a window.
 
     Attributes:
-        pose_error_mm: standard deviation of a tap's x and y, for a sensor on a hand-mounted gripper. The paper's robot
-            repeats to .03 mm.
+        pose_error_mm: standard deviation of a tap's x and y, for a hand-mounted gripper; the paper's robot has .03 mm.
         pose_error_deg: the same of its angle.
-        hysteresis: largest share of a reading that lags (one Maxwell element), per sensor between .01 and this: data
-            sheet 1.1 %, skins in the field up to 11 %.
+        hysteresis: largest share of a reading that lags, per sensor from .01: data sheet 1.1 %, in the field to 11 %.
         cross_talk: largest share of a reading that shows in its four neighbours in addition to that of the nominal
             magnets, per sensor: 5 % corresponds to half a millimetre of magnet height, by the dipole's law.
         gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % observed.
         thermal_drift_counts: standard deviation of z's drift since the last zeroing; x and y an eighth of it; common
-            to all taxels but for a quarter (the rests of one sensor moved by 8 to 32 counts, 25 in the mean). Warming
-            up is 120 counts per 3.5 K; a drift of 94 reads as a contact, and two deviations stay below it: users who
-            zero again after warming up, and whenever a free pad shows a contact, see no more.
+            to all taxels but for a quarter. A drift of 94 reads as a contact, and two deviations stay below it: users
+            who zero again after warming up (120 counts per 3.5 K) see no more.
         earth_field_counts: length of the earth's field, which is constant in space while the pad turns; zeroed at
             another attitude. The rests of one sensor differed by 25 counts in two attitudes, sqrt(2) times the field.
         noise_counts: standard deviation of a reading at rest: 1.7 to 2.6 measured.
@@ -81,15 +72,15 @@ class Nuisances:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "saturation_counts", tuple(self.saturation_counts))  # a list, if it comes from JSON
-        for name in NAMES:
-            value = getattr(self, name)
-            if name == "saturation_counts":
-                if len(value) != len(AXES) or not all(limit > 0 for limit in value):
-                    raise NuisanceError(f"{name} is {value}, expected three numbers above 0 for x, y, z; inf is off")
-                continue
-            largest = _LARGEST.get(name, inf)
-            if not (isfinite(value) and 0 <= value <= largest):
-                raise NuisanceError(f"{name} is {value}, expected 0 (off) to {largest:g}, finite")
+        if len(self.saturation_counts) != len(AXES) or not all(limit > 0 for limit in self.saturation_counts):
+            raise NuisanceError(
+                f"saturation_counts is {self.saturation_counts}, expected three numbers above 0 for x, y, z; inf is off"
+            )
+        largest = {"hysteresis": 1.0, "cross_talk": 1.0, "dead_taxels": 1.0, "gain_spread": 0.5}  # no negative gain
+        for name in set(NAMES) - {"saturation_counts"}:
+            value, most = getattr(self, name), largest.get(name, inf)
+            if not (isfinite(value) and 0 <= value <= most):
+                raise NuisanceError(f"{name} is {value}, expected 0 (off) to {most:g}, finite")
 
     @classmethod
     def none(cls) -> Self:
@@ -106,13 +97,6 @@ class Nuisances:
 
 NAMES: Final = tuple(field.name for field in fields(Nuisances))
 """Names of all nuisances in the order in which they act."""
-
-_LARGEST: Final = {
-    "hysteresis": 1.0,
-    "cross_talk": 1.0,
-    "gain_spread": 0.5,  # more, and a gain could be negative
-    "dead_taxels": 1.0,
-}
 
 
 def apply_nuisances(
@@ -135,7 +119,6 @@ def apply_nuisances(
     Returns:
         Whole zeroed counts, shape of `clean`.
     """
-    _check_clean(clean)
     frame = np.broadcast_to(np.arange(1.0, clean.shape[2] + 1), clean.shape[:3])
     return _read(clean, frame, nuisances, seed, tap_s, angle_deg)
 
@@ -148,20 +131,11 @@ def read_windows(
     tap_s: ArrayLike | None = None,
     angle_deg: ArrayLike = 0.0,
 ) -> NDArray[np.float32]:
-    """Return the readings of n sensors in one scan of each of their K taps, at any moment of the press.
+    """Return the readings (n, K, 3, rows, cols) of n sensors in one scan of each of their K taps.
 
-    Args:
-        clean: as in `apply_nuisances`; readings are interpolated linearly between frames.
-        share: completed share of each press, 0 to 1, broadcast to (n, K).
-        nuisances: of these sensors; these and the other arguments are those of `apply_nuisances`.
-        seed: of the draws.
-        tap_s: of the whole press.
-        angle_deg: of the pad.
-
-    Returns:
-        (n, K, 3, rows, cols) whole zeroed counts.
+    `share`, broadcast to (n, K), is the completed share of each press, 0 to 1; readings are interpolated linearly
+    between frames. The other arguments are those of `apply_nuisances`.
     """
-    _check_clean(clean)
     shares = _per_tap("share", share, clean)
     if not ((shares >= 0) & (shares <= 1)).all():
         raise NuisanceError(f"shares of a press are {shares.min():g} to {shares.max():g}, expected 0 to 1")
@@ -180,8 +154,8 @@ def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nui
 
 def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:
     """Draw the rest level of one sensor, (3, rows, cols) in raw counts, different for each axis and taxel."""
-    spread = rng.standard_normal(geometry.scan_shape) * _REST_SPREAD_COUNTS
-    return (np.array(_REST_COUNTS)[:, None, None] + spread).astype(np.float32)
+    level = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
+    return (level + rng.standard_normal(geometry.scan_shape) * 300.0).astype(np.float32)
 
 
 def _read(
@@ -193,6 +167,8 @@ def _read(
     angle_deg: ArrayLike,
 ) -> NDArray[np.float32]:
     """Return readings (n, K, m, 3, rows, cols) at the moments `frame` (n, K, m), in frames since the pad was free."""
+    if clean.ndim != 6 or clean.shape[3] != len(AXES):
+        raise NuisanceError(f"readings have shape {clean.shape}, expected (n, K, F, {len(AXES)}, rows, cols)")
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     n, taps, frames, *scan = clean.shape
 
@@ -202,7 +178,9 @@ def _read(
 
     lag = np.zeros((2, n))
     if nuisances.hysteresis:
-        lag = draw_lag(stream("hysteresis"), nuisances.hysteresis, n)
+        rng = stream("hysteresis")
+        lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
+        lag[1] = _log_uniform(rng, *_RELAXATION_S, (n,))
     weights = frame_weights(frame, frames, _durations_s(tap_s, clean, stream) / frames, *lag)
     flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
     counts = (weights @ flat).reshape(n, taps, -1, *scan)
@@ -233,8 +211,8 @@ def _read(
 
 def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArray[np.float32]:
     """Draw drifts (n, 3, rows, cols) in deviations of z."""
-    common = _cut_normal(rng, (n, len(AXES), 1, 1)) * _DRIFT_OF_AXIS[:, None, None]
-    return (common * (1 + _DRIFT_OF_TAXEL * _cut_normal(rng, (n, *scan)))).astype(np.float32)
+    common = _cut_normal(rng, (n, len(AXES), 1, 1)) * np.array([1 / 8, 1 / 8, 1.0])[:, None, None]
+    return (common * (1 + 0.25 * _cut_normal(rng, (n, *scan)))).astype(np.float32)
 
 
 def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -282,11 +260,8 @@ def frame_weights(
     return np.diff(ramp, n=2).astype(np.float32)
 
 
-def draw_lag(rng: np.random.Generator, largest: float, n: int) -> NDArray[np.float64]:
-    """Return the lagging share, up to `largest`, and the relaxation time in [s] of n sensors, (2, n)."""
-    share = rng.uniform(min(_LEAST_SHARE, largest), largest, n)
-    low, high = np.log(_RELAXATION_S)
-    return np.stack([share, np.exp(rng.uniform(low, high, n))])
+def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.exp(rng.uniform(np.log(low), np.log(high), shape))
 
 
 def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -303,8 +278,7 @@ def _durations_s(
     tap_s: ArrayLike | None, clean: NDArray, stream: Callable[[str], np.random.Generator]
 ) -> NDArray[np.float64]:
     if tap_s is None:
-        low, high = np.log(TAP_S)
-        return np.exp(stream("tap_s").uniform(low, high, clean.shape[:2]))
+        return _log_uniform(stream("tap_s"), *TAP_S, clean.shape[:2])
     durations_s = _per_tap("tap_s", tap_s, clean)
     if not ((durations_s > 0) & np.isfinite(durations_s)).all():
         raise NuisanceError(f"taps last {durations_s.min():g} to {durations_s.max():g} s, expected more than 0, finite")
@@ -317,8 +291,3 @@ def _per_tap(name: str, values: ArrayLike, clean: NDArray) -> NDArray[np.float64
         return np.broadcast_to(given, clean.shape[:2])
     except ValueError:
         raise NuisanceError(f"{name} has shape {given.shape}, expected one for each tap, {clean.shape[:2]}") from None
-
-
-def _check_clean(clean: NDArray) -> None:
-    if clean.ndim != 6 or clean.shape[3] != len(AXES):
-        raise NuisanceError(f"readings have shape {clean.shape}, expected (n, K, F, {len(AXES)}, rows, cols)")

@@ -11,65 +11,30 @@ Amplitude 0 is the infinite layer. Lengths in [mm], forces in [N].
 """
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from train.physics.elastic_layer import Layer
-from train.physics.magnets import MOVEMENT
 
-
-class Give(NamedTuple):
-    """One term of the surface's compliance: factor on 1 / (G h), and lengths in thicknesses."""
-
-    factor: float
-    reach: float
-    spread: float
-
-
-class Drift(NamedTuple):
-    """Term of the magnets' movement in one direction: factor on 1 / (G h), and lengths in thicknesses.
-
-    Attributes:
-        factor: for a slope it is on 1 / (G h^2).
-        inward: decay length from the side to the magnet.
-        reach: decay length from the side to the load.
-        spread: width along the side.
-    """
-
-    factor: float
-    inward: float
-    reach: float
-    spread: float
-
-
-GIVES: Final = (Give(0.959, 0.3415, 0.2247), Give(0.0255, 1.590, 0.6034))
-DOWN: Final = Drift(0.0404, 0.690, 1.147, 0.420)
-OUT: Final = Drift(0.1703, 1.117, 0.592, 0.593)
-LEAN: Final = Drift(1.000, 0.431, 0.317, 0.463)
+_WIDTH_MM: Final = 20.0
+_GIVES: Final = ((0.959, 0.3415, 0.2247), (0.0255, 1.590, 0.6034))
+"""Terms (a, b, c) of the surface's compliance."""
+_DOWN: Final = (0.0404, 0.690, 1.147, 0.420)
+"""Term of the magnets' way down: factor on 1 / (G h), decay lengths to magnet and load, width along the side."""
+_OUT: Final = (0.1703, 1.117, 0.592, 0.593)
+"""Term of their way to the side."""
+_LEAN: Final = (1.000, 0.431, 0.317, 0.463)
+"""Term of their axes, tops towards the side; its factor is on 1 / (G h^2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class FreeSides:
-    """Four free sides of a square pad.
-
-    Attributes:
-        amplitude: 1 as in the finite elements, 0 for an infinite layer.
-        width_mm: of the pad, from side to side.
-        gives: terms of the surface.
-        down: term of the magnets, towards the board.
-        out: term of the magnets, towards the side.
-        lean: term of the magnets' axes, their tops towards the side.
-    """
+    """Four free sides of a square pad; amplitude 1 is as in the finite elements, 0 an infinite layer."""
 
     amplitude: float = 1.0
-    width_mm: float = 20.0
-    gives: tuple[Give, ...] = GIVES
-    down: Drift = DOWN
-    out: Drift = OUT
-    lean: Drift = LEAN
 
     def __post_init__(self) -> None:
         if not self.amplitude >= 0:
@@ -86,10 +51,10 @@ class FreeSides:
             across (terms, 2, size), lower side first, and along (terms, size, size) in [mm/N]: a force at (x', y') adds
             across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
         """
-        scale = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm)
+        scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
         apart_mm = cells_mm[:, None] - cells_mm
-        across = [self._fall(cells_mm, give.reach * layer.thickness_mm) for give in self.gives]
-        along = [scale * give.factor * _bell(apart_mm, give.spread * layer.thickness_mm) for give in self.gives]
+        across = [_fall(cells_mm, reach * thickness_mm) for _, reach, _ in _GIVES]
+        along = [scale * factor * _bell(apart_mm, spread * thickness_mm) for factor, _, spread in _GIVES]
         return np.stack(across), np.stack(along)
 
     def movement(
@@ -102,36 +67,28 @@ class FreeSides:
             cells_mm: (size,), places of the loaded cells from the centre, along x as along y.
             magnets_mm: (taxels, 2), x and y.
         """
-        scale = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm)
-        parts = {
-            "down_mm": (self.down, scale),
-            "mm": (self.out, scale),
-            "lean": (self.lean, scale / layer.thickness_mm),
-        }
-        x_mm, y_mm = magnets_mm.T
-        added = np.zeros((len(magnets_mm), len(MOVEMENT), len(cells_mm), len(cells_mm)))
-        for name, (drift, unit) in parts.items():
-            inward_mm, reach_mm, spread_mm = (thicknesses * layer.thickness_mm for thicknesses in drift[1:])
-            near = self._fall(cells_mm, reach_mm)  # (2, size)
-            sides = np.ones(2) if name == "down_mm" else np.array([-1.0, 1.0])
-            by_x, by_y = (
-                unit * drift.factor * np.einsum("s,st,sc,tr->trc", sides, self._fall(at_mm, inward_mm), near, bell)
-                for at_mm, bell in (
-                    (x_mm, _bell(y_mm[:, None] - cells_mm, spread_mm)),
-                    (y_mm, _bell(x_mm[:, None] - cells_mm, spread_mm)),
-                )
-            )
-            by_y = by_y.swapaxes(1, 2)
-            if name == "down_mm":
-                added[:, MOVEMENT.index("down_mm")] = by_x + by_y
-            else:
-                first, second = ("right_mm", "back_mm") if name == "mm" else ("lean_x", "lean_y")
-                added[:, MOVEMENT.index(first)], added[:, MOVEMENT.index(second)] = by_x, by_y
-        return added
+        scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
 
-    def _fall(self, places_mm: NDArray[np.floating], length_mm: float) -> NDArray[np.float64]:
-        """Return exponentials (2, ...) that decay from either side inwards."""
-        return np.exp(-(self.width_mm / 2 + np.stack([places_mm, -places_mm])) / length_mm)
+        parts = (
+            (_OUT, scale, (-1.0, 1.0)),
+            (_DOWN, scale, (1.0, 1.0)),
+            (_LEAN, scale / thickness_mm, (-1.0, 1.0)),
+        )  # each with its unit, and its signs at lower and upper side
+
+        def by_sides(at_mm: NDArray[np.floating], beside_mm: NDArray[np.floating]) -> list[NDArray[np.float64]]:
+            """Return the parts of the two sides at the ends of one axis; magnets are at `at_mm` along it."""
+            added = []
+            for (factor, *lengths), unit, signs in parts:
+                inward_mm, reach_mm, spread_mm = (thicknesses * thickness_mm for thicknesses in lengths)
+                falls = _fall(at_mm, inward_mm), _fall(cells_mm, reach_mm)
+                bell = _bell(beside_mm[:, None] - cells_mm, spread_mm)
+                added.append(unit * factor * np.einsum("s,st,sc,tr->trc", signs, *falls, bell))
+            return added
+
+        x_mm, y_mm = magnets_mm.T
+        right, down_by_x, lean_x = by_sides(x_mm, y_mm)
+        back, down_by_y, lean_y = (part.swapaxes(1, 2) for part in by_sides(y_mm, x_mm))
+        return np.stack([right, back, down_by_x + down_by_y, lean_x, lean_y], axis=1)
 
 
 class SideGive:
@@ -155,14 +112,15 @@ class SideGive:
         falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
         return cls((falls, falls), (bells, bells))
 
-    def boxes(self, top: NDArray[np.integer], left: NDArray[np.integer], shape: tuple[int, int]) -> "SideGive":
-        """Return the part for boxes of one shape that begin at these rows and columns, (n,)."""
-        columns, rows = (
-            fall[0][:, :, torch.as_tensor(first[:, None] + np.arange(count))].permute(2, 0, 1, 3)
-            for fall, first, count in zip(self._across, (left, top), shape[::-1], strict=True)
+    def boxes(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> "SideGive":
+        """Return the part for boxes of one shape with these rows (n, height, 1) and columns (n, 1, width)."""
+        across = (
+            fall[0][:, :, torch.as_tensor(cells)].permute(2, 0, 1, 3)
+            for fall, cells in zip(self._across, (columns[:, 0], rows[:, :, 0]), strict=True)
         )
-        beside, below = (bell[:, :count, :count] for bell, count in zip(self._along, shape, strict=True))
-        return SideGive((columns, rows), (beside, below))
+        counts = (rows.shape[1], columns.shape[2])
+        along = (bell[:, :count, :count] for bell, count in zip(self._along, counts, strict=True))
+        return SideGive((next(across), next(across)), (next(along), next(along)))
 
     def __getitem__(self, which: torch.Tensor) -> "SideGive":
         """Return the part for some of the boxes."""
@@ -180,6 +138,11 @@ class SideGive:
         fall = across.expand(len(pressure), -1, -1, -1).flatten(1, 2)  # (n, terms sides, width)
         seen = (fall @ pressure.mT).unflatten(1, (terms, sides))  # (n, terms, sides, height)
         return (seen @ along).flatten(1, 2).mT @ fall
+
+
+def _fall(places_mm: NDArray[np.floating], length_mm: float) -> NDArray[np.float64]:
+    """Return exponentials (2, ...) that decay from either side inwards."""
+    return np.exp(-(_WIDTH_MM / 2 + np.stack([places_mm, -places_mm])) / length_mm)
 
 
 def _bell(apart_mm: NDArray[np.floating], spread_mm: float) -> NDArray[np.float64]:

@@ -1,8 +1,14 @@
 """Simulated skin: from pressure and traction on the pad to counts of the taxels, zeroed and clean.
 
 Under each taxel a magnet sits in the pad, and a Hall chip on the board below it. Loads move and tilt the magnets with
-the material around them, linearly (the pad is linear); the field at the chips depends on that nonlinearly. One factor,
-counts per mT, the same on all axes, is set by the data sheet's newtons per count.
+the material around them, linearly (the pad is linear): Fourier sums at the magnets' places, over a domain four pads
+wide. The field at the chips depends on that nonlinearly. One factor, counts per mT, is the same on all axes.
+
+A magnet is stiff and turns with the pad around it like a spheroid of its aspect a = thickness / diameter: its axis
+leans by (1 + L)/2 du_x/dz - (1 - L)/2 du_z/dx, with L = (a^2 - 1)/(a^2 + 1). A flat disc (L = -1) follows the slope of
+its plane, a sphere (L = 0) half the curl, a needle (L = 1) the material along it.
+
+Source: Jeffery 1922, the turning of a spheroid in Stokes flow, whose equations are those of an incompressible solid.
 """
 
 from functools import cached_property
@@ -12,90 +18,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import SensorGeometry
-from train.physics.elastic_layer import Layer
-from train.physics.magnet_response import pressure_response, traction_response
-from train.physics.magnets import Magnet, MagnetArray
-from train.physics.side_correction import FreeSides
+from train.physics.elastic_layer import Layer, inner_displacement, inner_tangential
+from train.physics.magnets import MOVEMENT, Magnet, MagnetArray
+from train.physics.pad_draws import Pad
 
-NEWTONS_PER_COUNT_Z: Final = 0.00085
-IN_PLANE_SHARE: Final = 0.4
-"""Share of the magnets' in-plane movement that friction leaves.
+_PADS_WIDE: Final = 4
+_SLOPE_STEP_MM: Final = 1e-3
+_EVEN, _ODD = 0, 1
 
-The contact is solved without friction, so that the simulated pad is squeezed out from under a figure that in reality
-holds it. Recordings of grips have an in-plane to normal ratio of .18 to .26; without this factor the simulated one is
-.57.
-"""
-
-_CALIBRATION_N: Final = 1.0
-
-
-def on_pad(geometry: SensorGeometry, size: int, cell_mm: float) -> NDArray[np.bool_]:
-    """Return which cells of a square grid centred on the pad lie on it, (size, size)."""
-    along_mm = np.abs(np.arange(size) - (size - 1) / 2) * cell_mm
-    square = geometry.width_mm == geometry.height_mm
-    across, down = (along_mm < (np.inf if square else side / 2) for side in (geometry.width_mm, geometry.height_mm))
-    return down[:, None] & across
+_Array = NDArray[np.float64]
+_Transfer = tuple[int, int, _Array]
+"""Parity in x and in y, even or odd, and the amplitudes (q_y, q_x) of a transfer's quarter of waves."""
 
 
 class Skin:
-    """Readings of a sensor whose pad is pressed.
-
-    Args:
-        geometry: the taxels.
-        layer: the pad.
-        size: cells along a side of the pressure grid.
-        cell_mm: their size, in [mm].
-        magnet: of every taxel.
-        in_plane_share: factor on the magnets' in-plane movement under pressure; movement under traction is not scaled.
-        rest: place and lean of each magnet, see train.physics.magnets.MagnetArray.
-        moments: of each magnet, see train.physics.magnets.MagnetArray.
-        counts_per_newton: of the sum of z under an even load.
-        sides: the pad's free sides; None for an infinite layer.
+    """Readings of a sensor whose pad is pressed, by loads on a grid of `size` cells a side of `cell_mm`.
 
     Attributes:
         counts_per_mt: of every chip and axis.
     """
 
-    def __init__(
-        self,
-        geometry: SensorGeometry,
-        layer: Layer,
-        size: int,
-        cell_mm: float,
-        magnet: Magnet | None = None,
-        in_plane_share: float = IN_PLANE_SHARE,
-        rest: NDArray[np.floating] | None = None,
-        moments: NDArray[np.floating] | None = None,
-        counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z,
-        sides: FreeSides | None = None,
-    ) -> None:
-        magnet = Magnet() if magnet is None else magnet
+    def __init__(self, pad: Pad, size: int, cell_mm: float) -> None:
+        geometry, layer, magnet = pad.geometry(), pad.layer, pad.magnet
         if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
             raise ValueError(
                 f"a magnet {magnet.thickness_mm} mm thick at {magnet.height_mm} mm does not fit into a layer of "
                 f"{layer.thickness_mm} mm"
             )
-        self.geometry = geometry
-        self.size = size
-        self._pad = (geometry, layer, size, cell_mm, magnet)
-        self._magnets = MagnetArray(geometry, magnet, rest, moments)
-        response = pressure_response(geometry, layer, size, cell_mm, magnet)
-        if sides is not None:
+        self._grid = (geometry, layer, size, cell_mm, magnet)
+        taxels = geometry.taxel_count
+        self._magnets = MagnetArray(geometry, magnet, pad.rest(taxels), pad.moments(taxels))
+        response = pressure_response(*self._grid)
+        if pad.sides is not None:
             cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
-            added = sides.movement(layer, cells_mm, geometry.taxel_centres_mm())
+            added = pad.sides.movement(layer, cells_mm, geometry.taxel_centres_mm())
             response += added.reshape(response.shape) * cell_mm**2
-        response[:, :2] *= in_plane_share
+        response[:, :2] *= pad.in_plane_share
         self._response = response.astype(np.float32)
-        # Calibrated as a user would: the sum of z per newton, here under an even load on the whole pad.
+        # Calibrated as a user would: the sum of z per newton, here under 1 N, evenly on the whole pad.
         loaded = on_pad(geometry, size, cell_mm)
-        even_mpa = loaded * (_CALIBRATION_N / ((size * cell_mm) ** 2 * loaded.mean()))
+        even_mpa = loaded * (1.0 / ((size * cell_mm) ** 2 * loaded.mean()))
         z_sum_mt = self._magnets.change_mt(self.movement(even_mpa))[:, 2].sum()
-        self.counts_per_mt = float(_CALIBRATION_N * counts_per_newton / z_sum_mt)
+        self.counts_per_mt = float(pad.counts_per_newton / z_sum_mt)
 
     @cached_property
     def _traction_response(self) -> NDArray[np.float32]:
         """MOVEMENT per traction to the right and back in each cell, (taxels, 5, 2, cells); computed on first use."""
-        return traction_response(*self._pad).astype(np.float32)
+        return traction_response(*self._grid).astype(np.float32)
 
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
@@ -106,50 +75,112 @@ class Skin:
             pressure_mpa: (..., size, size), in [MPa].
             traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
         """
-        if pressure_mpa.shape[-2:] != (self.size, self.size):
-            raise ValueError(f"pressures of shape {pressure_mpa.shape}, expected (..., {self.size}, {self.size})")
-        lead, cells = pressure_mpa.shape[:-2], self.size**2
+        taxels, parts, cells = self._response.shape
         moved = pressure_mpa.reshape(-1, cells) @ self._response.reshape(-1, cells).T
         if traction_mpa is not None:
-            if traction_mpa.shape != (*lead, 2, self.size, self.size):
-                raise ValueError(
-                    f"tractions of shape {traction_mpa.shape} with pressures of shape {pressure_mpa.shape}, expected "
-                    f"{(*lead, 2, self.size, self.size)}: two for every pressure, to the right and back"
-                )
             moved += traction_mpa.reshape(-1, 2 * cells) @ self._traction_response.reshape(-1, 2 * cells).T
-        return moved.reshape(*lead, *self._response.shape[:2])
+        return moved.reshape(*pressure_mpa.shape[:-2], taxels, parts)
 
     def frames(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.float32]:
-        """Return readings (n, F, 3, rows, cols) in counts, zeroed and clean, of loads on the pad.
+        """Return the counts (n, F, 3, rows, cols) of the loads of `movement`, with (n, F) before their other axes."""
+        return self.counts(self.movement(pressure_mpa, traction_mpa))
 
-        Args:
-            pressure_mpa: (n, F, size, size), in [MPa].
-            traction_mpa: on the pad's surface, to the right and back, (n, F, 2, size, size), in [MPa]; none if None.
-        """
-        return self._counts(self.movement(pressure_mpa, traction_mpa))
-
-    def flat_frames(
-        self, unit_pressure_mpa: NDArray[np.floating], indentation_mm: NDArray[np.floating]
-    ) -> NDArray[np.float32]:
-        """Return the readings of taps on flat surfaces, where pressure is proportional to the indentation.
-
-        Args:
-            unit_pressure_mpa: (n, size, size), of an indentation of 1 mm, in [MPa].
-            indentation_mm: (n, F), in [mm].
-
-        Returns:
-            (n, F, 3, rows, cols) in counts, zeroed and clean.
-        """
-        unit = self.movement(unit_pressure_mpa)
-        return self._counts(unit[:, None] * indentation_mm[:, :, None, None].astype(unit.dtype))
-
-    def _counts(self, movement: NDArray[np.floating]) -> NDArray[np.float32]:
-        rows, cols = self.geometry.rows, self.geometry.cols
-        # Every frame is computed: interpolation by a polynomial through five depths took 0.09 ms a tap, this 0.13 ms.
-        counts = np.empty((*movement.shape[:2], 3, rows, cols), dtype=np.float32)
+    def counts(self, movement: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return readings (n, F, 3, rows, cols) in counts, zeroed and clean, of magnets moved by (n, F, taxels, 5)."""
+        counts = np.empty((*movement.shape[:2], *self._grid[0].scan_shape), dtype=np.float32)
         for tap, moved in zip(counts, movement, strict=True):  # one tap at a time stays in the cache
             changed = self._magnets.change_mt(moved) * moved.dtype.type(self.counts_per_mt)
             tap[:] = changed.swapaxes(1, 2).reshape(tap.shape)
         return counts
+
+
+def on_pad(geometry: SensorGeometry, size: int, cell_mm: float) -> NDArray[np.bool_]:
+    """Return which cells of a square grid centred on the pad lie on it, (size, size)."""
+    along_mm = np.abs(np.arange(size) - (size - 1) / 2) * cell_mm
+    square = geometry.width_mm == geometry.height_mm
+    across, down = (along_mm < (np.inf if square else side / 2) for side in (geometry.width_mm, geometry.height_mm))
+    return down[:, None] & across
+
+
+def pressure_response(geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet) -> _Array:
+    """Return the MOVEMENT of each magnet per pressure in each cell, (taxels, 5, cells) in [mm/MPa] and [1/MPa]."""
+    q_x, q_y, q = _quarter(size, cell_mm)
+    (_, below), (down, along), (_, above) = (
+        inner_displacement(layer, q, magnet.height_mm + step_mm) for step_mm in (-_SLOPE_STEP_MM, 0, _SLOPE_STEP_MM)
+    )
+    lean = (1 + magnet.shape) / 2 * (above - below) / (2 * _SLOPE_STEP_MM) + (1 - magnet.shape) / 2 * q * down
+    move, lean = _per_wave(along, q), _per_wave(lean, q)
+    transfers = [
+        (_ODD, _EVEN, -move * q_x),
+        (_EVEN, _ODD, -move * q_y),
+        (_EVEN, _EVEN, down),
+        (_ODD, _EVEN, -lean * q_x),
+        (_EVEN, _ODD, -lean * q_y),
+    ]
+    return _sums(geometry, size, cell_mm, transfers)
+
+
+def traction_response(geometry: SensorGeometry, layer: Layer, size: int, cell_mm: float, magnet: Magnet) -> _Array:
+    """Return the MOVEMENT of each magnet per traction to the right and back in each cell, (taxels, 5, 2, cells)."""
+    q_x, q_y, q = _quarter(size, cell_mm)
+    below, here, above = (
+        inner_tangential(layer, q, magnet.height_mm + step_mm) for step_mm in (-_SLOPE_STEP_MM, 0, _SLOPE_STEP_MM)
+    )
+    bend, turn = (1 + magnet.shape) / 2, (1 - magnet.shape) / 2
+    lean_along = bend * (above.along - below.along) / (2 * _SLOPE_STEP_MM) - turn * q * here.sunk
+    lean_across = bend * (above.across - below.across) / (2 * _SLOPE_STEP_MM)
+    # u_i = across t_i + (along - across) q_i q_j / q^2 t_j, and the lean likewise.
+    move = _per_wave(_per_wave(here.along - here.across, q), q)
+    lean = _per_wave(_per_wave(lean_along - lean_across, q), q)
+    sunk = _per_wave(here.sunk, q)
+    under_right = (
+        (_EVEN, _EVEN, here.across + move * q_x**2),
+        (_ODD, _ODD, -move * q_x * q_y),
+        (_ODD, _EVEN, -sunk * q_x),
+        (_EVEN, _EVEN, lean_across + lean * q_x**2),
+        (_ODD, _ODD, -lean * q_x * q_y),
+    )
+    # Under traction back the response is the same, with x and y exchanged.
+    changed = [(y, x, amplitude.T) for x, y, amplitude in under_right]
+    under_back = (changed[1], changed[0], changed[2], changed[4], changed[3])
+    both = [transfer for pair in zip(under_right, under_back, strict=True) for transfer in pair]
+    return _sums(geometry, size, cell_mm, both).reshape(geometry.taxel_count, len(MOVEMENT), 2, size * size)
+
+
+def _quarter(size: int, cell_mm: float) -> tuple[_Array, _Array, _Array]:
+    """Return wave numbers 0 to the highest: to the right (1, m), back (m, 1), and their length (m, m), in [1/mm]."""
+    q = 2 * np.pi * np.asarray(np.fft.rfftfreq(_PADS_WIDE * size, cell_mm), dtype=np.float64)
+    return q[None, :], q[:, None], np.hypot(q[None, :], q[:, None])
+
+
+def _per_wave(part: _Array, q: _Array) -> _Array:
+    """Divide a part by the wave number, 0 for the wave that is even and has no direction."""
+    return np.divide(part, q, out=np.zeros_like(part), where=q > 0)
+
+
+def _sums(geometry: SensorGeometry, size: int, cell_mm: float, transfers: list[_Transfer]) -> _Array:
+    """Return responses (taxels, transfers, cells) of the magnets to the cells.
+
+    A transfer is even or odd in each axis, so that a quarter of its waves, with real sines and cosines, is enough: a
+    tenth of the products of whole complex waves.
+    """
+    q = _quarter(size, cell_mm)[0][0]
+    # All waves but the first and the last of an axis stand for two, of q and of -q.
+    twice = np.full_like(q, 2.0)
+    twice[[0, -1]] = 1.0
+    cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
+    centres_mm = geometry.taxel_centres_mm().reshape(geometry.rows, geometry.cols, 2)
+    waves_x, waves_y = (
+        [
+            twice[:, None] * wave(q[:, None] * (places_mm[:, None] - cells_mm).reshape(1, -1))
+            for wave in (np.cos, np.sin)
+        ]
+        for places_mm in (centres_mm[0, :, 0], centres_mm[:, 0, 1])
+    )  # each (waves, columns or rows of taxels times cells), even and odd
+    response = np.empty((geometry.taxel_count, len(transfers), size * size))
+    for row, (in_x, in_y, amplitude) in enumerate(transfers):
+        sums = (waves_y[in_y].T @ amplitude @ waves_x[in_x]).reshape(geometry.rows, size, geometry.cols, size)
+        response[:, row] = sums.swapaxes(1, 2).reshape(geometry.taxel_count, -1)
+    return response / (_PADS_WIDE * size) ** 2

@@ -1,6 +1,6 @@
 """Contact area and indentation of the pad on a finer grid than the cells on which pressure is solved."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -35,7 +35,7 @@ def which_of(covers: Sequence[Cover]) -> Iterable[tuple[Cover, NDArray[np.int64]
 
 
 def pressed_in(
-    solvers: dict[Cover, ContactSolver],
+    solver_of: Callable[[Cover], ContactSolver],
     covers: Sequence[Cover],
     depth_mm: NDArray[np.float32],
     cells_mm: NDArray[np.float32],
@@ -51,7 +51,7 @@ def pressed_in(
     follows the shape; under a soft one its place follows from its own layer's deflection.
 
     Args:
-        solvers: of every cover here, and of the bare pad.
+        solver_of: solver of a cover.
         covers: (n,).
         depth_mm: (n, m, m), depth of the shape below its highest part, in [mm].
         cells_mm: (n, size, size), of each cell's carrying part, in [mm].
@@ -59,9 +59,6 @@ def pressed_in(
         on_pad_mpa: (n, size, size), on the pad, in [MPa].
         indentation_mm: (n,), in [mm].
         pattern_cells: cells along the pattern's side, in the middle of the pad.
-
-    Returns:
-        Depths in [mm] and the mask, both (n, 2 * pattern_cells, 2 * pattern_cells).
     """
     size = cells_mm.shape[1]
     rim, pixels = size - pattern_cells, 2 * pattern_cells
@@ -71,7 +68,7 @@ def pressed_in(
     indented_mm = indentation_mm[:, None, None]
     close_mm = np.empty_like(pressure_mpa)
     for cover, which in which_of(covers):
-        solver = solvers[cover]
+        solver = solver_of(cover)
         gap_mm = solver.displacement_mm(pressure_mpa[which]) - (indented_mm[which] - cells_mm[which])
         close_mm[which] = pressure_mpa[which] * np.float32(solver.cell_compliance_mm_per_mpa) - gap_mm
     close_mm = np.where(cells_mm > _STEEP * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
@@ -83,7 +80,7 @@ def pressed_in(
     touching |= bottom & ~touching.any(axis=(1, 2), keepdims=True)  # a tip thinner than half a pixel
     covered = np.array([cover != BARE for cover in covers])
     if covered.any():
-        sunk_mm = to_pixels @ solvers[BARE].displacement_mm(on_pad_mpa[covered]) @ to_pixels.T
+        sunk_mm = to_pixels @ solver_of(BARE).displacement_mm(on_pad_mpa[covered]) @ to_pixels.T
         fine_mm[covered] = np.clip(indented_mm[covered] - sunk_mm, 0, indented_mm[covered])
     return fine_mm, touching
 

@@ -33,9 +33,9 @@ def tpsf_pattern(
 
     Args:
         touching: (n, H, W), the area that the surface touches.
-        indentation_mm: (n,), in [mm].
-        pixel_mm: pixel size, in [mm].
-        beta_mm: reach of the kernel, > 0, in [mm].
+        indentation_mm: (n,).
+        pixel_mm: pixel size.
+        beta_mm: reach of the kernel, > 0.
     """
     area = torch.from_numpy(np.ascontiguousarray(touching))
     response = spread(area.float(), torch.tensor([beta_mm], dtype=torch.float32), pixel_mm)
@@ -84,14 +84,9 @@ def heights_pattern(
 
 
 def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float) -> Tensor:
-    """Convolve maps (n, H, W) with exp(-r^2/beta^2), zero outside the map; the maps' unit times [mm^2].
+    """Convolve maps (n, H, W) with exp(-r^2/beta^2), beta (n,) or (1,), zero outside the map; their unit times [mm^2].
 
     The Gaussian is a product of two curves, and takes two products of matrices.
-
-    Args:
-        maps: (n, H, W).
-        beta_mm: (n,) or (1,), reach of the kernel, > 0, in [mm].
-        pixel_mm: pixel size, in [mm].
     """
     if not bool((beta_mm > 0).all()):
         raise ValueError(f"beta is {float(beta_mm.min())} mm, expected a positive length")

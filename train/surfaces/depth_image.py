@@ -1,8 +1,7 @@
 """Depth images: depth of a surface under the pad below the point that the pad touches first.
 
-A pose turns the surface's triangles into the pad's axes, and they are drawn straight onto the requested grid: every
-pixel's depth is that of the surface at the pixel's centre, on flats, slopes and edges alike. Only triangles whose
-bounding box meets the footprint are drawn.
+A pose turns the surface's triangles into the pad's axes; those whose bounding box meets the footprint are drawn
+straight onto the requested grid, so that every pixel's depth is exact at the pixel's centre.
 """
 
 from dataclasses import dataclass
@@ -31,30 +30,19 @@ class Pose:
 
 
 class Relief:
-    """Surface to be drawn from above.
-
-    Args:
-        name: used in error messages.
-        mesh: the surface, in [mm], z up.
-    """
+    """Surface to be drawn from above: a mesh in [mm], z up, and its name for error messages."""
 
     def __init__(self, name: str, mesh: trimesh.Trimesh) -> None:
         self.name = name
-        triangles_mm = np.asarray(mesh.triangles, dtype=np.float64)
-        # Sorted by their left ends, the triangles near a place are one slice, however large the mesh is.
-        self.triangles_mm = triangles_mm[np.argsort(triangles_mm[:, :, 0].min(axis=1), kind="stable")]
+        self.triangles_mm = np.asarray(mesh.triangles, dtype=np.float64)
         self._low_mm = self.triangles_mm[:, :, :2].min(axis=1)
         self._high_mm = self.triangles_mm[:, :, :2].max(axis=1)
-        self._widest_mm = (self._high_mm - self._low_mm)[:, 0].max(initial=0.0)
 
     def near(self, pose: Pose, reach_mm: float) -> NDArray[np.float64]:
         """Return triangles (t, 3, 3) whose bounding box comes within `reach_mm` of a pose's centre, in x and in y."""
         place = np.array([pose.x_mm, pose.y_mm])
-        left, right = place[0] - reach_mm - self._widest_mm, place[0] + reach_mm
-        first, last = np.searchsorted(self._low_mm[:, 0], left), np.searchsorted(self._low_mm[:, 0], right, "right")
-        low_mm, high_mm = self._low_mm[first:last], self._high_mm[first:last]
-        meets = ((low_mm <= place + reach_mm) & (high_mm >= place - reach_mm)).all(axis=1)
-        return self.triangles_mm[first:last][meets]
+        meets = (self._low_mm <= place + reach_mm) & (self._high_mm >= place - reach_mm)
+        return self.triangles_mm[meets.all(axis=1)]
 
 
 def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArray[np.float32]:

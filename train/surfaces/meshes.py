@@ -18,10 +18,6 @@ SUFFIXES: Final = (".stl", ".obj", ".ply")
 MAX_TRIANGLES: Final = 2_000_000
 MAX_FILE_BYTES: Final = 400_000_000
 """Largest file read: two million triangles in the most verbose OBJ. A longer one would fill the memory first."""
-EXTENT_MM: Final = (1.0, 500.0)
-"""Smallest and largest longest side; outside this range the unit is more likely wrong than the part."""
-_MERGED_DIGITS: Final = 4
-"""Decimals of a millimetre to which corners are merged: no press resolves a tenth of a micrometre."""
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
 _FLAT: Final = 1e-5
 """Ratio of thickness to length below which a body is a sheet: a hundred times the rounding of single precision."""
@@ -49,14 +45,11 @@ def size_of(name: str) -> str:
 
 
 def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
-    """Read an STL, OBJ or PLY file as a surface: z up as it stands, top at z = 0, centred on x = y = 0.
+    """Read an STL, OBJ or PLY file as a closed surface in [mm]: z up as it stands, top at z = 0, centred on x = y = 0.
 
     Args:
         path: the file; several bodies in it are taken together.
         unit_mm: length of the file's unit, > 0, in [mm]; 1000 for metres, 25.4 for inches.
-
-    Returns:
-        Closed mesh, in [mm].
 
     Raises:
         MeshError: the file is absent, broken, empty, open, flat, or of an impossible size.
@@ -68,7 +61,7 @@ def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     corners = corners * unit_mm
     _check_size(path, corners[faces].reshape(-1, 3), unit_mm)
     mesh = trimesh.Trimesh(corners, faces, process=False)
-    mesh.merge_vertices(digits_vertex=_MERGED_DIGITS)
+    mesh.merge_vertices(digits_vertex=4)  # no press resolves a tenth of a micrometre
     a, b, c = mesh.faces.T
     mesh.update_faces((a != b) & (b != c) & (c != a))  # triangles that merging shut
     mesh.remove_unreferenced_vertices()
@@ -136,18 +129,18 @@ def _legible(content: bytes, suffix: str) -> bytes:
 
 
 def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> None:
+    """Refuse a sheet, and a size of which the unit is more likely wrong than the part."""
     extent_mm = np.ptp(corners, axis=0)
     sides = _sides(extent_mm)
-    asked = "" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}"
-    smallest_mm, largest_mm = EXTENT_MM
-    if extent_mm.max() > largest_mm:
+    found = f"{path}: {sides}" + ("" if unit_mm == 1.0 else f" by --unit-mm {unit_mm:g}")
+    if extent_mm.max() > 500:
         raise MeshError(
-            f"{path}: {sides}{asked}, at most {largest_mm:g} mm; "
+            f"{found}, at most 500 mm; "
             "a file is taken to be in mm: pass --unit-mm if it is not (0.001 for micrometres), else cut out a part"
         )
-    if extent_mm.max() < smallest_mm:
+    if extent_mm.max() < 1:
         raise MeshError(
-            f"{path}: {sides}{asked}, at least {smallest_mm:g} mm; "
+            f"{found}, at least 1 mm; "
             "a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, 25.4 if in inches"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))

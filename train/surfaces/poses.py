@@ -24,15 +24,20 @@ POSITION_STEP_MM: Final = 2.5
 TEST_POSITION: Final = 0
 VALIDATION_POSITION: Final = 1
 HELD_OUT_RADIUS_MM: Final = 1.0
-"""Distance that random poses keep from the two held-out positions, in [mm].
-
-Only C, F, L, P, T and U are new there in every sense: the other surfaces are symmetric, and look as they do at another
-position to a pad turned by 90, 120 or 180 degrees. It has no visible effect, see docs/decisions.md.
-"""
+"""Distance that random poses keep from the two held-out positions, in [mm]; see docs/decisions.md."""
 SURFACE_REACH_MM: Final = 3.5
 """Largest distance of random poses from the surface's centre along x and along y, in [mm]."""
 
+HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
+REACH_MM: Final = 6.0
+"""Largest distance of an earlier tap: two thirds of both pads overlap at least, side by side."""
+NEAR_MM: Final = 3.0
+NEAR_DEG: Final = 45.0
+"""Bounds of most random poses."""
+
 Split = Literal["validation", "test"]
+Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
+"""Function from draws and a number of taps, K, to their poses (K, 3)."""
 
 
 def position_mm(index: int) -> tuple[float, float]:
@@ -77,21 +82,6 @@ def over_surface(newest: Pose, x_mm: float, y_mm: float, turn_deg: float) -> Pos
     return Pose(newest.x_mm + right_mm, newest.y_mm + up_mm, newest.angle_deg - turn_deg)
 
 
-HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
-REACH_MM: Final = 6.0
-"""Largest distance of an earlier tap: two thirds of both pads overlap at least, side by side."""
-NEAR_MM: Final = 3.0
-NEAR_DEG: Final = 45.0
-"""Bounds of most random poses."""
-_STEP_MM: Final = (0.3, 3.0)
-"""Bounds of the step of a slide from tap to tap."""
-_DRIFT_DEG: Final = 3.0
-_QUARTER: Final = ((1, 0), (0, 1), (1, 1))
-
-Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
-"""Function from draws and a number of taps, K, to their poses (K, 3)."""
-
-
 def turns(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
     """Return the paper's schedule: the pad turns by a step from tap to tap, at one place."""
     poses = np.zeros((taps, 3))
@@ -101,10 +91,8 @@ def turns(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
 
 def half_pitch(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
     """Return taps shifted by half a pitch: three make the grid twice as fine, the next ones lie on the other sides."""
-    signs = rng.choice([-1, 1], 2)
-    first = np.array(_QUARTER) * signs
-    others = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) != (0, 0)])
-    rest = np.array([one for one in others if not (one == first).all(axis=1).any()])
+    first = [tuple(place) for place in np.array([(1, 0), (0, 1), (1, 1)]) * rng.choice([-1, 1], 2)]
+    rest = [(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) not in [(0, 0), *first]]
     poses = np.zeros((taps, 3))
     poses[1:, :2] = np.concatenate([rng.permutation(first), rng.permutation(rest)])[: taps - 1] * HALF_PITCH_MM
     return poses
@@ -122,12 +110,11 @@ def far(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
 
 def slide(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
     """Return moments of a slide: even steps in one direction, with a slow turn."""
-    low, high = np.log(_STEP_MM)
+    low, high = np.log((0.3, 3.0))
     step_mm = min(float(np.exp(rng.uniform(low, high))), REACH_MM / max(taps - 1, 1))
-    way, turn_deg = rng.uniform(0, 2 * np.pi), rng.uniform(-_DRIFT_DEG, _DRIFT_DEG)
-    return np.arange(taps, dtype=np.float64)[:, None] * np.array(
-        [step_mm * np.cos(way), step_mm * np.sin(way), turn_deg]
-    )
+    way, turn_deg = rng.uniform(0, 2 * np.pi), rng.uniform(-3.0, 3.0)
+    step = np.array([step_mm * np.cos(way), step_mm * np.sin(way), turn_deg])
+    return np.arange(taps, dtype=np.float64)[:, None] * step
 
 
 def mixed(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
@@ -152,19 +139,14 @@ def schedule_of(name: str) -> Schedule:
     return SCHEDULES[name]
 
 
-SCHEDULES: Final[Mapping[str, Schedule]] = {
-    "turns": turns,
-    "half-pitch": half_pitch,
-    "near": near,
-    "far": far,
-    "slide": slide,
-    "mixed": mixed,
-}
-"""Schedules by name."""
-
-
 def _within(rng: np.random.Generator, taps: int, reach_mm: float, turn_deg: float) -> NDArray[np.float64]:
     away_mm, way = reach_mm * np.sqrt(rng.random(taps)), rng.uniform(0, 2 * np.pi, taps)
     poses = np.stack([away_mm * np.cos(way), away_mm * np.sin(way), rng.uniform(-turn_deg, turn_deg, taps)], axis=1)
     poses[0] = 0
     return poses
+
+
+SCHEDULES: Final[Mapping[str, Schedule]] = {
+    kind.__name__.replace("_", "-"): kind for kind in (turns, half_pitch, near, far, slide, mixed)
+}
+"""Schedules by name."""
