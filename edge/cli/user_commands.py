@@ -10,8 +10,7 @@ from functools import partial
 from typing import Any, Final
 
 from edge.pipeline.commands import RESET, ZERO, Command, Commands, read_stdin
-from edge.terminal.forced_end import before_force
-from edge.terminal.stop_signals import handled
+from edge.terminal.stop_signals import before_force, handled
 
 KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
 READ_BYTES: Final = 64

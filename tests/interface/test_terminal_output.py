@@ -23,6 +23,7 @@ from hypothesis.extra.numpy import arrays
 from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
+from edge.terminal import progress_bar as progress
 from edge.terminal.heatmap import HALF_BLOCK, SHADES, Panel, choose_palette, draw, resample
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
 
@@ -61,7 +62,8 @@ def test_a_replay_at_full_speed_shows_one_instead_of_the_live_line(
     tmp_path, monkeypatch, capfd, terminal, options, shown, to
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream, delay_s=0))
+    monkeypatch.setattr(progress, "DELAY_S", 0)
+    monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream))
     monkeypatch.setattr(status, "StatusSink", partial(status.StatusSink, terminal.stream))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_model(tmp_path / "tiny.onnx")
@@ -91,9 +93,16 @@ class Clock:
         return self.now_s
 
 
-def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal):
+@pytest.fixture
+def clock(monkeypatch):
+    """Clock of the bars."""
     clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+    monkeypatch.setattr("tqdm.std.time", clock)
+    return clock
+
+
+def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal, clock):
+    with Progress("poses", 400, "pose", stream=terminal.stream) as bar:
         clock.now_s += 1.9
         bar.advance(38)
         assert terminal.said() == ""
@@ -105,27 +114,24 @@ def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal):
     assert CLEARED.search(terminal.said())
 
 
-def test_units_that_were_there_before_took_no_time_now(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", done=300, stream=terminal.stream, clock_s=clock) as bar:
+def test_units_that_were_there_before_took_no_time_now(terminal, clock):
+    with Progress("poses", 400, "pose", done=300, stream=terminal.stream) as bar:
         clock.now_s += 2.0
         bar.advance(20)
         assert re.search(r"poses  80%.* 10\.0pose/s 00:08 left", terminal.said())
 
 
 @pytest.mark.parametrize("terminal", [40], indirect=True)
-def test_forty_columns_hold_it(terminal):
-    clock = Clock()
-    with Progress("run times", 10**6, "run", stream=terminal.stream, clock_s=clock) as bar:
+def test_forty_columns_hold_it(terminal, clock):
+    with Progress("run times", 10**6, "run", stream=terminal.stream) as bar:
         clock.now_s += 10
         bar.advance(100_000)
         (shown,) = terminal.said().split("\r")[1:] or [""]
         assert len(shown) <= 40 and "10.0krun/s 01:30 left" in shown
 
 
-def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal):
-    clock = Clock()
-    with Progress("watching", 60, SECONDS, stream=terminal.stream, clock_s=clock) as bar:
+def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal, clock):
+    with Progress("watching", 60, SECONDS, stream=terminal.stream) as bar:
         clock.now_s += 15
         bar.note("95 scans/s")
         bar.reach(15)
@@ -137,9 +143,8 @@ def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal):
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
-def test_whatever_ends_it_the_line_is_cleared(terminal, stop):
-    clock = Clock()
-    with pytest.raises(stop), Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+def test_whatever_ends_it_the_line_is_cleared(terminal, stop, clock):
+    with pytest.raises(stop), Progress("poses", 400, "pose", stream=terminal.stream) as bar:
         clock.now_s += 3
         bar.advance(1)
         assert "left" in terminal.said()
@@ -147,9 +152,8 @@ def test_whatever_ends_it_the_line_is_cleared(terminal, stop):
     assert CLEARED.search(terminal.said())
 
 
-def test_lines_of_others_stand_alone(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+def test_lines_of_others_stand_alone(terminal, clock):
+    with Progress("poses", 400, "pose", stream=terminal.stream) as bar:
         clock.now_s += 3
         bar.advance(30)
         terminal.said()
@@ -159,11 +163,13 @@ def test_lines_of_others_stand_alone(terminal):
         assert re.match(r"\r +\ra line\r\n\r?poses ", terminal.said())
 
 
-def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchruns_processes(terminal, monkeypatch):
-    clock, pipe = Clock(), io.StringIO()
+def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchruns_processes(
+    terminal, monkeypatch, clock
+):
+    pipe = io.StringIO()
     for stream, rank in ((pipe, "0"), (terminal.stream, "1")):
         monkeypatch.setenv("RANK", rank)
-        with Progress("poses", 400, "pose", stream=stream, clock_s=clock) as bar:
+        with Progress("poses", 400, "pose", stream=stream) as bar:
             for _ in range(400):
                 clock.now_s += 1
                 bar.advance()
@@ -171,9 +177,8 @@ def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchr
     assert pipe.getvalue() == terminal.said() == ""
 
 
-def test_a_window_that_is_closed_ends_no_work(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+def test_a_window_that_is_closed_ends_no_work(terminal, clock):
+    with Progress("poses", 400, "pose", stream=terminal.stream) as bar:
         clock.now_s += 3
         bar.advance()
         os.close(terminal.ours)
@@ -195,7 +200,7 @@ AT_ONCE = """
 import sys
 from edge.cli import main as cli
 from edge.terminal import progress_bar as progress
-progress.Progress.__init__.__kwdefaults__["delay_s"] = 0.0
+progress.DELAY_S = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 
