@@ -21,14 +21,14 @@ from firmware_bridge.zeroing import baseline as zeroing
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, BaselineEstimator, deformation
 
 
-@dataclass(frozen=True)
+@dataclass
 class Watched:
     """Data of a watch while the pads were free.
 
     Attributes:
         scans: of each sensor, in their order.
         counters: of the link.
-        duration_s: length of the watch, in [s].
+        duration_s: length of the watch so far, in [s].
         facts: of the line.
         ids: the CAN ids that came; empty where the link sees none.
         model: the id map that the user chose.
@@ -38,9 +38,9 @@ class Watched:
         mountings: of the sensors, as far as they are available.
     """
 
-    scans: Mapping[str, Sequence[Scan]]
-    counters: Mapping[str, int]
-    duration_s: float
+    scans: dict[str, list[Scan]] = field(default_factory=dict)
+    counters: Mapping[str, int] = field(default_factory=dict)
+    duration_s: float = 0.0
     facts: LineFacts = field(default_factory=LineFacts)
     ids: frozenset[int] = frozenset()
     model: ModelMap = USPA44_MAP

@@ -12,89 +12,58 @@ from edge.doctor.link_checks import line_facts
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
 from edge.validation import check_baselines, check_positive
-from firmware_bridge.scans.scan import Scan
+from firmware_bridge.links.base import Link
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import Baseline
 
 
-class Watch:
-    """Watch of a link.
+def prepare(
+    texts: Sequence[str], known: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
+) -> tuple[Link, SensorFile, Watched]:
+    """Return the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
 
-    Attributes:
-        link: the link; the caller opens and closes it.
-        known: facts on its sensors, from the sensor file and the recording.
-        scans: of each sensor, in their order.
-        duration_s: length of the watch so far, in [s].
+    `before` holds earlier baselines of the free pads, by sensor; `rate_hz` is expected of each sensor, in [Hz]. Raises
+    what source_setup.links_to raises, and UsageError for several sources.
     """
+    if len(texts) > 1:
+        raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
+    check_baselines(before, known.model_map.geometry)
+    (link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=0)
+    known = with_recorded(known, [link])
+    return link, known, Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
 
-    def __init__(
-        self,
-        texts: Sequence[str],
-        known: SensorFile,
-        *,
-        references: Mapping[str, Baseline],
-        rate_hz: float | None,
-        stop: threading.Event,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """Prepare to watch the source that `texts` names, one at most, which raises what source_setup.links_to raises.
 
-        Args:
-            texts: the source.
-            known: facts on the sensors.
-            references: earlier baselines of the free pads, by sensor.
-            rate_hz: expected of each sensor, in [Hz].
-            stop: ends the watch when it is set.
-            clock_s: the clock of the scans, monotonic, in [s].
-        """
-        if len(texts) > 1:
-            raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
-        if rate_hz is not None:
-            check_positive("rate_hz", rate_hz)
-        check_baselines(references, known.model_map.geometry)
-        (self.link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=0)
-        self.known = with_recorded(known, [self.link])
-        self.scans: dict[str, list[Scan]] = {}
-        self.duration_s = 0.0
-        self._references = references
-        self._rate_hz = rate_hz
-        self._stop = stop
-        self._clock_s = clock_s
+def watch(
+    link: Link,
+    watched: Watched,
+    length_s: float,
+    stop: threading.Event,
+    *,
+    tell: Callable[[int, float], object] = lambda scans, passed_s: None,
+    clock_s: Callable[[], float] = time.monotonic,
+) -> None:
+    """Watch an open link for `length_s` in [s], or until `stop`, or until nothing comes any more; raises LinkLostError.
 
-    def run(self, length_s: float, tell: Callable[[int, float], object] = lambda scans, passed_s: None) -> None:
-        """Watch the open link for `length_s` in [s], or until nothing comes any more; raises LinkLostError.
-
-        `tell` is called after each read with the number of scans and the time that has passed, in [s].
-        """
-        start_s = now_s = received_s = self._clock_s()
-        scans = 0
-        while now_s - start_s < length_s and not (self._stop.is_set() or self.link.ended):
-            if now_s - received_s > GIVEN_UP_S:
-                break
-            for scan in self.link.read(POLL_S):
-                self.scans.setdefault(scan.sensor, []).append(scan)
+    `tell` is called after each read with the number of scans and the time that has passed, in [s].
+    """
+    start_s = now_s = received_s = clock_s()
+    scans = 0
+    try:
+        while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
+            for scan in link.read(POLL_S):
+                watched.scans.setdefault(scan.sensor, []).append(scan)
                 received_s = now_s
                 scans += 1
-            now_s = self._clock_s()
-            self.duration_s = now_s - start_s
-            tell(scans, self.duration_s)
-
-    def watched(self) -> Watched:
-        """Return everything that has come so far, while the link is still open."""
-        return Watched(
-            self.scans,
-            self.link.counters(),
-            self.duration_s,
-            line_facts(self.link),
-            self.link.can_ids(),
-            self.known.model_map,
-            self._rate_hz,
-            self._references,
-            None if self.link.kind == "replay" else int(self._clock_s() * NS_PER_S),
-            self.known.mountings,
-        )
+            now_s = clock_s()
+            watched.duration_s = now_s - start_s
+            tell(scans, watched.duration_s)
+    finally:
+        watched.counters, watched.facts, watched.ids = link.counters(), line_facts(link), link.can_ids()
+        watched.until_ns = None if link.kind == "replay" else int(clock_s() * NS_PER_S)
 
 
 def examine(
@@ -123,10 +92,8 @@ def examine(
     """
     check_positive("duration_s", duration_s)
     known = settled(sensor, id_map)
-    stop = threading.Event() if stop is None else stop
-    watch = Watch(texts, known, references=references(baselines, known), rate_hz=rate_hz, stop=stop)
-    with watch.link:
-        refuse_emulated(known, watch.link.kind, force=False)
-        watch.run(duration_s)
-        watched = watch.watched()
+    link, known, watched = prepare(texts, known, references(baselines, known), rate_hz)
+    with link:
+        refuse_emulated(known, link.kind, force=False)
+        watch(link, watched, duration_s, threading.Event() if stop is None else stop)
     return judged(watched, time.time()).findings

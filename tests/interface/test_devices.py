@@ -231,7 +231,7 @@ SPEAKERS = {
     bytes(range(0, 256, 5)) + b"\r": f"{ELSE}no text: another line speed",
     b"t1238AABBCCDDEEFF0011\r": "CAN frames came, and ",
 }
-"""What another device says over and over, and what is read from it."""
+"""Lines that another device sends over and over, each with the hint that is made of them."""
 
 
 @pytest.mark.parametrize("said", SPEAKERS)

@@ -33,7 +33,7 @@ NARROW = """
 import socket, sys
 from edge.cli import main as cli
 from edge.view import server
-from edge.view import viewer_connection as attended
+from edge.view import viewers as attended
 
 def listen(host, port, listen=server._listen):
     listening = listen(host, port)

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Command, Commands
 from edge.view.access import grant, is_loopback
-from edge.view.viewer_commands import LONGEST_BYTES, execute
-from edge.view.viewer_state import Viewer
+from edge.view.viewers import LONGEST_BYTES, Viewer, execute
 from firmware_bridge.links.replay_player import Player
 
 TOKEN = "correct-horse-battery"

@@ -12,10 +12,9 @@ from view_samples import CONTRACT, Press
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
-from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
-from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
-from edge.view.sink import ViewSink
-from edge.view.viewer_state import Viewer
+from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
+from edge.view.viewers import Viewer
 from firmware_bridge.links.replay_player import PlayerState
 
 
@@ -52,7 +51,7 @@ def numbers(header):
 def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     press = Press(counts_per_newton=1000.0)
     result = replace(press.take(3)[-1], notes=(Note("late", "old"), Note("dead", "taxel 3")))
-    heard.add(result, {"dropped": 3})
+    heard.write(result, {"dropped": 3})
     clock.now_ns += 70_000_000
     [(header, maps)] = look(Viewer(), heard, clock)
     said = record(result, {"dropped": 3})
@@ -89,7 +88,7 @@ def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, 
     press, viewer, traced = Press(), Viewer(), []
     for scans in (1, 4, 0, 7, 200):
         for result in press.take(scans):
-            heard.add(result, {})
+            heard.write(result, {})
         got = look(viewer, heard, clock)
         assert len(got) == (scans > 0)
         for header, _ in got:
@@ -100,9 +99,9 @@ def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, 
 
 def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     frames = Frames(heard, clock(), "emulated")
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     [(first, _)] = unpacked(viewer.due(frames))
     [(second, _)] = look(viewer, heard, clock)
     assert (first["scan"], numbers(first)) == (0, [0]) and (second["scan"], numbers(second)) == (1, [1])
@@ -117,7 +116,7 @@ def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
     for number in range(count):  # made over from one: what is drawn is all that matters
         force = 9000.0 if number == spike else 0.0
         scan = replace(idle.scan, number=number, time_ns=number * period_ns)
-        heard.add(replace(idle, scan=scan, force_counts=force), {})
+        heard.write(replace(idle, scan=scan, force_counts=force), {})
     [(header, _)] = look(Viewer(), heard, clock)
     seconds = [point[0] for point in header["trace"]]
     assert len(seconds) <= TRACE_POINTS and seconds == sorted(set(seconds))
@@ -129,10 +128,10 @@ def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
 
 def test_who_was_away_long_gets_what_was_missed_thinned_and_nothing_twice(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(0), {})
+    heard.write(press.next(0), {})
     look(viewer, heard, clock)
     for result in press.take(2 * RECENT_SCANS, 0):
-        heard.add(result, {})
+        heard.write(result, {})
     [(header, _)] = look(viewer, heard, clock)
     got = numbers(header)
     assert got[-1] == 2 * RECENT_SCANS and 1 <= got[0] <= 5 and len(got) <= 2 * RECENT_SCANS / 5 + 2
@@ -145,7 +144,7 @@ AGAIN = Event(0, "zeroed", "4", "again")
 def test_memory_does_not_grow_with_the_run(heard):
     idle = Press().next(0)
     for number in range(20_000):
-        heard.add(
+        heard.write(
             replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), events=(AGAIN,)), {}
         )
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
@@ -170,9 +169,9 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
 
 def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
-    heard.add(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
+    heard.write(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
+    heard.write(press.next(), {})
     event, result = look(viewer, heard, clock)
     assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == (
         *("zeroed", "4", "sensor 4 zeroed on demand: baseline b"),
@@ -182,11 +181,11 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
 
 def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_trace(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     look(viewer, heard, clock)
     viewer.paused = True
     for result in press.take(9):
-        heard.add(result, {})
+        heard.write(result, {})
     heard.tell(Event(1, "lost", None, "gone"), {})
     assert [header["kind"] for header, _ in look(viewer, heard, clock)] == ["event"]
     viewer.paused = False
@@ -195,9 +194,9 @@ def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_t
 
 
 def test_state_tells_the_silence_of_a_sensor(heard, clock):
-    heard.add(Press("4").next(), {})
+    heard.write(Press("4").next(), {})
     clock.now_ns += 700_000_000
-    heard.add(Press("6").next(), {})
+    heard.write(Press("6").next(), {})
     assert Frames(heard, clock(), "emulated").silent() == {"4": 0.7}
     clock.now_ns += 500_000_000
     assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
@@ -229,7 +228,7 @@ def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(h
     four, viewer = Press("4"), Viewer()
 
     def told(press_counts=3000):
-        heard.add(four.next(press_counts), {})
+        heard.write(four.next(press_counts), {})
         return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
 
     four.runtime.zero()
@@ -247,28 +246,28 @@ def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(h
 
 
 @pytest.fixture
-def sink(clock):
-    """Sink of the page, which notes in `woken` when viewers are woken."""
-    made = ViewSink(RunSnapshot(clock), lambda: True, lambda: made.woken.append(clock()), clock)
-    made.woken = []
-    return made
+def woken(clock, heard):
+    """Times at which viewers are woken."""
+    times = []
+    heard.wake = lambda: times.append(clock())
+    return times
 
 
 @pytest.mark.parametrize("jitter_ns", [0, 900_000])
-def test_at_a_hundred_scans_a_second_every_fourth_wakes(clock, sink, jitter_ns):
+def test_at_a_hundred_scans_a_second_every_fourth_wakes(clock, heard, woken, jitter_ns):
     start_ns = clock.now_ns
     for number, result in enumerate(Press().take(400)):
         clock.now_ns = start_ns + number * PERIOD_NS + (jitter_ns if number % 3 else -jitter_ns)
-        sink.write(result, {})
-    assert 95 <= len(sink.woken) <= 4 * MAX_FPS + 1
+        heard.write(result, {})
+    assert 95 <= len(woken) <= 4 * MAX_FPS + 1
 
 
-def test_what_came_last_before_a_silence_is_shown_once(clock, sink):
+def test_what_came_last_before_a_silence_is_shown_once(clock, heard, woken):
     for result in Press().take(2):
-        sink.write(result, {})
+        heard.write(result, {})
         clock.now_ns += PERIOD_NS
-    assert len(sink.woken) == 1
+    assert len(woken) == 1
     for _ in range(5):
         clock.now_ns += 100_000_000
-        sink.wait()
-    assert len(sink.woken) == 2
+        heard.wait()
+    assert len(woken) == 2
