@@ -137,13 +137,7 @@ class Visit:
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
-def run(
-    options: argparse.Namespace,
-    out: TextIO,
-    err: TextIO,
-    *,
-    clock_s: Callable[[], float] = time.monotonic,
-) -> int:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Callable[[], float] = time.monotonic) -> int:
     """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
     Raises:
