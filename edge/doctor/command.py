@@ -3,24 +3,25 @@
 import argparse
 import json
 import math
+import os
+import select
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, TextIO
 
-from edge.doctor.examine import Examined, Watched, examine
+from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.findings import Finding, page, summary, worst
-from edge.doctor.pad_orientation import judge_press
-from edge.doctor.press_guide import FeltLine, GuidedPress, enter_pressed
-from edge.doctor.watch import prepare, watch
+from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_press
 from edge.doctor.write_sensor_file import check_writable, keep
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.stop_signals import stop_on_signals
-from edge.terminal.text_wrap import columns, wrapped
+from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
 from firmware_bridge.links.base import Link
@@ -32,6 +33,59 @@ from firmware_bridge.zeroing.baseline import deformation
 
 EXIT_WRONG: Final = 1
 EXIT_STOPPED: Final = 130
+
+
+REFRESH_S: Final = 0.1
+BAR: Final = 10
+
+
+class FeltLine:
+    """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
+
+    def __init__(self, stream: TextIO, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._stream = drawn(stream)
+        self._clock_s = clock_s
+        self._shown = 0
+        self._shown_s = self._asked_s = clock_s()
+
+    def asked(self) -> None:
+        """Begin the time of a request."""
+        self._asked_s = self._clock_s()
+
+    def show(self, guide: GuidedPress) -> None:
+        """Show the load on the pad, at most ten times a second."""
+        now_s = self._clock_s()
+        if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
+            return
+        self._shown_s = now_s
+        full = min(int(BAR * guide.felt), BAR)
+        left_s = max(PATIENCE_S - (now_s - self._asked_s), 0)
+        skip = ", Enter skips" if _stdin_is_terminal() else ""
+        self._write(f"felt [{'#' * full:{BAR}}] {left_s:.0f} s left{skip}")
+
+    def clear(self) -> None:
+        """Clear the line, for text that stays."""
+        if self._shown:
+            self._write("")
+            self._stream.write("\r")
+
+    def _write(self, text: str) -> None:
+        text = text[: columns() - 1]
+        self._stream.write("\r" + text.ljust(self._shown))
+        self._stream.flush()
+        self._shown = len(text)
+
+
+def enter_pressed() -> bool:
+    """Return whether Enter was pressed on the terminal since the last call; never waits."""
+    if not _stdin_is_terminal() or not select.select([sys.stdin.fileno()], [], [], 0)[0]:
+        return False
+    return b"\n" in os.read(sys.stdin.fileno(), 1024)
+
+
+def _stdin_is_terminal() -> bool:
+    # Only on POSIX can a terminal be polled for input.
+    return os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 class Visit:
@@ -168,7 +222,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
                 whole = not stop.is_set()
             except LinkLostError as error:
                 failed = error
-            examined = examine(watched, math.nan if link.kind == "replay" else time.time())
+            examined = judge(watched, math.nan if link.kind == "replay" else time.time())
             if whole:
                 try:
                     visit.press(sorted(watched.scans), examined)

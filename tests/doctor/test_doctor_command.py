@@ -18,9 +18,9 @@ from edge_samples import FakeLink
 
 from edge.cli import main as cli
 from edge.cli.run_options import parser
-from edge.doctor import command, watch
+from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
-from edge.doctor.pad_orientation import CORNERS, orders
+from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.pad_geometry import USPA44
@@ -201,8 +201,8 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
 
 def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong(monkeypatch):
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
-    with Emulator([recording(*people, rate_hz=300.0)], jitter_s=0.0) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 300, people=people, drift_s=0.5)
+    with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 120, people=people, drift_s=1.2)
     found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
@@ -212,7 +212,7 @@ def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     monkeypatch.setattr(command, "GIVEN_UP_S", 0.3)
     options = parser("doctor").parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
-    monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])
+    monkeypatch.setattr(examine, "links_to", lambda *_, **__: [link])
     assert command.run(options, out, Terminal(Person())) == 1
     settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"

@@ -9,8 +9,8 @@ from edge_samples import make_contract, write_model
 from mcap_samples import arrays_of
 
 from edge import api
+from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
 from edge.doctor.link_checks import check_id_map
-from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders
 from edge.errors import ModelError, UsageError
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
