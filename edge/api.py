@@ -71,7 +71,7 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
 if TYPE_CHECKING:
-    from edge.doctor.watch import examine
+    from edge.doctor.examine import examine
     from edge.mapping.sink import MapSink, ObjectMap
     from edge.pipeline.array_results import infer
     from edge.pipeline.baseline_capture import take_baselines
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
 _ON_USE: Final = {
-    "examine": "edge.doctor.watch",
+    "examine": "edge.doctor.examine",
     "MapSink": "edge.mapping.sink",
     "ObjectMap": "edge.mapping.sink",
     "infer": "edge.pipeline.array_results",

@@ -26,7 +26,7 @@ from edge.api import (
     save_baselines,
     unfinished_load,
 )
-from edge.cli.run_options import parser, understood
+from edge.cli.run_options import understood
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 from firmware_bridge.in_place import BACKUP_SUFFIX
@@ -51,11 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    command = COMMANDS.get(arguments[0]) if arguments else None
     open_closed_streams()
     try:
         with guarded_streams():
-            return (_run(arguments) if command is None else command(arguments[1:])) or 0
+            return _command(arguments) or 0
         return 0
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -79,16 +78,21 @@ def _exit_code(error: BridgeError | EdgeError) -> int:
     return EXIT_SINK if isinstance(error, SinkError) else EXIT_USAGE
 
 
-def _run(arguments: Sequence[str]) -> None:
-    if arguments and not arguments[0].startswith("-"):
+def _command(arguments: Sequence[str]) -> int | None:
+    """Do a command, or run without one; return its exit code, or None for 0."""
+    named = bool(arguments) and not arguments[0].startswith("-")
+    name, rest = (arguments[0], arguments[1:]) if named else ("", arguments)
+    if name == "bench":
+        return _bench(rest)
+    if named and name not in COMMANDS:
         from difflib import get_close_matches
 
-        near = get_close_matches(arguments[0], COMMANDS, n=1)
+        near = get_close_matches(name, COMMANDS, n=1)
         meant = (
             f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"
         )
-        raise UsageError(f"no command {arguments[0]!r}: {meant}")
-    _follow(understood("", arguments))
+        raise UsageError(f"no command {name!r}: {meant}")
+    return _ACTIONS[name](understood(name, rest))
 
 
 def _follow(
@@ -102,30 +106,26 @@ def _follow(
     run(options, source, statistics, mapping)
 
 
-def _demo(arguments: Sequence[str]) -> None:
-    options = understood("demo", arguments)
+def _demo(options: argparse.Namespace) -> None:
     options.source = ["demo"]
     _follow(options)
 
 
-def _map(arguments: Sequence[str]) -> None:
-    options = understood("map", arguments)
+def _map(options: argparse.Namespace) -> None:
     from edge.cli.run_files import new_map
 
     with new_map(options) as mapping:
         _follow(options, mapping=mapping)
 
 
-def _record(arguments: Sequence[str]) -> None:
-    options = understood("record", arguments)
+def _record(options: argparse.Namespace) -> None:
     from edge.cli.run_files import new_recording
 
     with new_recording(options) as statistics:
         _follow(options, statistics)
 
 
-def _replay(arguments: Sequence[str]) -> None:
-    options = understood("replay", arguments)
+def _replay(options: argparse.Namespace) -> None:
     from edge.cli.run_command import run
     from edge.pipeline.replay_setup import Player, open_recording
 
@@ -144,8 +144,7 @@ def _replay(arguments: Sequence[str]) -> None:
     run(options, source, player=player)
 
 
-def _baseline(arguments: Sequence[str]) -> None:
-    options = parser("baseline").parse_args(arguments)
+def _baseline(options: argparse.Namespace) -> None:
     from edge.api import take_baselines
     from edge.terminal.stop_signals import stop_on_signals
 
@@ -185,35 +184,32 @@ def _bench(arguments: Sequence[str]) -> int:
     return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
-def _convert(arguments: Sequence[str]) -> None:
-    options = parser("convert").parse_args(arguments)
-    from edge.cli.convert_command import convert
-
-    convert(options)
-
-
-def _models(arguments: Sequence[str]) -> None:
-    options = parser("models").parse_args(arguments)
+def _models(options: argparse.Namespace) -> None:
     from edge.cli.models_command import run
 
     run(measure=options.measure, stdout=sys.stdout)
 
 
-def _devices(arguments: Sequence[str]) -> None:
-    options = parser("devices").parse_args(arguments)
+def _devices(options: argparse.Namespace) -> None:
     from edge.cli.devices_command import run
 
     run(as_json=options.json, stdout=sys.stdout)
 
 
-def _doctor(arguments: Sequence[str]) -> int:
-    options = parser("doctor").parse_args(arguments)
+def _doctor(options: argparse.Namespace) -> int:
     from edge.doctor.command import run
 
     return run(options, sys.stdout, sys.stderr)
 
 
-COMMANDS: Final[dict[str, Callable[[Sequence[str]], int | None]]] = {
+def _convert(options: argparse.Namespace) -> None:
+    from edge.cli.convert_command import convert
+
+    convert(options)
+
+
+_ACTIONS: Final[dict[str, Callable[[argparse.Namespace], int | None]]] = {
+    "": _follow,
     "demo": _demo,
     "record": _record,
     "replay": _replay,
@@ -221,10 +217,10 @@ COMMANDS: Final[dict[str, Callable[[Sequence[str]], int | None]]] = {
     "map": _map,
     "models": _models,
     "baseline": _baseline,
-    "bench": _bench,
     "devices": _devices,
     "doctor": _doctor,
 }
+COMMANDS: Final = (*filter(None, _ACTIONS), "bench")
 
 
 def _open_source(options: argparse.Namespace, give_up_s: float) -> Source:

@@ -26,9 +26,8 @@ _MEMORY_REMEDY: Final = "'ulimit -l unlimited', a line '@GROUP - memlock unlimit
 def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> Iterator[None]:
     """Run this thread, and those that it waits for, in real time as far as is permitted, and as before afterwards.
 
-    Args:
-        tell: called with one line for each part that is refused; the run continues without it.
-        thread_ids: system's numbers of the other threads. A thread begun meanwhile is ordinary, on this processor.
+    `tell` is called with one line for each part that is refused; the run continues without it. `thread_ids` are the
+    system's numbers of the other threads. A thread begun meanwhile is ordinary, on this processor.
     """
     if sys.platform != "linux":
         tell(f"--realtime: not on {sys.platform}, only on Linux; going on without")
@@ -48,27 +47,28 @@ def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> I
         yield
 
 
+def _each(threads: Sequence[int], act: Callable[[int], None]) -> None:
+    for thread in threads:
+        with suppress(ProcessLookupError):  # it has ended, and its link with it
+            act(thread)
+
+
 def _schedule(threads: Sequence[int]) -> Callable[[], object]:
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-
     def schedule(policy: int, parameters: os.sched_param) -> None:
-        for thread in threads:
-            with suppress(ProcessLookupError):  # it has ended, and its link with it
-                # Threads that these begin start as ordinary ones. The flag stays afterwards, since clearing it needs
-                # a privilege of its own.
-                os.sched_setscheduler(thread, policy | os.SCHED_RESET_ON_FORK, parameters)
+        # Threads that these begin start as ordinary ones. The flag stays afterwards: to clear it needs a privilege.
+        policy |= os.SCHED_RESET_ON_FORK
+        _each(threads, lambda thread: os.sched_setscheduler(thread, policy, parameters))
 
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
     schedule(os.SCHED_FIFO, os.sched_param(PRIORITY))
-    return lambda: schedule(policy, parameters)
+    return lambda: schedule(*before)
 
 
 def _pin(threads: Sequence[int]) -> Callable[[], object]:
     allowed = os.sched_getaffinity(0)
 
     def pin(processors: set[int]) -> None:
-        for thread in threads:
-            with suppress(ProcessLookupError):
-                os.sched_setaffinity(thread, processors)
+        _each(threads, lambda thread: os.sched_setaffinity(thread, processors))
 
     if len(allowed) > 1:  # a single processor gains nothing
         pin({max(allowed)})

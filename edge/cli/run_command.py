@@ -42,7 +42,7 @@ from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
     from edge.api import MapSink
-    from edge.cli.demo_sinks import Demo
+    from edge.cli.demo import Demo
     from edge.pipeline.replay_setup import Player
     from edge.view.live_view import LiveView
 
@@ -74,7 +74,7 @@ def run(
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands, contextlib.closing(source):
         loops = options.source == [DEMO_LOOP]
-        demo = loops or options.source == ["demo"]
+        is_demo = loops or options.source == ["demo"]
         posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
         name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
         model = None
@@ -103,22 +103,23 @@ def run(
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
                 if player is not None:
                     print("the recording begins when the page is opened, and repeats until Ctrl-C", file=sys.stderr)
-            if demo:
-                from edge.cli import demo_sinks
+            if is_demo:
+                from edge.cli import demo
 
-                played = demo_sinks.Demo(model, source, scores, view, loops=loops, maps=mapping is None)
+                watching = [messages, *(() if view is None else view.sinks)]
+                played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
             asked = runtime_options(options)
             if loops:
                 rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
                 asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
-            if demo:  # it shows the run time of every scan
+            if is_demo:  # it shows the run time of every scan
                 asked = replace(asked, every_scan=True)
             per_newton = options.counts_per_newton
             runtime = open_runtime(model, source, baselines=baselines, counts_per_newton=per_newton, **asdict(asked))
             give_back()
             sinks: list[Sink] = []
             if played is not None:
-                sinks += played.sinks([messages, *(() if view is None else view.sinks)], commands)
+                sinks += [played, *([] if played.map is None else [played.map])]
             fan = Fan(messages.say)
             closing.callback(fan.close)
             sinks.append(messages)

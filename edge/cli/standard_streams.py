@@ -3,7 +3,7 @@
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Final, TextIO, cast
 
 from edge.errors import SinkError
@@ -37,7 +37,8 @@ def guarded_streams() -> Iterator[None]:
     stdout that cannot be written raises SinkError.
     """
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = cast("TextIO", _Checked(sys.stdout)), cast("TextIO", _Optional(sys.stderr))
+    sys.stdout = cast("TextIO", _Guarded(streams[0], _refuse_stdout))
+    sys.stderr = cast("TextIO", _Guarded(streams[1], lambda error: _stand_in(streams[1], STDERR)))
     try:
         try:
             yield
@@ -59,8 +60,8 @@ def _stand_in(stream: TextIO, number: int) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
-class _Checked:
-    """Stream that reports in one line why it cannot be written, and that escapes control characters.
+class _Guarded:
+    """Stream that escapes control characters, and whose faults are handled; but for a reader that has gone, of stdout.
 
     All printed text passes here, and much of it holds names and texts of files, devices and models.
 
@@ -68,41 +69,30 @@ class _Checked:
         drawn: the same stream for text with control characters of our own.
     """
 
-    def __init__(self, stream: TextIO, *, escapes: bool = True) -> None:
-        self._stream = stream
-        self._escapes = escapes
-        self.drawn = type(self)(stream, escapes=False) if escapes else self
+    def __init__(self, stream: TextIO, refuse: Callable[[OSError], None], *, escapes: bool = True) -> None:
+        self._stream, self._refuse, self._escapes = stream, refuse, escapes
+        self.drawn = type(self)(stream, refuse, escapes=False) if escapes else self
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with self._refused():
+        try:
             encoding = getattr(self._stream, "encoding", None) or "utf-8"
             shown = harmless(text) if self._escapes else text
             self._stream.write(shown.encode(encoding, "backslashreplace").decode(encoding))
+        except OSError as error:
+            self._refuse(error)
         return len(text)
 
     def flush(self) -> None:
-        with self._refused():
+        try:
             self._stream.flush()
-
-    @contextlib.contextmanager
-    def _refused(self) -> Iterator[None]:
-        try:
-            yield
-        except BrokenPipeError:
-            raise
         except OSError as error:
-            raise SinkError(f"cannot write to stdout: {error.strerror}") from error
+            self._refuse(error)
 
 
-class _Optional(_Checked):
-    """Stream that accepts all text, even if it cannot be written: full, or its window closed."""
-
-    @contextlib.contextmanager
-    def _refused(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError:
-            _stand_in(self._stream, STDERR)
+def _refuse_stdout(error: OSError) -> None:
+    if isinstance(error, BrokenPipeError):
+        raise error
+    raise SinkError(f"cannot write to stdout: {error.strerror}") from error

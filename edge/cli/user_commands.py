@@ -10,11 +10,9 @@ from functools import partial
 from typing import Any, Final
 
 from edge.pipeline.commands import RESET, ZERO, Command, Commands, read_stdin
-from edge.terminal.forced_end import before_force
-from edge.terminal.stop_signals import handled
+from edge.terminal.stop_signals import before_force, handled
 
-KEYS: Final = {b"r": RESET, b"z": ZERO, b"Z": Command("zero", force=True)}
-READ_BYTES: Final = 64
+KEYS: Final = {ord("r"): RESET, ord("z"): ZERO, ord("Z"): Command("zero", force=True)}
 ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
@@ -36,31 +34,27 @@ class Keys:
         if not select.select([self._descriptor], [], [], 0)[0]:
             return
         try:
-            keys = os.read(self._descriptor, READ_BYTES)
+            keys = os.read(self._descriptor, 64)
         except OSError:  # the terminal was closed, which ends keys but not the run
             keys = b""
         self._gone = not keys
         for key in keys:
-            command = KEYS.get(bytes([key]))
-            if command is not None:
-                self._commands.put(command)
+            if key in KEYS:
+                self._commands.put(KEYS[key])
 
     def take(self) -> None:
         """Set the terminal to pass keys one by one, unseen; Ctrl-C and Ctrl-Z remain signals."""
         import termios
+        import tty
 
         if self._gone or self._before is not None or not self._foreground():
             return
         try:
             before = termios.tcgetattr(self._descriptor)
-            mode = termios.tcgetattr(self._descriptor)
-            mode[3] &= ~(termios.ICANON | termios.ECHO)
-            mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
-            termios.tcsetattr(self._descriptor, termios.TCSANOW, mode)
+            tty.setcbreak(self._descriptor, termios.TCSANOW)
+            self._before = before
         except termios.error:
             self._gone = True
-        else:
-            self._before = before
 
     def give_back(self, *, for_good: bool = False) -> None:
         """Restore the terminal's settings, unless the program is in the background, where another uses it."""

@@ -3,33 +3,89 @@
 import argparse
 import json
 import math
+import os
+import select
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, TextIO
 
-from edge.doctor.examine import Examined, examine
+from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.findings import Finding, page, summary, worst
-from edge.doctor.pad_orientation import judge_press
-from edge.doctor.press_guide import FeltLine, GuidedPress, enter_pressed
-from edge.doctor.watch import Watch
+from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_press
 from edge.doctor.write_sensor_file import check_writable, keep
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import references, refuse_emulated, settled
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.stop_signals import stop_on_signals
-from edge.terminal.text_wrap import columns, wrapped
+from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
+from firmware_bridge.links.base import Link
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
 
 EXIT_WRONG: Final = 1
 EXIT_STOPPED: Final = 130
+
+
+REFRESH_S: Final = 0.1
+BAR: Final = 10
+
+
+class FeltLine:
+    """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
+
+    def __init__(self, stream: TextIO, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._stream = drawn(stream)
+        self._clock_s = clock_s
+        self._shown = 0
+        self._shown_s = self._asked_s = clock_s()
+
+    def asked(self) -> None:
+        """Begin the time of a request."""
+        self._asked_s = self._clock_s()
+
+    def show(self, guide: GuidedPress) -> None:
+        """Show the load on the pad, at most ten times a second."""
+        now_s = self._clock_s()
+        if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
+            return
+        self._shown_s = now_s
+        full = min(int(BAR * guide.felt), BAR)
+        left_s = max(PATIENCE_S - (now_s - self._asked_s), 0)
+        skip = ", Enter skips" if _stdin_is_terminal() else ""
+        self._write(f"felt [{'#' * full:{BAR}}] {left_s:.0f} s left{skip}")
+
+    def clear(self) -> None:
+        """Clear the line, for text that stays."""
+        if self._shown:
+            self._write("")
+            self._stream.write("\r")
+
+    def _write(self, text: str) -> None:
+        text = text[: columns() - 1]
+        self._stream.write("\r" + text.ljust(self._shown))
+        self._stream.flush()
+        self._shown = len(text)
+
+
+def enter_pressed() -> bool:
+    """Return whether Enter was pressed on the terminal since the last call; never waits."""
+    if not _stdin_is_terminal() or not select.select([sys.stdin.fileno()], [], [], 0)[0]:
+        return False
+    return b"\n" in os.read(sys.stdin.fileno(), 1024)
+
+
+def _stdin_is_terminal() -> bool:
+    # Only on POSIX can a terminal be polled for input.
+    return os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 class Visit:
@@ -38,26 +94,26 @@ class Visit:
     Attributes:
         mountings: corrections of the mountings, by sensor.
         newtons: counts per newton of the sensors that were weighed.
-        watched: True when the free pads were watched for the whole time.
         unfinished: True when a measurement was asked of a person, and not made.
     """
 
     def __init__(
         self,
         options: argparse.Namespace,
-        watch: Watch,
+        link: Link,
+        known: SensorFile,
         err: TextIO,
         stop: threading.Event,
         clock_s: Callable[[], float],
     ) -> None:
-        """Prepare the visit of a watch that has not begun; requests to a person go to `err`."""
+        """Prepare the visit; requests to a person go to `err`."""
         self.mountings: dict[str, Mounting] = {}
         self.newtons: dict[str, float] = {}
-        self.watched = self.unfinished = False
-        self._options, self._err, self._stop, self._clock_s = options, err, stop, clock_s
-        self._watch, self._link = watch, watch.link
+        self.unfinished = False
+        self._options, self._link, self._known = options, link, known
+        self._err, self._stop, self._clock_s = err, stop, clock_s
 
-    def watch(self) -> None:
+    def watch(self, watched: Watched) -> None:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
@@ -68,23 +124,21 @@ class Visit:
                     bar.note(f"{scans / passed_s:.0f} scans/s")
                 bar.reach(min(passed_s, length_s))
 
-            self._watch.run(length_s, show)
-        self.watched = not self._stop.is_set()
+            watch(self._link, watched, length_s, self._stop, tell=show, clock_s=self._clock_s)
 
-    def press(self, examined: Examined) -> None:
+    def press(self, names: Sequence[str], examined: Examined) -> None:
         """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
         why = self._why_no_press()
-        for name in sorted(self._watch.scans):
+        for name in names:
             if why is None and name in examined.baselines:
-                self._press_one(name, examined)
+                self._press_one(name, f"Sensor {name}: " if len(names) > 1 else "", examined)
             else:
                 reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
 
-    def _press_one(self, name: str, examined: Examined) -> None:
-        geometry, weight_g = self._watch.known.geometry, self._options.weight_g
+    def _press_one(self, name: str, whose: str, examined: Examined) -> None:
+        geometry, weight_g = self._known.geometry, self._options.weight_g
         guide = GuidedPress(weight_g, geometry)
-        whose = f"Sensor {name}: " if len(self._watch.scans) > 1 else ""
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
         findings, found = judge_press(guide.answer, self._options.out is not None, weight_g is not None, geometry)
@@ -97,7 +151,7 @@ class Visit:
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
-        baseline, mounting = examined.baselines[name], self._watch.known.mountings.get(name)
+        baseline, mounting = examined.baselines[name], self._known.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
             self._say(whose + guide.first)
         received_s = self._clock_s()
@@ -137,13 +191,7 @@ class Visit:
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
-def run(
-    options: argparse.Namespace,
-    out: TextIO,
-    err: TextIO,
-    *,
-    clock_s: Callable[[], float] = time.monotonic,
-) -> int:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Callable[[], float] = time.monotonic) -> int:
     """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
     Raises:
@@ -162,37 +210,52 @@ def run(
         check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
     before = references(options.baseline, known)
     with stop_on_signals() as stop:
-        watch = Watch(options.source, known, references=before, rate_hz=options.rate_hz, stop=stop, clock_s=clock_s)
-        visit = Visit(options, watch, err, stop, clock_s)
+        link, known, watched = prepare(options.source, known, before, options.rate_hz)
+        visit = Visit(options, link, known, err, stop, clock_s)
         start_s = clock_s()
         failed: BridgeError | None = None
-        with watch.link:
-            refuse_emulated(known, watch.link.kind, options.force)
+        whole = False
+        with link:
+            refuse_emulated(known, link.kind, options.force)
             try:
-                visit.watch()
+                visit.watch(watched)
+                whole = not stop.is_set()
             except LinkLostError as error:
                 failed = error
-            watched = watch.watched()
-            examined = examine(watched, math.nan if watch.link.kind == "replay" else time.time())
-            if failed is None and not stop.is_set():
+            examined = judge(watched, math.nan if link.kind == "replay" else time.time())
+            if whole:
                 try:
-                    visit.press(examined)
+                    visit.press(sorted(watched.scans), examined)
                 except LinkLostError as error:
                     failed = error
         if failed is not None:
             examined.findings.append(Finding("link", "wrong", f"lost: {failed}", "", "check plug and cable"))
         kept, replaced = False, options.out is not None and options.out.exists()
-        if options.out is not None and failed is None and visit.watched:
+        if options.out is not None and failed is None and whole:
             free = {name: one for name, one in examined.baselines.items() if name not in examined.loaded}
-            emulated = "emulated" in (watch.link.kind, watch.link.origin)
-            found = free, visit.mountings, visit.newtons
+            emulated = "emulated" in (link.kind, link.origin)
             try:
-                keep(options.out, watch.known, watched.facts.port, *found, emulated=emulated)
+                keep(options.out, known, watched.facts.port, free, visit.mountings, visit.newtons, emulated=emulated)
                 kept = True
             except SensorFileError as error:
                 failed = error
         stopped_s = clock_s() - start_s if stop.is_set() else None
-        _tell(options, watch, stopped_s, examined.findings, out, kept=kept, replaced=replaced)
+        if options.json:
+            document = {
+                "source": link.name,
+                "kind": link.kind,
+                "id_map": known.model,
+                "duration_s": round(watched.duration_s, 3),
+                "stopped": stopped_s is not None,
+                "verdict": worst(examined.findings),
+                "findings": [finding.document() for finding in examined.findings],
+                "sensor_file": str(options.out) if kept else None,
+            }
+            print(json.dumps(document, indent=1), file=out)
+        else:
+            files = [f"kept in {options.out}"] if kept else []
+            files += [f"the former file is now {options.out}{BACKUP_SUFFIX}"] if kept and replaced else []
+            print(*_lines(link, examined.findings, files, stopped_s), sep="\n", file=out)
         if failed is not None:
             raise failed
         if stop.is_set():
@@ -202,35 +265,9 @@ def run(
     return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
 
 
-def _tell(
-    options: argparse.Namespace,
-    watch: Watch,
-    stopped_s: float | None,
-    findings: list[Finding],
-    out: TextIO,
-    *,
-    kept: bool,
-    replaced: bool,
-) -> None:
-    link = watch.link
-    if options.json:
-        document = {
-            "source": link.name,
-            "kind": link.kind,
-            "id_map": watch.known.model,
-            "duration_s": round(watch.duration_s, 3),
-            "stopped": stopped_s is not None,
-            "verdict": worst(findings),
-            "findings": [finding.document() for finding in findings],
-            "sensor_file": str(options.out) if kept else None,
-        }
-        print(json.dumps(document, indent=1), file=out)
-        return
+def _lines(link: Link, findings: list[Finding], files: list[str], stopped_s: float | None) -> list[str]:
+    """Return the findings for a person; the visit was stopped after `stopped_s`, or None."""
     emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
-    print(f"{link.name}{emulated}", page(findings, columns()), sep="\n", file=out)
-    if kept:
-        print(f"kept in {options.out}", file=out)
-        if replaced:
-            print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)
     early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
-    print(*wrapped(early + summary(findings), columns()), sep="\n", file=out)
+    shown = [f"{link.name}{emulated}", page(findings, columns()), *files]
+    return [*shown, *wrapped(early + summary(findings), columns())]

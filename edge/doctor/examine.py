@@ -1,34 +1,43 @@
-"""Examination of a watch: all findings, and which of them only follow from others. No I/O, no clock."""
+"""Watch of a link while its pads are free, and its examination: all findings, and which only follow from others."""
 
-from collections.abc import Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor import link_checks as link
+from edge.doctor import link_checks
 from edge.doctor import taxel_checks as taxels
 from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import LineFacts
 from edge.doctor.taxel_checks import FEWEST_SCANS, Samples
+from edge.errors import UsageError
+from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
+from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.links.base import Link
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.sensor_file.model import SensorFile
+from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing import baseline as zeroing
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, BaselineEstimator, deformation
 
 
-@dataclass(frozen=True)
+@dataclass
 class Watched:
     """Data of a watch while the pads were free.
 
     Attributes:
         scans: of each sensor, in their order.
         counters: of the link.
-        duration_s: length of the watch, in [s].
+        duration_s: length of the watch so far, in [s].
         facts: of the line.
         ids: the CAN ids that came; empty where the link sees none.
         model: the id map that the user chose.
@@ -38,9 +47,9 @@ class Watched:
         mountings: of the sensors, as far as they are available.
     """
 
-    scans: Mapping[str, Sequence[Scan]]
-    counters: Mapping[str, int]
-    duration_s: float
+    scans: dict[str, list[Scan]] = field(default_factory=dict)
+    counters: Mapping[str, int] = field(default_factory=dict)
+    duration_s: float = 0.0
     facts: LineFacts = field(default_factory=LineFacts)
     ids: frozenset[int] = frozenset()
     model: ModelMap = USPA44_MAP
@@ -68,19 +77,19 @@ class Examined:
     loaded: frozenset[str] = frozenset()
 
 
-def examine(watched: Watched, unix_time_s: float) -> Examined:
+def judge(watched: Watched, unix_time_s: float) -> Examined:
     """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970, NaN if unknown."""
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
     enough = {name: one for name, one in samples.items() if one.enough}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
     facts, counters, duration_s = watched.facts, watched.counters, watched.duration_s
     taxel_count = watched.model.geometry.taxel_count
-    baud = link.check_baud(facts, counters, duration_s, len(enough), watched.rate_hz, taxel_count)
-    id_map = link.check_id_map(watched.ids, watched.model, bool(half_silent))
+    baud = link_checks.check_baud(facts, counters, duration_s, len(enough), watched.rate_hz, taxel_count)
+    id_map = link_checks.check_id_map(watched.ids, watched.model, bool(half_silent))
     line_full = baud is not None and baud.verdict == "wrong"
-    of_link = [link.check_link(counters, duration_s), baud]
+    of_link = [link_checks.check_link(counters, duration_s), baud]
     if facts.port is not None and enough:
-        of_link.append(link.check_latency(facts, max(one.held_back_ms() for one in enough.values()), line_full))
+        of_link.append(link_checks.check_latency(facts, max(one.held_back_ms() for one in enough.values()), line_full))
     of_link.append(id_map)
     findings = [finding for finding in of_link if finding is not None]
     if not enough:
@@ -97,9 +106,9 @@ def examine(watched: Watched, unix_time_s: float) -> Examined:
         spoiled = next((check.name for check in (noise, drift) if check.verdict != "ok"), None)
         baseline, quality = check_baseline(watched.scans[name][1:], one.living, spoiled, unix_time_s)
         of_sensor = [
-            link.check_rate(one, watched.rate_hz, line_full),
-            link.check_torn(one),
-            link.check_lost(one, (newest_ns - watched.scans[name][-1].time_ns) / NS_PER_S),
+            link_checks.check_rate(one, watched.rate_hz, line_full),
+            link_checks.check_torn(one),
+            link_checks.check_lost(one, (newest_ns - watched.scans[name][-1].time_ns) / NS_PER_S),
             taxels.check_silent(one, wrong_map and name in half_silent),
             taxels.check_stuck(one),
             noise,
@@ -167,3 +176,83 @@ def check_load(
     measured = f"z {z[taxel]:+.0f} counts on taxel {taxel} against baseline {reference.id}"
     remedy = _PRESSED if z[taxel] > 0 else "the baseline was taken of a loaded pad, or is too old: zero again"
     return judged("load", "wrong" if abs(z[taxel]) > LOAD_LIMIT_COUNTS else "ok", measured, norm, remedy)
+
+
+def prepare(
+    texts: Sequence[str], known: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
+) -> tuple[Link, SensorFile, Watched]:
+    """Return the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
+
+    `before` holds earlier baselines of the free pads, by sensor; `rate_hz` is expected of each sensor, in [Hz]. Raises
+    what source_setup.links_to raises, and UsageError for several sources.
+    """
+    if len(texts) > 1:
+        raise UsageError(f"{len(texts)} sources, expected one: examine them one after the other")
+    if rate_hz is not None:
+        check_positive("rate_hz", rate_hz)
+    check_baselines(before, known.model_map.geometry)
+    (link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=0)
+    known = with_recorded(known, [link])
+    return link, known, Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
+
+
+def watch(
+    link: Link,
+    watched: Watched,
+    length_s: float,
+    stop: threading.Event,
+    *,
+    tell: Callable[[int, float], object] = lambda scans, passed_s: None,
+    clock_s: Callable[[], float] = time.monotonic,
+) -> None:
+    """Watch an open link for `length_s` in [s], or until `stop`, or until nothing comes any more; raises LinkLostError.
+
+    `tell` is called after each read with the number of scans and the time that has passed, in [s].
+    """
+    start_s = now_s = received_s = clock_s()
+    scans = 0
+    try:
+        while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
+            for scan in link.read(POLL_S):
+                watched.scans.setdefault(scan.sensor, []).append(scan)
+                received_s = now_s
+                scans += 1
+            now_s = clock_s()
+            watched.duration_s = now_s - start_s
+            tell(scans, watched.duration_s)
+    finally:
+        watched.counters, watched.facts, watched.ids = link.counters(), link_checks.line_facts(link), link.can_ids()
+        watched.until_ns = None if link.kind == "replay" else int(clock_s() * NS_PER_S)
+
+
+def examine(
+    *texts: str,
+    sensor: str | Path | None = None,
+    id_map: str | None = None,
+    rate_hz: float | None = None,
+    baselines: Mapping[str, Baseline] | str | Path | None = None,
+    duration_s: float = 60.0,
+    stop: threading.Event | None = None,
+) -> list[Finding]:
+    """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
+
+    Args:
+        texts: as for `open_source`, but at most one; no other program may read it meanwhile.
+        sensor: as for `open_source`.
+        id_map: as for `open_source`.
+        rate_hz: expected rate of each sensor, in [Hz].
+        baselines: of the free pads, or their file; by default those of the sensor file.
+        duration_s: how long to watch, in [s].
+        stop: event that ends it early.
+
+    Raises:
+        BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.
+        UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
+    """
+    check_positive("duration_s", duration_s)
+    known = settled(sensor, id_map)
+    link, known, watched = prepare(texts, known, references(baselines, known), rate_hz)
+    with link:
+        refuse_emulated(known, link.kind, force=False)
+        watch(link, watched, duration_s, threading.Event() if stop is None else stop)
+    return judge(watched, time.time()).findings

@@ -22,7 +22,7 @@ from edge.sinks.ros2.map_messages import UNITS, image, in_si
 from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
 from edge.sinks.ros2.topic_names import sensor_path
 from edge.sinks.run_facts import NOW, RunFacts
-from edge.terminal.forced_end import finishing
+from edge.terminal.stop_signals import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.cdr import MessageType

@@ -2,20 +2,14 @@
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, Self, TextIO, TypeVar
+from typing import Any, Final, Self, TextIO, TypeVar
 
 from edge.terminal.text_wrap import drawn
 from firmware_bridge.errors import harmless
 
-if TYPE_CHECKING:
-    from tqdm import tqdm
-
 DELAY_S: Final = 2.0
-_RANK, _FIRST = "RANK", "0"
-"""Variable and value of the first of torchrun's processes, which share a terminal; it alone shows its bars."""
 _COUNTED: Final = "{desc} {percentage:3.0f}%|{bar}| {rate_fmt} {remaining} left{postfix}"
 _TIMED: Final = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 SECONDS: Final = "s"
@@ -26,17 +20,7 @@ _Thing = TypeVar("_Thing")
 class Progress:
     """Progress of a piece of work on one line, which is cleared at the end, whatever ends it."""
 
-    def __init__(
-        self,
-        what: str,
-        total: float,
-        unit: str,
-        *,
-        done: float = 0,
-        stream: TextIO | None = None,
-        clock_s: Callable[[], float] = time.monotonic,
-        delay_s: float = DELAY_S,
-    ) -> None:
+    def __init__(self, what: str, total: float, unit: str, *, done: float = 0, stream: TextIO | None = None) -> None:
         """Begin; nothing is shown yet.
 
         Args:
@@ -45,19 +29,26 @@ class Progress:
             unit: in the singular, such as "pose"; SECONDS for a wait.
             done: units that were finished before, and took no time now.
             stream: output, used only if it is a terminal; stderr by default.
-            clock_s: monotonic, in [s].
-            delay_s: time before the bar appears, in [s].
         """
-        self._what, self._total, self._unit = harmless(what, kept=""), total, unit
-        self._before = self._done = done
-        self._note = ""
-        self._stream = sys.stderr if stream is None else stream
-        self._clock_s = clock_s
-        self._begun_s = clock_s()
-        self._delay_s = delay_s
-        self._bar: tqdm[Any] | None = None
-        first = os.environ.get(_RANK, _FIRST) == _FIRST
-        self._watched = first and self._stream is not None and not self._stream.closed and self._stream.isatty()
+        self._bar: Any = None  # a tqdm, where there is a terminal
+        stream = sys.stderr if stream is None else stream
+        first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, which share a terminal
+        if first and stream is not None and not stream.closed and stream.isatty():
+            from tqdm import tqdm  # here and not above, since few programs run on a terminal
+
+            self._bar = tqdm(
+                desc=harmless(what, kept=""),
+                total=total,
+                initial=done,
+                unit=unit,
+                unit_scale=True,
+                file=drawn(stream),
+                leave=False,
+                dynamic_ncols=True,
+                miniters=0,
+                bar_format=_TIMED if unit == SECONDS else _COUNTED,
+                delay=DELAY_S,
+            )
 
     def __enter__(self) -> Self:
         return self
@@ -67,58 +58,37 @@ class Progress:
 
     def advance(self, units: float = 1) -> None:
         """Add finished units."""
-        self.reach(self._done + units)
+        if self._bar is not None:
+            self._bar.update(units)
 
     def reach(self, done: float) -> None:
         """Set the number of finished units."""
-        more, self._done = done - self._done, done
         if self._bar is not None:
-            self._bar.update(more)
-        elif self._watched and self._clock_s() - self._begun_s >= self._delay_s:
-            self._show()
+            self._bar.update(done - self._bar.n)
 
     def note(self, text: str, *, at_once: bool = False) -> None:
         """Set a few words after the bar, shown with the next step, or at once if that is far off."""
-        self._note = text
         if self._bar is not None:
-            self._bar.set_postfix_str(text, refresh=at_once)
+            self._bar.set_postfix_str(text, refresh=at_once and self._shown)
 
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Clear the bar within a with statement, for lines of others on the same terminal."""
-        if self._bar is not None:
-            self._bar.clear()
+        if self._bar is None or not self._shown:
+            yield
+            return
+        self._bar.clear()
         yield
-        if self._bar is not None:
-            self._bar.refresh()
+        self._bar.refresh()
+
+    @property
+    def _shown(self) -> bool:
+        return self._bar is not None and self._bar.last_print_t >= self._bar.start_t + DELAY_S
 
     def close(self) -> None:
         """Clear the line; repeated calls do no harm."""
-        self._watched = False
         if self._bar is not None:
             self._bar.close()
-
-    def _show(self) -> None:
-        from tqdm import tqdm  # here and not above, since most work is over before
-
-        waited_s = self._clock_s() - self._begun_s
-        bar = tqdm(
-            desc=self._what,
-            total=self._total,
-            initial=self._before,
-            unit=self._unit,
-            unit_scale=True,
-            file=drawn(self._stream),
-            leave=False,
-            dynamic_ncols=True,
-            miniters=0,
-            bar_format=_TIMED if self._unit == SECONDS else _COUNTED,
-            delay=1e-9,  # its first bar would have no rate
-        )
-        bar.last_print_t -= waited_s  # the rate counts from the start of the work, not of the bar
-        bar.set_postfix_str(self._note, refresh=False)
-        bar.update(self._done - self._before)
-        self._bar = bar
 
 
 def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = None) -> Iterator[_Thing]:

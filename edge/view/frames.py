@@ -11,15 +11,13 @@ from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import event_record, record
-from edge.view.run_snapshot import Newest, NumberedEvent, Point, RunSnapshot
+from edge.view.run_snapshot import MAX_FPS, Newest, NumberedEvent, Point, RunSnapshot
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import PlayerState
 from firmware_bridge.silence import SENSOR_SILENT_NS
 
 VERSION: Final = 1
-MAX_FPS: Final = 25
-"""Most result frames a second of one sensor: more is not visible to the eye."""
 
 
 class Run(NamedTuple):

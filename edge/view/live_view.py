@@ -18,7 +18,6 @@ from edge.view.frames import Run
 from edge.view.recorder import FORM, Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.server import Server
-from edge.view.sink import ViewSink
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import Player
 
@@ -37,19 +36,10 @@ class LiveView:
     def __init__(
         self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract, commands: Commands
     ) -> None:
-        """Take the port, 0 for any free one.
+        """Take the port, 0 for any free one, where `host` leads.
 
-        Args:
-            host: name or address to listen at.
-            port: to listen at.
-            token: that requests must carry; None makes one where other machines can reach `host`.
-            record_dir: folder in which recordings are made.
-            contract: of the run's model.
-            commands: queue for the viewers' commands; this page's recorder does those to record.
-
-        Raises:
-            UsageError: the token is not valid.
-            SinkError: the port cannot be taken.
+        Requests must carry the token; None makes one where other machines can reach `host`. Recordings are made in
+        `record_dir`. Raises UsageError where the token is not valid, SinkError where the port cannot be taken.
         """
         access = grant(host, socket.gethostname(), token)
         self._snapshot = RunSnapshot()
@@ -58,9 +48,9 @@ class LiveView:
         commands.record = self._recorder.record
         import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
         self._server = Server(self._snapshot, commands, access, port, self._recorder, failed=self._failed)
-        self._view = ViewSink(self._snapshot, lambda: self._server.watched, self._server.wake)
+        self._snapshot.wake = self._server.wake
         self._contract = contract
-        self.sinks: list[Sink] = [self._recorder, self._view]
+        self.sinks: list[Sink] = [self._recorder, self._snapshot]
         addresses = own_addresses(host) if is_everything(host) else []
         self.url, *self.other_urls = access.urls(self._server.port, addresses)
 
@@ -82,15 +72,10 @@ class LiveView:
         messages: Callable[[Event], object],
         player: Player | None = None,
     ) -> None:
-        """Answer requests from now on.
+        """Answer requests from now on, about a source of this name and kind, and the model that the run begins with.
 
-        Args:
-            name: of the source.
-            kind: of the source.
-            model: name of the model that the run begins with.
-            open_sink: opens the sink that a text names, to record into.
-            messages: called with the events of recordings, which viewers get too.
-            player: of the recording that is shown, which begins with the first viewer; None if viewers cannot steer it.
+        `open_sink` opens the sink to record into; `messages` is called with the events of recordings, which viewers get
+        too. The player is of the recording that is shown, and begins with the first viewer; None if there is none.
         """
         self._messages = messages
         self._recorder.open_sink = open_sink
@@ -99,12 +84,11 @@ class LiveView:
     def show_map(self, state: MapState) -> None:
         """Show a state of the map. Never waits."""
         self._snapshot.map = state
-        if self._server.watched:
-            self._server.wake()
+        self._server.wake()
 
     def _failed(self, why: str) -> None:
         self._messages(Event(time.monotonic_ns(), "trouble", None, why))
 
     def _tell(self, event: Event) -> None:
         self._messages(event)
-        self._view.tell(event, {})
+        self._snapshot.tell(event, {})

@@ -13,12 +13,16 @@ from edge.mapping.live_map import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.cadence import Rate
+from edge.pipeline.sink import Sink
 
 TRACE_S: Final = 60.0
 TRACE_POINTS: Final = 1200
 """Most points of the last TRACE_S: one in 50 ms, which on a page some hundred pixels wide looks like all of them."""
 RECENT_SCANS: Final = 256
 EVENTS: Final = 20
+MAX_FPS: Final = 25
+"""Most result frames a second of one sensor: more is not visible to the eye."""
+_PERIOD_NS: Final = round(1e9 / MAX_FPS)
 _POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
 
 
@@ -52,26 +56,31 @@ class NumberedEvent(NamedTuple):
     received_ns: int
 
 
-class RunSnapshot:
+class RunSnapshot(Sink):
     """Newest result and trace of every sensor, and the latest events, in memory that does not grow with the run.
 
     Attributes:
         newest: by sensor.
         first_ns: time of the run's first scan, in [ns]; None before.
         map: newest state of the map; None where none is made.
+        wake: called when there is something to show, MAX_FPS times a second at most; it never waits. So viewers are
+            served after a scan's last work and not by a clock of their own, while the loop sleeps.
     """
 
     def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.newest: dict[str, Newest] = {}
         self.first_ns: int | None = None
         self.map: MapState | None = None
+        self.wake: Callable[[], object] = lambda: None
         self._clock_ns = clock_ns
         self._traces: dict[str, _Trace] = {}
         self._events: deque[NumberedEvent] = deque(maxlen=EVENTS)
         self._events_count = 0
+        self._due_ns = 0
+        self._unseen = False
 
-    def add(self, result: Result, counters: Mapping[str, int]) -> int:
-        """Add a result; returns the time of its arrival, in [ns]."""
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Add a result."""
         scan = result.scan
         if self.first_ns is None:
             self.first_ns = scan.time_ns
@@ -82,19 +91,27 @@ class RunSnapshot:
             self._traces = {**self._traces, scan.sensor: trace}
         trace.add(result)
         for event in result.events:
-            self.tell(event, counters)
+            self._add_event(event, counters)
         received_ns = self._clock_ns()
         newest = Newest(trace.number, result, counters, received_ns, trace.rate.rate_hz)
         if scan.sensor in self.newest:
             self.newest[scan.sensor] = newest
         else:
             self.newest = {**self.newest, scan.sensor: newest}
-        return received_ns
+        self._news(received_ns)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Add an event."""
-        self._events_count += 1
-        self._events.append(NumberedEvent(self._events_count, event, counters, self._clock_ns()))
+        self._add_event(event, counters)
+        self._news(self._clock_ns())
+
+    def wait(self) -> None:
+        """Show the newest result, once no scan follows it."""
+        if self._unseen:
+            self._news(self._clock_ns())
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to finish."""
 
     def events(self, since: int) -> list[NumberedEvent]:
         """Return the latest events after number `since`."""
@@ -103,6 +120,18 @@ class RunSnapshot:
     def points(self, sensor: str, since: int) -> list[Point]:
         """Return the points of a sensor after number `since`: all, or if these are too many, one in 50 ms."""
         return self._traces[sensor].points(since)
+
+    def _add_event(self, event: Event, counters: Mapping[str, int]) -> None:
+        self._events_count += 1
+        self._events.append(NumberedEvent(self._events_count, event, counters, self._clock_ns()))
+
+    def _news(self, now_ns: int) -> None:
+        self._unseen = now_ns < self._due_ns
+        if not self._unseen:
+            # Every fourth of a hundred scans a second, even if they come a little early or late.
+            behind = now_ns - self._due_ns < _PERIOD_NS
+            self._due_ns = (self._due_ns if behind else now_ns) + _PERIOD_NS
+            self.wake()
 
 
 class _Trace:

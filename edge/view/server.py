@@ -31,8 +31,7 @@ from edge.view.frames import Frames, Run, hello, refused, state
 from edge.view.recorder import Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.static_page import load_page
-from edge.view.viewer_commands import LONGEST_BYTES, execute
-from edge.view.viewer_connection import Attended
+from edge.view.viewers import LONGEST_BYTES, AttendedViewer, execute
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import Player
 
@@ -52,7 +51,6 @@ class Server:
     """Server that shows a run to its viewers.
 
     Attributes:
-        watched: True while there is a viewer.
         port: that it listens at.
     """
 
@@ -67,18 +65,10 @@ class Server:
     ) -> None:
         """Take the port, 0 for any free one; pages are answered from `begin` to `close`.
 
-        Args:
-            snapshot: store of what is shown.
-            commands: queue for the viewers' commands.
-            access: conditions that a request must meet.
-            port: that it listens at.
-            recorder: of what viewers record.
-            failed: called with the reason when the page ends early, from the server's thread.
-
-        Raises:
-            SinkError: the page cannot be served there.
+        `failed` is called with the reason when the page ends early, from the server's thread. Raises SinkError where
+        the page cannot be served.
         """
-        self.watched = False
+        self._watched = False
         self._snapshot, self._commands, self._access = snapshot, commands, access
         self._recorder, self._failed = recorder, failed
         self._page = load_page(access.key)
@@ -86,7 +76,7 @@ class Server:
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
         self._connections = Connections(self._look_round)
-        self._viewers: dict[ServerConnection, Attended] = {}
+        self._viewers: dict[ServerConnection, AttendedViewer] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
@@ -104,13 +94,17 @@ class Server:
     def close(self) -> None:
         """Inform viewers that the run has ended, and free the port."""
         self._ending = True
-        self.wake()
+        self._rouse()
         if self._thread is not None:
             self._thread.join()
         self._socket.close()
 
     def wake(self) -> None:
-        """Wake the server, because there is something new. Never waits."""
+        """Wake the server, because there is something new for its viewers. Never waits."""
+        if self._watched:
+            self._rouse()
+
+    def _rouse(self) -> None:
         loop = self._loop
         if loop is not None:
             with contextlib.suppress(RuntimeError):  # it has ended at that moment
@@ -120,7 +114,7 @@ class Server:
         try:
             asyncio.run(self._show(run, ready))
         finally:  # also after an unforeseen error, which ends this thread and not the run
-            self._loop, self.watched = None, False
+            self._loop, self._watched = None, False
             ready.set()
             if not self._ending:
                 self._failed(f"the live page has ended: {sys.exception()!r}; the run continues")
@@ -169,8 +163,8 @@ class Server:
                 if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
                     self._connections.gone, tidied_s, closing = 0, now_s, gone > 0
                     _tidy()
-                for attended in self._viewers.values():
-                    attended.send(frames, now_s)
+                for viewer in self._viewers.values():
+                    viewer.send(frames, now_s)
             server.close(code=CloseCode.GOING_AWAY, reason="the run has ended")
             self._loop.call_later(END_S, self._connections.abort)
 
@@ -191,7 +185,7 @@ class Server:
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
 
     async def _attend(self, run: Run, connection: ServerConnection) -> None:
-        attended = Attended(connection)
+        viewer = AttendedViewer(connection)
         with contextlib.suppress(ConnectionClosed):
             try:
                 async with asyncio.timeout(OPEN_S):
@@ -199,17 +193,17 @@ class Server:
             except TimeoutError:
                 connection.transport.abort()
                 return
-            self._viewers[connection] = attended
-            self.watched = True
+            self._viewers[connection] = viewer
+            self._watched = True
             if self._player is not None:
                 self._player.begin()
-            pinging = asyncio.create_task(attended.follow())
+            pinging = asyncio.create_task(viewer.follow())
             try:
                 self._news.set()
                 async for message in connection:
                     if connection.state is not State.OPEN:
                         break  # many commands may wait from before it closed, and each takes its time
-                    why = execute(message, attended.viewer, self._commands, self._player)
+                    why = execute(message, viewer, self._commands, self._player)
                     if self._player is not None:
                         self._news.set()
                     if why is not None:
@@ -217,7 +211,7 @@ class Server:
                     await asyncio.sleep(COMMAND_PAUSE_S)
             finally:
                 del self._viewers[connection]
-                self.watched = bool(self._viewers)
+                self._watched = bool(self._viewers)
                 pinging.cancel()
                 self._news.set()
 

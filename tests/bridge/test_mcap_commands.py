@@ -5,7 +5,6 @@ import re
 import resource
 import signal
 import subprocess
-import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -21,7 +20,7 @@ from mcap.stream_reader import StreamReader
 from mcap_samples import SURE, arrays_of, make_results, messages_of, odd_scans, record_into
 
 from edge.cli import main as cli
-from edge.doctor.watch import Watch
+from edge.doctor.examine import prepare
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.map_messages import image_map, in_si
@@ -215,5 +214,5 @@ def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
 def test_the_doctor_goes_by_how_the_recorded_sensors_sat(tmp_path):
     sat = Mounting(signs=(1, 1, -1))
     path = record_into(tmp_path / "a.mcap", make_results(odd_scans()), mountings={"4": sat})
-    watch = Watch([f"replay:{path}"], SensorFile(), references={}, rate_hz=None, stop=threading.Event())
-    assert watch.known.mountings["4"] == sat
+    _, known, _ = prepare([f"replay:{path}"], SensorFile(), {}, None)
+    assert known.mountings["4"] == sat

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
 
-from edge.doctor.examine import Watched, examine
+from edge.doctor.examine import Watched, judge
 from edge.doctor.findings import Finding, page, worst
 from edge.doctor.link_checks import LineFacts, capacity_hz, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
@@ -23,13 +23,13 @@ def faults(scans, **changes):
     changes.setdefault("references", {"4": FREE})
     return {
         finding.name: finding.verdict
-        for finding in examine(watched(scans, **changes), 0.0).findings
+        for finding in judge(watched(scans, **changes), 0.0).findings
         if finding.verdict != "ok"
     }
 
 
 def remedy_of(name, scans, **changes):
-    findings = examine(watched(scans, **changes), 0.0).findings
+    findings = judge(watched(scans, **changes), 0.0).findings
     return next(finding.remedy for finding in findings if finding.name == name)
 
 
@@ -48,7 +48,7 @@ def with_taxel(counts, taxel, readings):
 
 class TestSensor:
     def test_a_healthy_one_is_ok_in_every_line_and_may_be_zeroed(self):
-        examined = examine(watched(as_scans(healthy_counts()), references={"4": FREE}), 5.0)
+        examined = judge(watched(as_scans(healthy_counts()), references={"4": FREE}), 5.0)
         assert {finding.verdict for finding in examined.findings} == {"ok"} and len(examined.findings) == 11
         assert not any(finding.remedy for finding in examined.findings)
         baseline = examined.baselines["4"]
@@ -99,7 +99,7 @@ class TestSensor:
     def test_all_stuck_is_an_old_scan_sent_for_ever(self):
         scans = as_scans(np.repeat(healthy_counts(1), 400, axis=0))
         assert "one old scan" in remedy_of("stuck taxels", scans)
-        assert worst(examine(watched(scans), 0.0).findings) == "wrong"
+        assert worst(judge(watched(scans), 0.0).findings) == "wrong"
 
     @pytest.mark.parametrize(("counts_moved", "verdict"), [(15, "look"), (60, "wrong")])
     def test_drift_of_all_taxels(self, counts_moved, verdict):
@@ -156,7 +156,7 @@ class TestSensor:
 
     def test_of_two_sensors_the_silent_one_is_named(self):
         both = {"4": as_scans(healthy_counts(700), times_ns(700)), "6": as_scans(healthy_counts(), sensor="6")}
-        found = examine(Watched(both, COUNTERS, 7.0), 0.0).findings
+        found = judge(Watched(both, COUNTERS, 7.0), 0.0).findings
         assert [(one.sensor, one.name) for one in found if one.verdict == "wrong"] == [("6", "lost scans")]
 
     def test_one_scan_late_is_none_lost(self):
@@ -248,7 +248,7 @@ class TestIdMap:
         heard, closed, counters = heard_of(ID_MAPS[asked], ids)
         found = {
             one.name: one
-            for one in examine(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0).findings
+            for one in judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0).findings
         }
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
             sensor = {"AB": "7b"}.get(spoken + asked, sensor)

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -13,16 +12,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cli_samples import write_recording
+from cli_samples import start, write_recording
 from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
-from edge_samples import ROOT, FakeLink
+from edge_samples import FakeLink
 
 from edge.cli import main as cli
 from edge.cli.run_options import parser
-from edge.doctor import command, watch
+from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
-from edge.doctor.pad_orientation import CORNERS, orders
-from firmware_bridge.emulation import pty_port as pseudo_port
+from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.pad_geometry import USPA44
@@ -140,38 +138,14 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
         done = doctor(monkeypatch, emulator.port, "--json")
     document = json.loads(done.out)
     assert verdicts(done) == {}
-    assert (
-        document["stopped"] is False
-        and document["kind"] == "emulated"
-        and document["sensor_file"] is None
-        and document["id_map"] == "uSPa44"
-    )
+    told = {"stopped": False, "kind": "emulated", "sensor_file": None, "id_map": "uSPa44"}
+    assert document | told == document
     names = [one["name"] for one in document["findings"]]
     of_link = "link, baud rate, latency timer, id map"
     of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
     assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
     assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
-
-
-def test_a_line_that_is_too_slow(monkeypatch):
-    """A frame takes 1.9 ms on the line at 115200 baud: 32 scans a second arrive of a hundred."""
-    monkeypatch.setattr(pseudo_port, "LINE_SPEED_BAUD", 115_200)
-    with Emulator([recording(healthy_counts(200))], loop=True, frame_s=220 / 115_200, jitter_s=0) as emulator:
-        done = doctor(monkeypatch, f"{emulator.port}@115200", "--json", drift_s=1.7)
-    found = verdicts(done)
-    assert found.pop("baud rate") == "wrong" and done.code == 1
-    assert found == {"baseline": "not known"}
-    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
-    assert settled["rate"] == settled["latency timer"] == "not known"
-    assert "115200 baud carry 33 scans" in done.out or "115200 baud carry 32 scans" in done.out
-
-
-def test_an_adapter_that_hands_on_every_16_ms(monkeypatch):
-    with Emulator([recording(healthy_counts(200))], loop=True, latency_s=0.016) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json")
-    settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
-    assert verdicts(done) == {} and settled["latency timer"] == "wrong" and done.code == 1
 
 
 def test_the_wrong_id_map_names_the_right_one(monkeypatch):
@@ -190,25 +164,6 @@ def test_another_line_speed_than_the_adapters(monkeypatch):
     found = verdicts(done)
     assert found["link"] == "wrong" and found["scans"] == "wrong" and len(found) == 2 and done.code == 1
     assert "another line speed" in done.out
-
-
-def test_a_sensor_that_says_nothing(monkeypatch):
-    with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
-        monkeypatch.setattr(watch, "GIVEN_UP_S", 0.5)
-        done = doctor(monkeypatch, emulator.port, drift_s=60)
-    assert done.code == 1 and "WRONG" in done.out and "is the sensor powered" in done.out
-
-
-def test_a_pad_that_is_pressed_since_its_baseline(monkeypatch, tmp_path):
-    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--out", tmp_path / "s.toml")
-        assert verdicts(done) == {}
-    loaded = healthy_counts(200)
-    loaded[:, 2] += 250
-    with Emulator([recording(loaded)], loop=True) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--sensor", tmp_path / "s.toml")
-    load = next(one for one in json.loads(done.out)["findings"] if one["name"] == "load")
-    assert verdicts(done) == {} and load["verdict"] == "wrong" and done.code == 1
 
 
 @pytest.mark.parametrize(
@@ -246,8 +201,8 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
 
 def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong(monkeypatch):
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
-    with Emulator([recording(*people, rate_hz=300.0)], jitter_s=0.0) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 300, people=people, drift_s=0.5)
+    with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
+        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 120, people=people, drift_s=1.2)
     found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
@@ -257,7 +212,7 @@ def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
     monkeypatch.setattr(command, "GIVEN_UP_S", 0.3)
     options = parser("doctor").parse_args(["--drift-s", "0.1", "--json"])
     out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
-    monkeypatch.setattr(watch, "links_to", lambda *_, **__: [link])
+    monkeypatch.setattr(examine, "links_to", lambda *_, **__: [link])
     assert command.run(options, out, Terminal(Person())) == 1
     settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
@@ -314,23 +269,7 @@ def test_a_cable_pulled_out_is_3_after_what_was_found(monkeypatch, tmp_path):
 
 def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "edge.cli.main",
-                "doctor",
-                "--source",
-                f"slcan:{emulator.port}",
-                "--out",
-                tmp_path / "s",
-            ],
-            cwd=ROOT,
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        process = start("doctor", "--source", f"slcan:{emulator.port}", "--out", tmp_path / "s")
         assert process.stderr is not None and "watching for 60 s" in process.stderr.readline()
         time.sleep(0.9)
         process.send_signal(signal.SIGINT)

@@ -12,7 +12,7 @@ from test_doctor_command import doctor, recording
 
 from edge.cli import main as cli
 from edge.cli.run_options import parser
-from edge.doctor import command, watch
+from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
@@ -43,7 +43,7 @@ class TestLoss:
     def test_a_visit_that_found_no_baseline_leaves_a_good_file(self, monkeypatch, good):
         content = good.read_text()
         with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
-            monkeypatch.setattr("edge.doctor.watch.GIVEN_UP_S", 0.5)
+            monkeypatch.setattr("edge.doctor.examine.GIVEN_UP_S", 0.5)
             asked = ["doctor", "--source", f"slcan:{emulator.port}", "--out", str(good), "--drift-s", "5"]
             with monkeypatch.context() as streams:
                 err = io.StringIO()
@@ -174,7 +174,7 @@ class TestUse:
     def test_on_the_command_line_it_is_2_and_one_line(self, tmp_path, monkeypatch, capsys, command):
         monkeypatch.chdir(tmp_path)
         save_sensor_file(tmp_path / "s.toml", EMULATED)
-        for module in ("edge.api", "edge.doctor.watch"):
+        for module in ("edge.api", "edge.doctor.examine"):
             monkeypatch.setattr(f"{module}.links_to", lambda *_, **__: [FakeLink([], kind="device")])
         code = cli.main([*command, "--sensor", "s.toml"])
         lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
@@ -189,7 +189,9 @@ def told(*arguments, link=None, out=None):
     options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
     out = io.StringIO() if out is None else out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(watch, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()])
+        patch.setattr(
+            examine, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()]
+        )
         return command.run(options, out, io.StringIO()), out.getvalue()
 
 

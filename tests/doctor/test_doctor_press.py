@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from doctor_samples import finger, visit
 
-from edge.doctor.pad_orientation import Answer, Press, find_axes, find_order, judge_press, orders, z_sign
-from edge.doctor.press_guide import PATIENCE_S, GuidedPress
+from edge.doctor.guided_press import (
+    PATIENCE_S,
+    Answer,
+    GuidedPress,
+    Press,
+    find_axes,
+    find_order,
+    judge_press,
+    orders,
+    z_sign,
+)
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 

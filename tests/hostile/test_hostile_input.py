@@ -41,11 +41,7 @@ class Harm:
 def test_a_file_without_end_is_read_up_to_the_limit():
     with pytest.raises(OSError, match="larger than the 1,000 bytes"):
         read_bounded(Path("/dev/zero"), 1000)
-    for read, error in (
-        (load_baselines, RecordingError),
-        (load_recording, RecordingError),
-        (read_model, ModelError),
-    ):
+    for read, error in ((load_baselines, RecordingError), (load_recording, RecordingError), (read_model, ModelError)):
         with pytest.raises(error):
             read(Path("/dev/zero"))
 

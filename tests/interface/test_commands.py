@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, make_scan, write_model
+from cli_samples import write_recording
+from edge_samples import BASELINE, ROOT, write_model
 
 from edge.cli.user_commands import user_commands
 from edge.pipeline.commands import RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
-from edge.terminal.stop_signals import handled
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []
@@ -91,14 +91,6 @@ def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
     assert commands.refused == 1
 
 
-def test_a_line_cut_for_its_length_is_no_command(pipe):
-    _, commands = lines_of(pipe[0])
-    for piece in (b'{"cmd": "reset", "x": "', *[b"x" * 4000] * 3, b'"}\n'):
-        os.write(pipe[1], piece)
-        assert commands.poll() == []
-    assert commands.refused == 1
-
-
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
     _, commands = lines_of(pipe[0])
     os.write(pipe[1], b'{"cmd": "reset"}')
@@ -146,21 +138,6 @@ class Told:
 
     def zero(self, name=None, *, force=False):
         self.done.append((name, force))
-
-
-def test_a_signal_asks_once_for_zeroing_and_is_let_go_afterwards():
-    before = signal.getsignal(signal.SIGUSR1)
-    runtime = Told()
-    commands = Commands()
-    with handled(["SIGUSR1"], lambda *_: commands.signalled.add(ZERO)):
-        obey(commands, runtime)
-        assert runtime.done == []
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGUSR1)
-        obey(commands, runtime)
-        obey(commands, runtime)
-    assert runtime.done == [(None, False)]
-    assert signal.getsignal(signal.SIGUSR1) is before
 
 
 def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
@@ -237,21 +214,14 @@ class Terminal:
     def __init__(self, folder: Path) -> None:
         write_model(folder / "tiny.onnx")
         save_baselines(folder / "zero.json", [BASELINE])
-        counts = np.stack([make_scan(n, noise=3).counts for n in range(SCANS)])
-        # Of many taxels: one alone that reads so much is not believed after a while, and then the pad may be zeroed.
-        counts[:1400, 2, 1:3, 1:3] += 1000  # local, so that it needs no rest before it
-        np.savez(
-            folder / "rest.npz",
-            format=np.array("tactile-recording"),
-            version=np.array(1),
-            sensor=np.array(["4"] * SCANS),
-            scan=np.arange(SCANS),
-            time_ns=np.arange(SCANS) * 5_000_000,
-            counts=counts,
-        )
+        # Pressed on many taxels: one alone that reads so much is not believed after a while, and then it may be zeroed.
+        path = write_recording(folder / "rest.npz", [0] * SCANS, period_ns=5_000_000)
+        arrays = dict(np.load(path))
+        arrays["counts"][:1400, 2, 1:3, 1:3] += 1000  # local, so that it needs no rest before it
+        np.savez(path, **arrays)
         self.records = folder / "out.jsonl"
         command = ["-m", "edge.cli.main", "--model", folder / "tiny.onnx", "--sink", f"jsonl:{self.records}"]
-        command += ["--source", f"replay:{folder / 'rest.npz'}", "--baseline", folder / "zero.json"]
+        command += ["--source", f"replay:{path}", "--baseline", folder / "zero.json"]
         self.shown = b""
         self._process, self.leader = pty.fork()
         if self._process == 0:

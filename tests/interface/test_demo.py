@@ -11,8 +11,7 @@ from trust_samples import make_posed_trust
 from edge.api import load_model
 from edge.cli import main as cli
 from edge.cli import run_command as run
-from edge.cli.demo_scenes import SLIDE, DemoScenes
-from edge.cli.demo_score import DemoScore, score_table
+from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
 from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.inference.bundled import POSED_MODEL, demo_recording
@@ -55,20 +54,19 @@ def recording(tmp_path):
 
 def play(recording, *, lost=(), overtaken=()):
     model = FakeModel()
-    score = DemoScore(recording, model)
+    score = DemoScore(DemoRecording(recording), model)
     runtime = Runtime(model, source="emulated", baselines={"4": BASELINE})
     series = ScanSeries("4", USPA44)
     with np.load(recording) as data:
         for index, counts in enumerate(data["counts"]):
             if index not in lost:
                 scan = series.close(counts.copy(), index * 10_000_000)
-                score.write(runtime.push(scan, infer=index not in overtaken), {})
+                score.add(runtime.push(scan, infer=index not in overtaken))
     return score
 
 
 def test_each_tap_is_scored_at_its_peak_against_that_frames_truth(recording):
     score = play(recording)
-    assert (score.surface, score.taps) == ("S", 2)
     first, second = score.scores()
     assert (first.tap, first.pose, second.tap, second.pose) == (0, (0, 0, 0), 1, (0, 0, -5))
     assert (first.result.taps_used, second.result.taps_used) == (1, 2)
@@ -87,13 +85,16 @@ def test_a_lost_scan_shifts_nothing(recording):
 
 
 def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
-    model, score = FakeModel(), None
-    score, runtime = DemoScore(recording, model), Runtime(model, source="emulated", baselines={"4": BASELINE})
+    model = FakeModel()
+    score, runtime = (
+        DemoScore(DemoRecording(recording), model),
+        Runtime(model, source="emulated", baselines={"4": BASELINE}),
+    )
     with np.load(recording) as data:
         shown = [*data["counts"][:6], *data["option_counts"][0], data["counts"][8]]
     series = ScanSeries("4", USPA44)
     for index, counts in enumerate(shown):
-        score.write(runtime.push(series.close(counts.copy(), index * 10_000_000)), {})
+        score.add(runtime.push(series.close(counts.copy(), index * 10_000_000)))
     first, second = score.scores()
     assert score.complete and second.pose == (2.35, 0, 0)
     np.testing.assert_allclose(second.truth, 0.1, rtol=1e-3)
@@ -106,10 +107,9 @@ def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(rec
 
 def told_of_scenes(results, path):
     events = []
-    scenes = DemoScenes(path, events.append, lambda: pytest.fail("it goes on to no other object"))
+    scenes = DemoScenes(DemoRecording(path), events.append, lambda: pytest.fail("it goes on to no other object"))
     for result in results:
-        scenes.write(result, {})
-    scenes.close()
+        scenes.add(result)
     assert {event.kind for event in events} <= {"note"}
     return [event.text.removeprefix("demo: ") for event in events]
 

@@ -80,16 +80,21 @@ def test_the_gripper_stops_on_contact_and_never_moves_by_what_is_emulated_unaske
     assert " mm2 touch, as felt " in out[2] and len(out) == 3
 
 
+def known(folder):
+    """Write a pad at rest, a model with checks and a sensor file; return the options of a gripper that uses them."""
+    write_recording(folder / "rest.npz", [0] * 100)
+    write_model(folder / "tiny.onnx", make_trusted_contract())
+    save_sensor_file(folder / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
+    given = ("--model", folder / "tiny.onnx", "--sensor", folder / "s.toml", "--area-mm2", "20", "--pretend")
+    return *given, *PATIENT
+
+
 def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
     process = start(empty, "print_force.py", "--source", "demo")
     assert "zeroing" in process.stdout.readline()
     process.stdout.close()
     assert (process.stderr.read(), process.wait(TIMEOUT_S)) == ("", 0)
-    write_recording(tmp_path / "rest.npz", [0] * 100)
-    write_model(tmp_path / "tiny.onnx", make_trusted_contract())
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
-    known = ("--model", tmp_path / "tiny.onnx", "--sensor", tmp_path / "s.toml", *PATIENT, "--pretend")
-    process = start(empty, "stop_on_area.py", "--source", f"replay:{tmp_path}/rest.npz", "--area-mm2", "20", *known)
+    process = start(empty, "stop_on_area.py", "--source", f"replay:{tmp_path}/rest.npz", *known(tmp_path))
     process.stdout.close()
     assert (process.stderr.read(), process.wait(TIMEOUT_S)) == ("", 1)
 
@@ -97,16 +102,13 @@ def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
 @pytest.fixture
 def closing(empty, tmp_path):
     """A gripper that closes on nothing, and the emulator whose cable can be pulled."""
-    write_recording(tmp_path / "rest.npz", [0] * 100)
-    write_model(tmp_path / "tiny.onnx", make_trusted_contract())
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(baseline=BASELINE)}))
+    options = known(tmp_path)
     command = [sys.executable, "-m", "edge.bench.emulated_buses"]
     with subprocess.Popen(
         [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as emulator:
         source = f"slcan:{emulator.stdout.readline().strip()}"
-        known = ("--model", tmp_path / "tiny.onnx", "--sensor", tmp_path / "s.toml", *PATIENT)
-        process = start(empty, "stop_on_area.py", "--source", source, "--area-mm2", "20", "--pretend", *known)
+        process = start(empty, "stop_on_area.py", "--source", source, *options)
         assert process.stdout.readline() == "gripper: closing\n"
         yield process, emulator
         process.kill()
@@ -130,12 +132,16 @@ def test_a_kill_stops_the_gripper(closing, number):
     assert out == "gripper: stopped\n" and process.returncode == 128 + number
 
 
-@pytest.fixture(scope="module")
-def stop_on_area():
-    spec = importlib.util.spec_from_file_location("stop_on_area", ROOT / "examples" / "stop_on_area.py")
+def loaded(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def stop_on_area():
+    return loaded("stop_on_area")
 
 
 @pytest.fixture
@@ -292,18 +298,8 @@ def test_the_gripper_stands_still_however_it_ends(at_once, settings, words):
 def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     trimesh.creation.icosphere(radius=6, subdivisions=3).export(tmp_path / "ball.stl")
     tiny = ("--sequences", 4, "--figures", 2, "--steps", 2)
-    code, out, errors = run(
-        empty,
-        "train_and_deploy.py",
-        tmp_path / "ball.stl",
-        "--out",
-        "ball",
-        *tiny,
-        "--source",
-        "demo",
-        "--duration-s",
-        3,
-    )
+    words = (tmp_path / "ball.stl", "--out", "ball", *tiny, "--source", "demo", "--duration-s", 3)
+    code, out, errors = run(empty, "train_and_deploy.py", *words)
     assert code == 1, errors
     assert {path.name for path in empty.iterdir()} == {"ball"} and not (empty / "ball" / "ball.onnx").exists()
     expected = r"about [\d.]+ minutes on this machine: [\d.]+ to simulate 6 presses, [\d.]+ for 2 steps .*"
@@ -316,9 +312,7 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
 @pytest.fixture
 def trained(monkeypatch, tmp_path):
     """The example on a machine without an adapter, whose training takes no time; it counts its trainings."""
-    spec = importlib.util.spec_from_file_location("train_and_deploy", ROOT / "examples" / "train_and_deploy.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = loaded("train_and_deploy")
     module.trainings = []
 
     def train(mesh, out, **_):
@@ -346,27 +340,21 @@ def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(trained, m
         assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 
 
-def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys):
-    words = ["train_and_deploy.py", "ball.stl", "--out", "ball"]
-    monkeypatch.setattr(sys, "argv", words)
-    trained.main()
-    line = "about 56.8 minutes on this machine: 3.0 to simulate 9000 presses, 53.3 for 16000 steps of training, 0.5 for"
-    assert capsys.readouterr().out.startswith(line)
-    monkeypatch.setattr(sys, "argv", [*words, "--minutes", "4", "--figures", "9000"])
-    trained.main()
-    line = "about 4.0 minutes on this machine: 0.4 to simulate 1062 presses, 3.1 for 944 steps of training, 0.5 for"
-    assert capsys.readouterr().out.startswith(line)
-    monkeypatch.setattr(sys, "argv", [*words, "--minutes", "0.5"])  # less than the rest takes
-    trained.main()
-    line = "about 0.8 minutes on this machine: 0.0 to simulate 45 presses, 0.3 for 80 steps of training, 0.5 for"
-    assert capsys.readouterr().out.startswith(line)
-    assert len(trained.trainings) == 3
-
-
-def test_without_a_sensor_the_trained_model_is_the_end_of_it(trained, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball"])
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ("", "about 56.8 minutes on this machine: 3.0 to simulate 9000 presses, 53.3 for 16000 steps of training, "),
+        (
+            "--minutes 4 --figures 9000",
+            "about 4.0 minutes on this machine: 0.4 to simulate 1062 presses, 3.1 for 944 steps of training, ",
+        ),
+    ],
+)
+def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys, options, line):
+    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", *options.split()])
     trained.main()
     out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith(line) and len(trained.trainings) == 1
     assert out[2].startswith("not tried on a sensor: ") and out[-1] == "from now on: edge-sr --model ball/ball.onnx"
 
 

@@ -266,23 +266,6 @@ async def until(event):
         await asyncio.sleep(0.001)
 
 
-def test_asyncio_goes_on_while_a_model_runs():
-    async def main():
-        with Source(FakeLink([scans(0), scans(1)])) as source:
-            model = SlowModel()
-
-            async def let():
-                await until(model.begun)
-                model.let.set()
-
-            letting = asyncio.create_task(let())
-            numbers = [result.scan.number async for result in stream_of(source, model=model)]
-            await letting
-            return numbers
-
-    assert asyncio.run(main()) == [0, 1]
-
-
 @pytest.mark.parametrize("way", ["iterate", "read"])
 @pytest.mark.parametrize("when", ["waiting", "running"])
 def test_a_task_that_is_cancelled_loses_no_result(way, when):

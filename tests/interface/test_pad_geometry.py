@@ -9,8 +9,7 @@ from edge_samples import make_contract, write_model
 from mcap_samples import arrays_of
 
 from edge import api
-from edge.doctor.link_checks import check_id_map
-from edge.doctor.pad_orientation import Press, corner_taxel, find_axes, find_order, orders
+from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
 from edge.errors import ModelError, UsageError
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
@@ -20,7 +19,7 @@ from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, USPA46_MAP, layout_c
+from firmware_bridge.scans.can_id_maps import layout_c
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
@@ -197,11 +196,3 @@ def test_a_pad_that_is_not_square_can_lie_in_four_ways():
     assert find_order(presses, USPA46) == "as in the id map"
     axes = find_axes(presses, USPA46)
     assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
-
-
-def test_the_larger_pad_is_what_speaks_where_the_smaller_ones_ids_are_among_its_own():
-    ids = dict.fromkeys((can_id for can_id, _ in USPA46_MAP.wire_order("4")), 10)
-    finding = check_id_map(ids, USPA44_MAP, half_silent=False)
-    assert finding is not None and finding.verdict == "wrong" and finding.remedy == "--id-map uSPa46"
-    finding = check_id_map(ids, USPA46_MAP, half_silent=False)
-    assert finding is not None and finding.verdict == "ok"

@@ -7,7 +7,6 @@ import sys
 import pytest
 from edge_samples import ROOT
 
-from edge.cli import realtime as module
 from edge.cli.realtime import PRIORITY, realtime
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="these calls are Linux's")
@@ -82,30 +81,24 @@ def test_what_is_permitted_is_had_by_every_thread_and_given_back():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        ("sched_setscheduler", ["SCHED_FIFO", "rtprio"]),
-        ("sched_setaffinity", ["one processor", "cgroup"]),
-        ("mlockall", ["locked memory", "ulimit -l"]),
+        ("os.sched_setscheduler", ["SCHED_FIFO", "rtprio"]),
+        ("os.sched_setaffinity", ["one processor", "cgroup"]),
+        ("edge.cli.realtime._lock_memory", ["locked memory", "ulimit -l"]),
     ],
 )
 def test_a_refusal_is_one_line_and_the_run_goes_on(monkeypatch, call, words):
     def refuse(*args):
         raise PermissionError(1, "Operation not permitted")
 
-    granted = []
-    monkeypatch.setattr(module, "_lock_memory", lambda: granted.append("mlockall") or (lambda: None))
-    for name in ("sched_setscheduler", "sched_setaffinity"):
-        monkeypatch.setattr(os, name, lambda *args, name=name: granted.append(name))
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 3})
-    if call == "mlockall":
-        monkeypatch.setattr(module, "_lock_memory", refuse)
-    else:
-        monkeypatch.setattr(os, call, refuse)
+    granted, calls = [], ("os.sched_setscheduler", "os.sched_setaffinity", "edge.cli.realtime._lock_memory")
+    for name in calls:
+        monkeypatch.setattr(name, lambda *args, name=name: granted.append(name) or (lambda: None))
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {1, 3})
+    monkeypatch.setattr(call, refuse)
     told = []
     with realtime(told.append):
-        assert len(told) == 1 and "\n" not in told[0]
-        assert set(granted) == {"sched_setscheduler", "sched_setaffinity", "mlockall"} - {call}
-    for word in (*words, "Operation not permitted", "going on without"):
-        assert word in told[0]
+        assert len(told) == 1 and set(granted) == {*calls} - {call}
+    assert "\n" not in told[0] and all(word in told[0] for word in (*words, "not permitted", "going on without"))
 
 
 def test_elsewhere_it_says_so_once(monkeypatch):

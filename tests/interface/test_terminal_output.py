@@ -23,6 +23,7 @@ from hypothesis.extra.numpy import arrays
 from edge.cli import main as cli
 from edge.pipeline import replay_setup as recordings
 from edge.sinks import status_line as status
+from edge.terminal import progress_bar as progress
 from edge.terminal.heatmap import HALF_BLOCK, SHADES, Panel, choose_palette, draw, resample
 from edge.terminal.progress_bar import SECONDS, Progress, tracked
 
@@ -61,7 +62,8 @@ def test_a_replay_at_full_speed_shows_one_instead_of_the_live_line(
     tmp_path, monkeypatch, capfd, terminal, options, shown, to
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream, delay_s=0))
+    monkeypatch.setattr(progress, "DELAY_S", 0)
+    monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream))
     monkeypatch.setattr(status, "StatusSink", partial(status.StatusSink, terminal.stream))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_model(tmp_path / "tiny.onnx")
@@ -91,41 +93,38 @@ class Clock:
         return self.now_s
 
 
-def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal):
+@pytest.fixture
+def clock(monkeypatch):
+    """Clock of the bars."""
     clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+    monkeypatch.setattr("tqdm.std.time", clock)
+    return clock
+
+
+def test_a_bar_with_rate_and_remaining_time_comes_after_two_seconds(terminal, clock):
+    with Progress("poses", 400, "pose", done=100, stream=terminal.stream) as bar:
         clock.now_s += 1.9
         bar.advance(38)
         assert terminal.said() == ""
         clock.now_s += 0.1
         bar.advance(2)
         shown = terminal.said()
-        assert re.search(r"^\r?poses  10%\|.+\| 20\.0pose/s 00:18 left\s*$", shown), shown
+        assert re.search(r"^\r?poses  35%\|.+\| 20\.0pose/s 00:13 left\s*$", shown), shown
         assert "\n" not in shown
     assert CLEARED.search(terminal.said())
 
 
-def test_units_that_were_there_before_took_no_time_now(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", done=300, stream=terminal.stream, clock_s=clock) as bar:
-        clock.now_s += 2.0
-        bar.advance(20)
-        assert re.search(r"poses  80%.* 10\.0pose/s 00:08 left", terminal.said())
-
-
 @pytest.mark.parametrize("terminal", [40], indirect=True)
-def test_forty_columns_hold_it(terminal):
-    clock = Clock()
-    with Progress("run times", 10**6, "run", stream=terminal.stream, clock_s=clock) as bar:
+def test_forty_columns_hold_it(terminal, clock):
+    with Progress("run times", 10**6, "run", stream=terminal.stream) as bar:
         clock.now_s += 10
         bar.advance(100_000)
         (shown,) = terminal.said().split("\r")[1:] or [""]
         assert len(shown) <= 40 and "10.0krun/s 01:30 left" in shown
 
 
-def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal):
-    clock = Clock()
-    with Progress("watching", 60, SECONDS, stream=terminal.stream, clock_s=clock) as bar:
+def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal, clock):
+    with Progress("watching", 60, SECONDS, stream=terminal.stream) as bar:
         clock.now_s += 15
         bar.note("95 scans/s")
         bar.reach(15)
@@ -136,20 +135,8 @@ def test_a_wait_shows_what_is_left_of_it_and_a_note_but_no_rate(terminal):
         assert "93 scans/s" in terminal.said()
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
-def test_whatever_ends_it_the_line_is_cleared(terminal, stop):
-    clock = Clock()
-    with pytest.raises(stop), Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
-        clock.now_s += 3
-        bar.advance(1)
-        assert "left" in terminal.said()
-        raise stop
-    assert CLEARED.search(terminal.said())
-
-
-def test_lines_of_others_stand_alone(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+def test_lines_of_others_stand_alone(terminal, clock):
+    with Progress("poses", 400, "pose", stream=terminal.stream) as bar:
         clock.now_s += 3
         bar.advance(30)
         terminal.said()
@@ -159,11 +146,13 @@ def test_lines_of_others_stand_alone(terminal):
         assert re.match(r"\r +\ra line\r\n\r?poses ", terminal.said())
 
 
-def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchruns_processes(terminal, monkeypatch):
-    clock, pipe = Clock(), io.StringIO()
+def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchruns_processes(
+    terminal, monkeypatch, clock
+):
+    pipe = io.StringIO()
     for stream, rank in ((pipe, "0"), (terminal.stream, "1")):
         monkeypatch.setenv("RANK", rank)
-        with Progress("poses", 400, "pose", stream=stream, clock_s=clock) as bar:
+        with Progress("poses", 400, "pose", stream=stream) as bar:
             for _ in range(400):
                 clock.now_s += 1
                 bar.advance()
@@ -171,9 +160,8 @@ def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchr
     assert pipe.getvalue() == terminal.said() == ""
 
 
-def test_a_window_that_is_closed_ends_no_work(terminal):
-    clock = Clock()
-    with Progress("poses", 400, "pose", stream=terminal.stream, clock_s=clock) as bar:
+def test_a_window_that_is_closed_ends_no_work(terminal, clock):
+    with Progress("poses", 400, "pose", done=300, stream=terminal.stream) as bar:
         clock.now_s += 3
         bar.advance()
         os.close(terminal.ours)
@@ -195,7 +183,7 @@ AT_ONCE = """
 import sys
 from edge.cli import main as cli
 from edge.terminal import progress_bar as progress
-progress.Progress.__init__.__kwdefaults__["delay_s"] = 0.0
+progress.DELAY_S = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 
@@ -257,12 +245,8 @@ def test_resampling_is_the_mean_over_each_new_cell(image, height, width):
     np.testing.assert_allclose(resample(image, height, width), exact, atol=1e-12)
 
 
-def test_finer_cells_repeat_values():
-    np.testing.assert_allclose(resample(np.arange(4.0).reshape(2, 2), 4, 6), np.kron([[0, 1], [2, 3]], np.ones((2, 3))))
-
-
 @pytest.mark.parametrize("palette", PALETTES)
-@pytest.mark.parametrize("columns", [1, 5, 6, 7, 8, 19, 20, 39, 40, 63, 64, 79, 80, 123, 124, 300])
+@pytest.mark.parametrize("columns", [1, 7, 20, 39, 64, 80, 124, 300])
 def test_no_line_is_wider_than_the_terminal(palette, columns):
     panels = [panel(title="a title longer than some of these terminals"), panel(np.eye(40)), panel(high=1e-7)]
     lines = visible(draw(panels, columns, palette))
@@ -276,12 +260,6 @@ def test_side_by_side_where_there_is_room_else_below_each_other():
     assert len(wide) == 1 + 12 + 1
     assert [line.strip() for line in narrow if line.strip() in ("one", "two", "three")] == ["one", "two", "three"]
     assert len(narrow) == 3 * (1 + 20 + 1) + 2
-
-
-@pytest.mark.parametrize("columns", range(76, 130))
-def test_taxels_side_by_side_have_sharp_borders(columns):
-    lines = draw([panel(np.eye(4)), panel(), panel()], columns, "plain").splitlines()[1:-1]
-    assert set("".join(lines)) == {SHADES[0], SHADES[-1]}
 
 
 def test_plain_is_ascii_denser_where_larger():
@@ -303,37 +281,23 @@ def test_a_cell_shows_the_upper_pixel_over_the_lower(palette):
     assert line == f"\x1b[38;{high};48;{low}m{HALF_BLOCK * 40}\x1b[0m"
 
 
-def test_values_beyond_the_scale_are_clipped_and_a_flat_scale_is_dark():
-    line = draw([panel(np.array([[-5.0, 5.0]]))], 40, "plain").splitlines()[1]
-    assert line == " " * 20 + "@" * 20
-    assert set(draw([panel(np.zeros((2, 2)), high=0.0)], 40, "plain").splitlines()[1]) <= {" "}
-
-
-def test_the_scale_names_both_ends_and_the_unit():
-    last = draw([panel(high=1.234)], 40, "plain").splitlines()[-1]
-    assert last.startswith("0 ") and last.endswith(f"{SHADES[-1]} 1.23 mm") and len(last) == 40
-
-
-@pytest.mark.parametrize(("high", "text"), [(0.0123, "0.0123"), (99.96, "100"), (1613.4, "1613"), (12345.6, "12346")])
-def test_the_scales_numbers_are_short(high, text):
-    assert draw([panel(high=high)], 40, "plain").endswith(f" {text} mm")
+@pytest.mark.parametrize(
+    ("high", "text"), [(0.0123, "0.0123"), (1.234, "1.23"), (99.96, "100"), (1613.4, "1613"), (12345.6, "12346")]
+)
+def test_the_scale_names_both_ends_shortly_and_the_unit(high, text):
+    last = draw([panel(high=high)], 40, "plain").splitlines()[-1]
+    assert last.startswith("0 ") and last.endswith(f"{SHADES[-1]} {text} mm") and len(last) == 40
 
 
 @pytest.mark.parametrize(
     ("environment", "terminal", "encoding", "palette"),
     [
         ({"TERM": "xterm", "COLORTERM": "truecolor"}, True, "utf-8", "truecolor"),
-        ({"TERM": "xterm", "COLORTERM": "24bit"}, True, "utf-8", "truecolor"),
-        ({"TERM": "xterm"}, True, "utf-8", "256"),
-        ({"TERM": "xterm", "COLORTERM": "yes"}, True, "utf-8", "256"),
-        ({"TERM": "xterm", "NO_COLOR": "1"}, True, "utf-8", "plain"),
         ({"TERM": "xterm", "NO_COLOR": ""}, True, "utf-8", "256"),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, True, "utf-8", "plain"),
         ({"TERM": "dumb", "COLORTERM": "truecolor"}, True, "utf-8", "plain"),
-        ({"COLORTERM": "truecolor"}, True, "utf-8", "plain"),
         ({"TERM": "xterm"}, False, "utf-8", "plain"),
-        ({"TERM": "xterm"}, True, "ascii", "plain"),
         ({"TERM": "xterm"}, True, "latin-1", "plain"),
-        ({"TERM": "xterm"}, True, None, "plain"),
         ({"TERM": "xterm"}, True, "no such encoding", "plain"),
     ],
 )

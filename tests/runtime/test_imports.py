@@ -14,7 +14,7 @@ from edge_samples import ROOT
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
     *("edge.sinks.jsonl", "edge.sinks.npz_file", "edge.sinks.ros2.sink", "cyclonedds", "tqdm", "edge.bench"),
-    *("edge.cli.demo_score", "edge.terminal.heatmap", "edge.cli.realtime", "websockets", "usb", "can", "subprocess"),
+    *("edge.cli.demo", "edge.terminal.heatmap", "edge.cli.realtime", "websockets", "usb", "can", "subprocess"),
     *("firmware_bridge.emulation.robot_main", "firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
     *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
     *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),

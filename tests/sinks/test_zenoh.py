@@ -36,7 +36,7 @@ from edge.sinks.json_encoding import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.run_facts import RunFacts
 from edge.sinks.zenoh import ZenohSink, chunks
-from edge.terminal.forced_end import EXIT_FORCED
+from edge.terminal.stop_signals import EXIT_FORCED
 
 __all__ = ["consume", "endpoint"]
 

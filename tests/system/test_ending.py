@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 
 from edge.cli import main as cli
 from edge.sinks.binary_message import unpack
-from edge.terminal.forced_end import EXIT_FORCED
+from edge.terminal.stop_signals import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
 LONG_S = 12.0
@@ -33,7 +33,7 @@ NARROW = """
 import socket, sys
 from edge.cli import main as cli
 from edge.view import server
-from edge.view import viewer_connection as attended
+from edge.view import viewers as attended
 
 def listen(host, port, listen=server._listen):
     listening = listen(host, port)
@@ -73,7 +73,7 @@ with stop_on_signals(), terminal_keys(Commands()):
 """
 FINISHING = """
 import os, pathlib, signal, sys, time
-from edge.terminal import forced_end as ending
+from edge.terminal import stop_signals as ending
 from edge.terminal.stop_signals import stop_on_signals
 path, grows = pathlib.Path(sys.argv[1]), sys.argv[2] == "grows"
 ending.END_S, ending.STALLED_S = 0.3, 0.6

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Command, Commands
 from edge.view.access import grant, is_loopback
-from edge.view.viewer_commands import LONGEST_BYTES, execute
-from edge.view.viewer_state import Viewer
+from edge.view.viewers import LONGEST_BYTES, Viewer, execute
 from firmware_bridge.links.replay_player import Player
 
 TOKEN = "correct-horse-battery"
@@ -58,11 +57,6 @@ def test_a_name_that_is_not_ours_is_refused(listens):
     assert {host for host in ours + strange if asks(access, f"/ws?token={TOKEN}", host) is None} == set(ours)
     assert {asks(access, f"/ws?token={TOKEN}", host) for host in (*strange, "", [], [ours[0], strange[0]])} == {403}
     assert {asks(access, "/ws", host) for host in ours} == {None if token is None else 403}
-
-
-def test_who_is_refused_for_a_name_is_told_what_to_do():
-    refusal = grant("0.0.0.0", "robot", TOKEN).refusal("/", ["arm.lan:8077"], [])
-    assert refusal is not None and "arm.lan:8077; open the address that edge-sr printed" in refusal.text
 
 
 PROXIES = (
@@ -197,37 +191,19 @@ def test_commands_are_polled_once_in_their_order():
 @pytest.mark.parametrize(
     "message",
     [
-        "",
-        "zero",
-        "[]",
-        "null",
-        "[" * 4000,
-        b'{"cmd": "zero"}',
-        {"cmd": "stop"},
+        *("", "zero", "[]", "null", "[" * 4000, b'{"cmd": "zero"}', {"cmd": "stop"}, {"cmd": ["zero"]}),
         {"cmd": "zero", "sensro": "4"},
-        {"cmd": "zero", "sensor": 4},
         {"cmd": "zero", "sensor": "\ud800"},  # which no record can hold
         {"cmd": "zero", "sensor": "\x1b]0;mine\a"},  # which a terminal would do
-        {"cmd": "zero", "force": 1},
-        {"cmd": "record"},
         {"cmd": "record", "on": "yes"},
         {"cmd": "record", "on": True, "path": "/etc/passwd"},
         {"cmd": "pause"},
-        {"cmd": ["zero"]},
-        {"cmd": {}},
     ],
 )
 def test_what_is_no_command_is_counted_and_told(message):
     asked, [why] = executed(message)
     assert asked.refused == 1 and asked.poll() == []
     assert why is not None and "expected {" in why and len(why) < 400 and "\n" not in why
-
-
-def test_pausing_is_the_viewers_own():
-    asked, viewer, other = Commands(), Viewer(), Viewer()
-    for on in (True, False):
-        assert execute(json.dumps({"cmd": "pause", "on": on}), viewer, asked) is None
-        assert viewer.paused == on and not other.paused and asked.poll() == []
 
 
 def test_where_nobody_polls_a_few_wait_and_the_others_are_refused():

@@ -11,17 +11,15 @@ from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
-from edge.sinks.json_encoding import record
-from edge.view.frames import MAX_FPS, Frames, Run, hello, refused, state
-from edge.view.run_snapshot import EVENTS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
-from edge.view.sink import ViewSink
-from edge.view.viewer_state import Viewer
+from edge.sinks.json_encoding import event_record, record
+from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
+from edge.view.viewers import Viewer
 from firmware_bridge.links.replay_player import PlayerState
 
 
 class Clock:
-    def __init__(self):
-        self.now_ns = 10**12
+    now_ns = 10**12
 
     def __call__(self):
         return self.now_ns
@@ -52,12 +50,12 @@ def numbers(header):
 
 def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     press = Press(counts_per_newton=1000.0)
-    result = press.take(3)[-1]
-    heard.add(result, {"dropped": 3})
+    result = replace(press.take(3)[-1], notes=(Note("late", "old"), Note("dead", "taxel 3")))
+    heard.write(result, {"dropped": 3})
     clock.now_ns += 70_000_000
     [(header, maps)] = look(Viewer(), heard, clock)
     said = record(result, {"dropped": 3})
-    assert header["kind"] == "result" and header["age_s"] == 0.07
+    assert header["kind"] == "result" and header["age_s"] == 0.07 and header["note_kinds"] == ["late", "dead"]
     assert {key: header[key] for key in said if key != "counts"} == {k: v for k, v in said.items() if k != "counts"}
     assert header["counts"] == result.scan.counts.tolist() and header["source"] == "emulated"
     assert list(maps) == ["zeroed", "pattern", "deviation", "taps"]
@@ -70,90 +68,43 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     ]
 
 
-def test_what_is_not_there_is_left_out(heard, clock):
-    heard.add(Press().next(0), {})
-    [(header, maps)] = look(Viewer(), heard, clock)
-    assert list(maps) == ["zeroed"] and header["contact"] is False and header["trace"][0][2:] == [None, None, None]
-    heard.add(Press("6", baselines={}).next(0), {})
-    header, maps = look(Viewer(), heard, clock)[1]
-    assert header["sensor"] == "6" and maps == {} and header["trace"][0][1:] == [None, None, None, None]
-
-
 def test_hello_says_what_does_not_change():
     header, maps = unpack(hello(Run("demo", "emulated", "mtsr4", CONTRACT, "c0ffee"), None))
-    assert maps == {}
-    assert header == {
-        "kind": "hello",
-        "version": 1,
-        "run": "c0ffee",
-        "name": "demo",
-        "source": "emulated",
-        "model": "mtsr4",
-        "taps": 4,
-        "pattern_unit": "mm",
-        "full_scale": 2.0,
-        "contact_level": CONTRACT.contact_level,
-        "pixel_pitch_mm": pytest.approx(0.47),
-        "taxel_pitch_mm": 4.7,
+    model = {"model": "mtsr4", "taps": 4, "pattern_unit": "mm", "full_scale": 2.0, "wrench": False, "checks": False}
+    grid = {
         "rows": 4,
         "cols": 4,
+        "taxel_pitch_mm": 4.7,
         "height": 40,
         "width": 40,
-        "wrench": False,
-        "checks": False,
-        "recording": None,
-        "max_fps": MAX_FPS,
-        "maps": [],
+        "pixel_pitch_mm": pytest.approx(0.47),
     }
+    run = {"kind": "hello", "version": 1, "run": "c0ffee", "name": "demo", "source": "emulated", "recording": None}
+    contact = {"contact_level": CONTRACT.contact_level, "max_fps": MAX_FPS, "maps": []}
+    assert maps == {} and header == run | model | grid | contact
 
 
 def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
     press, viewer, traced = Press(), Viewer(), []
     for scans in (1, 4, 0, 7, 200):
         for result in press.take(scans):
-            heard.add(result, {})
+            heard.write(result, {})
         got = look(viewer, heard, clock)
         assert len(got) == (scans > 0)
         for header, _ in got:
             assert header["scan"] == press.number - 1
             traced += numbers(header)
-    assert traced == list(range(212))
-
-
-def test_two_at_different_speeds_get_the_same_newest_and_what_each_has_missed(heard, clock):
-    press, quick, slow = Press(), Viewer(), Viewer()
-    heard.add(press.next(), {})
-    assert len(look(quick, heard, clock)) == len(look(slow, heard, clock)) == 1
-    for _ in range(3):
-        heard.add(press.next(), {})
-        look(quick, heard, clock)
-    heard.add(press.next(), {})
-    [(first, _)], [(second, _)] = look(quick, heard, clock), look(slow, heard, clock)
-    assert first["scan"] == second["scan"] == 4
-    assert (numbers(first), numbers(second)) == ([4], [1, 2, 3, 4])
+    assert traced == list(range(212)) and header["rate_hz"] == 100.0
 
 
 def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     frames = Frames(heard, clock(), "emulated")
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     [(first, _)] = unpacked(viewer.due(frames))
     [(second, _)] = look(viewer, heard, clock)
     assert (first["scan"], numbers(first)) == (0, [0]) and (second["scan"], numbers(second)) == (1, [1])
-
-
-def test_who_looks_at_the_same_shares_its_bytes(heard, clock):
-    heard.add(Press().next(), {})
-    frames = Frames(heard, clock(), "emulated")
-    assert Viewer().due(frames)[0] is Viewer().due(frames)[0]
-
-
-def test_the_age_is_of_the_moment_and_not_of_who_looked_before(heard, clock):
-    heard.add(Press().next(), {})
-    look(Viewer(), heard, clock)
-    clock.now_ns += 5 * 10**9
-    assert look(Viewer(), heard, clock)[0][0]["age_s"] == 5.0
 
 
 @pytest.mark.parametrize("rate_hz", [8, 100, 1000])
@@ -165,7 +116,7 @@ def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
     for number in range(count):  # made over from one: what is drawn is all that matters
         force = 9000.0 if number == spike else 0.0
         scan = replace(idle.scan, number=number, time_ns=number * period_ns)
-        heard.add(replace(idle, scan=scan, force_counts=force), {})
+        heard.write(replace(idle, scan=scan, force_counts=force), {})
     [(header, _)] = look(Viewer(), heard, clock)
     seconds = [point[0] for point in header["trace"]]
     assert len(seconds) <= TRACE_POINTS and seconds == sorted(set(seconds))
@@ -177,10 +128,10 @@ def test_a_newcomer_gets_the_last_minute_thinned(heard, clock, rate_hz):
 
 def test_who_was_away_long_gets_what_was_missed_thinned_and_nothing_twice(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(0), {})
+    heard.write(press.next(0), {})
     look(viewer, heard, clock)
     for result in press.take(2 * RECENT_SCANS, 0):
-        heard.add(result, {})
+        heard.write(result, {})
     [(header, _)] = look(viewer, heard, clock)
     got = numbers(header)
     assert got[-1] == 2 * RECENT_SCANS and 1 <= got[0] <= 5 and len(got) <= 2 * RECENT_SCANS / 5 + 2
@@ -193,7 +144,7 @@ AGAIN = Event(0, "zeroed", "4", "again")
 def test_memory_does_not_grow_with_the_run(heard):
     idle = Press().next(0)
     for number in range(20_000):
-        heard.add(
+        heard.write(
             replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), events=(AGAIN,)), {}
         )
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
@@ -206,19 +157,11 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
     clock.now_ns += 2 * 10**9
     got = look(viewer, heard, clock)
     assert [header["note"] for header, _ in got] == [f"gone {number}" for number in range(5, EVENTS + 5)]
-    assert got[-1][0] | {"maps": []} == {
-        "kind": "event",
-        "state": "event",
-        "event": "lost",
-        "sensor": None,
-        "source": "emulated",
-        "time_ns": EVENTS + 4,
-        "note": f"gone {EVENTS + 4}",
-        "counters": {"outages": EVENTS + 4},
-        "number": EVENTS + 5,
-        "age_s": 2.0,
-        "maps": [],
-    }
+    last, said = (
+        got[-1][0],
+        event_record(Event(EVENTS + 4, "lost", None, f"gone {EVENTS + 4}"), {"outages": EVENTS + 4}, "emulated"),
+    )
+    assert last == said | {"kind": "event", "number": EVENTS + 5, "age_s": 2.0, "maps": []}
     assert look(viewer, heard, clock) == []
     heard.tell(Event(1, "back", None, "again"), {})
     assert [header["note"] for header, _ in look(viewer, heard, clock)] == ["again"]
@@ -226,9 +169,9 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
 
 def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
-    heard.add(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
+    heard.write(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
+    heard.write(press.next(), {})
     event, result = look(viewer, heard, clock)
     assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == (
         *("zeroed", "4", "sensor 4 zeroed on demand: baseline b"),
@@ -238,11 +181,11 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
 
 def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_trace(heard, clock):
     press, viewer = Press(), Viewer()
-    heard.add(press.next(), {})
+    heard.write(press.next(), {})
     look(viewer, heard, clock)
     viewer.paused = True
     for result in press.take(9):
-        heard.add(result, {})
+        heard.write(result, {})
     heard.tell(Event(1, "lost", None, "gone"), {})
     assert [header["kind"] for header, _ in look(viewer, heard, clock)] == ["event"]
     viewer.paused = False
@@ -250,16 +193,10 @@ def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_t
     assert header["scan"] == 9 and numbers(header) == list(range(1, 10))
 
 
-def test_the_rate_is_the_scans_and_not_the_frames(heard, clock):
-    for result in Press().take(50):
-        heard.add(result, {})
-    assert look(Viewer(), heard, clock)[0][0]["rate_hz"] == 100.0
-
-
 def test_state_tells_the_silence_of_a_sensor(heard, clock):
-    heard.add(Press("4").next(), {})
+    heard.write(Press("4").next(), {})
     clock.now_ns += 700_000_000
-    heard.add(Press("6").next(), {})
+    heard.write(Press("6").next(), {})
     assert Frames(heard, clock(), "emulated").silent() == {"4": 0.7}
     clock.now_ns += 500_000_000
     assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
@@ -287,19 +224,11 @@ def test_what_is_refused_is_an_event():
     assert "number" not in header and header["sensor"] is None
 
 
-def test_a_result_has_the_kinds_of_its_notes(heard, clock):
-    press = Press()
-    heard.add(press.next(), {})
-    heard.add(replace(press.next(), notes=(Note("late", "old"), Note("dead", "taxel 3"))), {})
-    ((header, _),) = look(Viewer(), heard, clock)
-    assert header["note_kinds"] == ["late", "dead"] and header["note"] == "old; taxel 3"
-
-
 def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(heard, clock):
     four, viewer = Press("4"), Viewer()
 
     def told(press_counts=3000):
-        heard.add(four.next(press_counts), {})
+        heard.write(four.next(press_counts), {})
         return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
 
     four.runtime.zero()
@@ -316,45 +245,29 @@ def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(h
     assert told() == [("reset", None)]  # of all sensors, though this one's result carries it
 
 
-class TestSink:
-    """Tests of the times at which viewers are woken."""
+@pytest.fixture
+def woken(clock, heard):
+    """Times at which viewers are woken."""
+    times = []
+    heard.wake = lambda: times.append(clock())
+    return times
 
-    def sink(self, clock, watched=True):
-        woken = []
-        return ViewSink(RunSnapshot(clock), lambda: watched, lambda: woken.append(clock()), clock), woken
 
-    def test_nobody_is_woken_where_nobody_looks(self, clock):
-        sink, woken = self.sink(clock, watched=False)
-        for result in Press().take(20):
-            clock.now_ns += PERIOD_NS
-            sink.write(result, {})
-        assert woken == []
+@pytest.mark.parametrize("jitter_ns", [0, 900_000])
+def test_at_a_hundred_scans_a_second_every_fourth_wakes(clock, heard, woken, jitter_ns):
+    start_ns = clock.now_ns
+    for number, result in enumerate(Press().take(400)):
+        clock.now_ns = start_ns + number * PERIOD_NS + (jitter_ns if number % 3 else -jitter_ns)
+        heard.write(result, {})
+    assert 95 <= len(woken) <= 4 * MAX_FPS + 1
 
-    @pytest.mark.parametrize("jitter_ns", [0, 900_000])
-    def test_at_a_hundred_scans_a_second_every_fourth_wakes(self, clock, jitter_ns):
-        sink, woken = self.sink(clock)
-        start_ns = clock.now_ns
-        for number, result in enumerate(Press().take(400)):
-            clock.now_ns = start_ns + number * PERIOD_NS + (jitter_ns if number % 3 else -jitter_ns)
-            sink.write(result, {})
-        assert 95 <= len(woken) <= 4 * MAX_FPS + 1
 
-    def test_never_more_often_than_an_eye_takes_in(self, clock):
-        sink, woken = self.sink(clock)
-        for result in Press().take(1000):
-            clock.now_ns += 1_000_000
-            sink.write(result, {})
-            sink.tell(Event(1, "lost", None, "gone"), {})
-        assert len(woken) <= MAX_FPS + 1
-
-    def test_what_came_last_before_a_silence_is_shown_once(self, clock):
-        sink, woken = self.sink(clock)
-        press = Press()
-        sink.write(press.next(), {})
+def test_what_came_last_before_a_silence_is_shown_once(clock, heard, woken):
+    for result in Press().take(2):
+        heard.write(result, {})
         clock.now_ns += PERIOD_NS
-        sink.write(press.next(), {})
-        assert len(woken) == 1
-        for _ in range(5):
-            clock.now_ns += 100_000_000
-            sink.wait()
-        assert len(woken) == 2
+    assert len(woken) == 1
+    for _ in range(5):
+        clock.now_ns += 100_000_000
+        heard.wait()
+    assert len(woken) == 2

@@ -16,8 +16,7 @@ from edge.pipeline.commands import Command, Commands, obey
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
-from edge.view.viewer_commands import execute
-from edge.view.viewer_state import Viewer
+from edge.view.viewers import Viewer, execute
 from firmware_bridge.recording.formats import load_recording
 
 AT = time.struct_time((2026, 11, 22, 5, 6, 7, 6, 326, 0))

@@ -90,14 +90,6 @@ class TestPage:
         assert response.status == 405 and (method == "HEAD" or response.read() == b"only GET\n")
         connection.close()
 
-    def test_a_request_byte_by_byte_is_one(self, page):
-        with page.stranger() as stranger:
-            stranger.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            for byte in b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n":
-                stranger.sendall(bytes([byte]))
-                time.sleep(0.001)
-            assert stranger.recv(100).startswith(b"HTTP/1.1 200")
-
     def test_who_says_nothing_is_not_waited_for(self, tmp_path, monkeypatch):
         monkeypatch.setattr(server, "OPEN_S", 0.1)
         with live_page(tmp_path) as page, page.stranger(b"GET / HTTP/1.1\r\n") as stranger:

@@ -12,7 +12,7 @@ from websockets.sync.client import connect
 
 from edge.pipeline.pump import uncollected
 from edge.view import server
-from edge.view import viewer_connection as attended
+from edge.view import viewers as attended
 from edge.view.connection_limits import MOST_CONNECTIONS, MOST_VIEWERS
 
 __all__ = ["page"]

@@ -1,0 +1,381 @@
+"""The demo around one run: its robot, its scenes, its score against the truth, and its map."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.metrics import boundary_distance_mm, psnr_db, rmse_percent
+from edge.inference.bundled import demo_recording
+from edge.inference.model_interface import Model
+from edge.inference.pose_input import scheduled_rows
+from edge.mapping.live_map import MapState
+from edge.mapping.object_map import ObjectMap
+from edge.mapping.sink import MapSink
+from edge.perception.event import Event
+from edge.perception.result import Result
+from edge.pipeline.commands import RESET, Commands
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
+from edge.terminal.heatmap import Palette, Panel, choose_palette, draw
+from edge.terminal.text_wrap import columns, drawn
+from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.zeroing.baseline import deformation
+
+if TYPE_CHECKING:
+    from edge.view.live_view import LiveView
+
+FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2
+"""Scenes as train/demo.py numbers them; FREE is outside of any."""
+_BEGINS: Final = {
+    FOREIGN: "demo: now another surface is tapped, and then the first one again: no pattern may be made from both",
+    MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
+    SLIDE: "demo: now the pad slides along another object, a long letter: a map is made of its patterns",
+}
+_MAP_MARGIN_MM: Final = 1.0
+_MAP_COLUMNS: Final = 72
+
+
+class DemoRecording:
+    """Facts on the demo's recording by the raw counts of its scans, so that a lost scan shifts nothing.
+
+    Attributes:
+        arrays: of the file.
+        scenes: scene of each scan.
+        taps: number of the tap of each scan of a tap, and its indentation in [mm]. The taps of the figure come first,
+            after them those that may be played in place of all but the first.
+        figure_taps: number of taps of the figure.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with np.load(path, allow_pickle=False) as data:
+            self.arrays: dict[str, NDArray[Any]] = dict(data)
+        counts = self.arrays["counts"]
+        self.figure_taps = len(self.arrays["tap_pose"])
+        self.scenes = dict(zip(map(_key, counts), self.arrays["scene"].tolist(), strict=True))
+        played = zip(counts, self.arrays["tap"].tolist(), self.arrays["indentation_mm"].tolist(), strict=True)
+        self.taps = {_key(scan): (tap, depth_mm) for scan, tap, depth_mm in played if tap >= 0}
+        options = zip(self.arrays["option_counts"], self.arrays["option_indentation_mm"].tolist(), strict=True)
+        for tap, (scans, depths_mm) in enumerate(options, self.figure_taps):
+            self.taps |= {_key(scan): (tap, depth_mm) for scan, depth_mm in zip(scans, depths_mm, strict=True)}
+
+
+def _key(counts: NDArray[np.integer]) -> bytes:
+    return counts.astype(np.int32).tobytes()
+
+
+class DemoRobot:
+    """Robot that goes, after each tap of the figure, where the next one is proposed."""
+
+    def __init__(self, recording: DemoRecording, touch: Callable[[PadPose | None], object]) -> None:
+        """Begin before the first tap; `touch` gets the pose of each proposal, None where nothing is proposed."""
+        self._recording, self._touch = recording, touch
+        self._tapping = False
+
+    def add(self, result: Result) -> None:
+        """Ask for the next tap once this one is over."""
+        if result.contact:
+            self._tapping |= _key(result.scan.counts) in self._recording.taps
+        elif self._tapping and result.contact is False:
+            self._tapping = False
+            self._touch(None if result.next_tap is None else result.next_tap.target)
+
+
+class DemoScenes:
+    """Announcement of each scene of the demo, and of its outcome unless it is cut off, as events of kind "note"."""
+
+    def __init__(self, recording: DemoRecording, tell: Callable[[Event], object], reset: Callable[[], object]) -> None:
+        """Begin before the first scene; `reset` is called where the robot goes on to another object."""
+        self._recording, self._tell, self._reset = recording, tell, reset
+        self._scene = FREE
+        self._patterns = self._checked = self._untrusted = self._dropped = 0
+
+    def add(self, result: Result) -> None:
+        """Follow the scenes."""
+        scene = self._recording.scenes.get(_key(result.scan.counts), self._scene)
+        if scene != self._scene:
+            self._end()
+            self._scene = scene
+            if scene in _BEGINS:
+                self._say(_BEGINS[scene])
+            if scene == SLIDE:
+                self._reset()
+        self._dropped += sum(event.kind == "tap_dropped" for event in result.events)
+        if result.pattern is not None:
+            self._patterns += 1
+            self._checked += result.trusted is not None
+            self._untrusted += result.trusted is False
+
+    def _end(self) -> None:
+        """Announce the outcome of the scene, and count from 0."""
+        if self._scene == FOREIGN:
+            none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
+            self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
+        elif self._scene == MAGNET:
+            told = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
+            none = f"none of {self._patterns} patterns with the magnet was checked"
+            self._say(f"demo: {told if self._checked else none}")
+        self._patterns = self._checked = self._untrusted = self._dropped = 0
+
+    def _say(self, text: str) -> None:
+        self._tell(Event(time.monotonic_ns(), "note", None, text))
+
+
+@dataclass(frozen=True, slots=True)
+class TapScore:
+    """Error of one tap's pattern against its truth, (H, W) in the model's unit, at the tap's peak.
+
+    The tap is numbered from 0; its pose is x and y in [mm] and turn in [deg], as the robot stated them. Errors are in
+    [dB] and in [% of full scale]; `alone_percent` is that of a pattern of this tap alone.
+    """
+
+    tap: int
+    pose: tuple[float, float, float]
+    result: Result
+    truth: NDArray[np.float32]
+    psnr_db: float
+    rmse_percent: float
+    alone_percent: float
+
+
+class DemoScore:
+    """Score of the figure: of each tap the result with the largest force, until the last tap is over.
+
+    Attributes:
+        complete: True once the last tap is over.
+    """
+
+    def __init__(
+        self, recording: DemoRecording, model: Model, on_complete: Callable[["DemoScore"], object] = lambda score: None
+    ) -> None:
+        """Begin before the first tap; `on_complete` is called once, when the last tap is over."""
+        self._recording, self._model, self._on_complete = recording, model, on_complete
+        self._peaks: list[tuple[Result, int, float]] = []  # with number of the recording's tap, and indentation in [mm]
+        self._between = True
+        self.complete = False
+
+    def add(self, result: Result) -> None:
+        """Keep the result if it is the strongest of its tap."""
+        if self.complete:
+            return
+        key = _key(result.scan.counts)
+        self._between |= result.contact is False
+        figure_over = self._between and len(self._peaks) == self._recording.figure_taps
+        if figure_over or (self._peaks and self._recording.scenes.get(key, FREE) != FREE):
+            self.complete = True
+            self._on_complete(self)
+            return
+        if key not in self._recording.taps or result.pattern is None or result.force_counts is None:
+            return
+        tap, indentation_mm = self._recording.taps[key]
+        if self._between or tap != self._peaks[-1][1]:
+            self._peaks.append((result, tap, indentation_mm))
+            self._between = False
+        elif result.force_counts > (self._peaks[-1][0].force_counts or 0):
+            self._peaks[-1] = result, tap, indentation_mm
+
+    def scores(self) -> list[TapScore]:
+        """Return the scores of the taps that got a pattern."""
+        return [self._score(number, *peak) for number, peak in enumerate(self._peaks)]
+
+    def _score(self, number: int, result: Result, tap: int, indentation_mm: float) -> TapScore:
+        if result.pattern is None:
+            raise ValueError("peak has no pattern, expected one kept by add")
+        arrays, full_scale = self._recording.arrays, self._model.contract.output_full_scale
+        whose, row = ("", tap) if tap < self._recording.figure_taps else ("option_", tap - self._recording.figure_taps)
+        truth = arrays[f"{whose}unit_patterns"][row].astype(np.float32) * indentation_mm
+        x_mm, y_mm, turn_deg = arrays["tap_pose" if whose == "" else "option_pose"][row, :3].tolist()
+        alone = result.pattern if result.taps_used < 2 else self._alone(result)
+        error_db = float(psnr_db(result.pattern, truth, full_scale))
+        errors = (float(rmse_percent(one, truth, full_scale)) for one in (result.pattern, alone))
+        return TapScore(number, (x_mm, y_mm, turn_deg), result, truth, error_db, *errors)
+
+    def _alone(self, result: Result) -> NDArray[np.float32]:
+        """Return the pattern of a result's newest tap alone."""
+        contract = self._model.contract
+        if result.window is None:
+            raise ValueError("result has no window, expected one with a pattern")
+        window = contract.scale_window(result.window)
+        if contract.takes_poses:
+            return self._model.run(window[:1], poses=scheduled_rows(1, contract.angle_step_deg))
+        padded = np.zeros((contract.taps, *window.shape[1:]), dtype=np.float32)
+        padded[0] = window[0]
+        return self._model.run(padded)
+
+    def text(self, palette: Palette) -> str:
+        """Return the table of the scores, and the last tap's maps."""
+        scores, of = self.scores(), f"of {self._recording.figure_taps} taps scored"
+        if not scores:
+            return f"none {of}: the run ended before a tap had a pattern"
+        table = f"{len(scores)} {of} at their peak, against the simulated truth:\n{score_table(scores)}"
+        return f"{table}\n\ntap {scores[-1].tap + 1}:\n{_score_picture(scores[-1], palette)}"
+
+
+def score_table(scores: Sequence[TapScore]) -> str:
+    """Return the scores as a table with a line for each tap, 50 columns wide, and what the taps together are worth.
+
+    RMSE in [% of full scale], of the pattern and of one from the same tap alone; "+-" is the model's own estimate, half
+    the 90 % interval of touched pixels in [um].
+    """
+    lines = ["tap    x    y turn use   PSNR  RMSE alone  +- time", "      mm   mm  deg taps    dB   %fs   %fs  um   us"]
+    for score in scores:
+        interval_mm = score.result.interval_mm
+        interval = "-" if interval_mm is None else f"{1000 * interval_mm:.0f}"
+        x_mm, y_mm, turn_deg = score.pose
+        figures = f"{score.psnr_db:6.2f} {score.rmse_percent:5.2f} {score.alone_percent:5.2f}"
+        place = f"{score.tap + 1:3d} {x_mm:4.1f} {y_mm:4.1f} {turn_deg:4.0f} {score.result.taps_used:3d}"
+        lines.append(f"{place} {figures} {interval:>3s} {score.result.run_time_us or 0:4.0f}")
+    return "\n".join([*lines, _gained(scores)])
+
+
+def _gained(scores: Sequence[TapScore]) -> str:
+    """Return what the earlier taps have changed, also where it is nothing good."""
+    last = scores[-1]
+    if last.result.taps_used < 2:
+        return "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
+    change = "fell" if last.rmse_percent < last.alone_percent else "did not fall"
+    errors = f"{last.rmse_percent:.2f} % of full scale, {last.alone_percent:.2f} % with it alone"
+    risen = [str(one.tap + 1) for before, one in pairwise(scores) if one.rmse_percent > before.rmse_percent]
+    rose = f"\nFrom tap to tap it rose at tap {' and '.join(risen)}." if risen else ""
+    return f"With {last.result.taps_used} taps the last one's error {change}: {errors}.{rose}"
+
+
+def _score_picture(score: TapScore, palette: Palette) -> str:
+    """Return the taxels, the pattern and the truth as maps side by side."""
+    result = score.result
+    if result.pattern is None or result.baseline is None:
+        raise ValueError("score has no pattern, expected one made by DemoScore")
+    taxels_z = deformation(result.scan.counts, result.baseline)[2]
+    highest = float(max(result.pattern.max(), score.truth.max()))
+    believed = {True: "super-resolved", None: "not checked", False: "NOT BELIEVED"}[result.trusted]
+    height, width = result.pattern.shape
+    panels = [
+        Panel(f"taxels, {taxels_z.shape[0]} x {taxels_z.shape[1]}", taxels_z, 0.0, float(taxels_z.max()), "counts"),
+        Panel(f"{believed}, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
+        Panel("truth", score.truth, 0.0, highest, result.pattern_unit),
+    ]
+    return draw(panels, columns(), palette)
+
+
+class DemoMap(MapSink):
+    """Map of the slide alone, beside the truth, a letter: `complete` is true once the slide is over."""
+
+    def __init__(
+        self,
+        recording: DemoRecording,
+        show: Callable[[MapState], object] | None,
+        on_complete: Callable[["DemoMap"], object],
+    ) -> None:
+        """Begin before the slide; `on_complete` is called once, when it is over."""
+        arrays = recording.arrays
+        self._recording, self._letter, self._on_complete = recording, arrays["letter"], on_complete
+        px_per_mm, (x_mm, y_mm) = float(arrays["letter_px_per_mm"]), arrays["letter_centre_mm"].tolist()
+        super().__init__(ObjectMap(len(self._letter) / px_per_mm, px_per_mm, centre_mm=(x_mm, y_mm)), show=show)
+        self._begun = self.complete = False
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Fuse the results of the slide."""
+        scene = self._recording.scenes.get(_key(result.scan.counts))
+        if scene == SLIDE:
+            self._begun = True
+            super().write(result, counters)
+        elif scene is not None and self._begun and not self.complete:
+            self.complete = True
+            self._on_complete(self)
+
+    def text(self, palette: Palette) -> str:
+        """Return the map's distance from the truth, and both as pictures; nothing before the slide."""
+        if not self._begun:
+            return ""
+        if not self.whole.fused:
+            return f"the letter is not on the map: {self.summary()}"
+        contact = np.nan_to_num(self.whole.contact()[0])
+        px_per_mm = self.whole.grid.px_per_mm
+        away_mm = float(boundary_distance_mm(contact[None], self._letter[None], 0.5, 1 / px_per_mm)[0])
+        rows, cols = (np.flatnonzero(self._letter.any(axis=axis)) for axis in (1, 0))
+        margin = round(_MAP_MARGIN_MM * px_per_mm)
+        shown = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, cols))
+        length_mm = (cols[-1] + 1 - cols[0]) / px_per_mm
+        title = f"map of a letter of {length_mm:.0f} mm, from one slide: {self.whole.fused} patterns fused, "
+        panels = [
+            Panel("map", contact[shown], 0.0, 1.0, "touched"),
+            Panel("truth", self._letter[shown].astype(np.float64), 0.0, 1.0, "touched"),
+        ]
+        pictures = "\n\n".join(draw([panel], columns(), palette, widest=_MAP_COLUMNS) for panel in panels)
+        return f"{title}outline {away_mm:.2f} mm from the truth\n{pictures}"
+
+
+class Demo(Sink):
+    """Sink that makes a run the demo; it prints to `stream`, and shows its map on the live page, if there is one.
+
+    Where it `loops`, it goes on after its end, and each part is printed once it is complete.
+
+    Attributes:
+        map: made where the user makes none; a sink of its own.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        source: Source,
+        stream: TextIO,
+        view: "LiveView | None",
+        watching: Sequence[Sink],
+        commands: Commands,
+        *,
+        loops: bool,
+        maps: bool,
+    ) -> None:
+        """Begin the demo; scenes are announced to the sinks that are `watching`."""
+        recording = DemoRecording(demo_recording())
+        self._stream, self._view, self._loops = stream, view, loops
+        self._score = DemoScore(recording, model, self._completed)
+        self.map = DemoMap(recording, None if view is None else view.show_map, self._completed) if maps else None
+        # Without poses a model's taps must follow the paper's schedule, as the recording does.
+        touch = source.steer() if model.contract.takes_poses else None
+        self._robot = None if touch is None else DemoRobot(recording, touch)
+
+        def tell(event: Event) -> None:
+            for sink in watching:
+                sink.tell(event, {})
+
+        self._scenes = DemoScenes(recording, tell, lambda: commands.put(RESET))
+        how = "where it is proposed" if self._robot else "by a fixed schedule"
+        taps = f"{str(recording.arrays['surface'])!r} {recording.figure_taps} times"
+        sys.stderr.write(f"demo: an emulated sensor taps {taps}, {how}, zeroed first\n")
+
+    def write(self, result: Result, counters: Mapping[str, int]) -> None:
+        """Follow the demo."""
+        self._score.add(result)
+        if self._robot is not None:
+            self._robot.add(result)
+        self._scenes.add(result)
+
+    def close(self) -> None:
+        """Do nothing: the demo ends with its source."""
+
+    def finish(self) -> None:
+        """Print what was not printed while the demo went on."""
+        for part in (self._score, self.map):
+            if part is not None and not (self._loops and part.complete):
+                self._print(part)
+
+    def _completed(self, part: DemoScore | DemoMap) -> None:
+        if not self._loops:
+            return
+        self._print(part)
+        if part is self.map or self.map is None:
+            page = "" if self._view is None else f"live page: {self._view.url}; "
+            sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
+
+    def _print(self, part: DemoScore | DemoMap) -> None:
+        stream = drawn(self._stream)
+        if text := part.text(choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)):
+            stream.write(f"\n{text}\n")
