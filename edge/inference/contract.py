@@ -1,7 +1,7 @@
 """Contract between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, Final
@@ -273,53 +273,11 @@ def _shown(value: object) -> str:
 
 
 def _check(values: Mapping[str, Any]) -> None:
-    def refuse(key: str, expected: str) -> None:
-        raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
-
-    for key, most in MOST.items():
-        any_batch = key == "batch" and values[key] == ANY_BATCH
-        if not any_batch and (type(values[key]) is not int or not 1 <= values[key] <= most):
-            refuse(key, f"a whole number from 1 to {most}")
-    if values["rows"] * values["cols"] * values["scale"] ** 2 > MOST_PIXELS:
-        refuse("scale", f"patterns of at most {MOST_PIXELS} pixels")
-    if values["tap_order"] != TAP_ORDER:
-        refuse("tap_order", repr(TAP_ORDER))
-    if values["arithmetic"] not in ARITHMETICS:
-        refuse("arithmetic", " or ".join(map(repr, ARITHMETICS)))
-    for key in ("output_full_scale", "pitch_mm", "contact_level"):
-        if not is_number(values[key]) or values[key] < LEAST_UNIT:
-            refuse(key, f"a positive number from {LEAST_UNIT:g}")
-    if values["contact_level"] >= 1:
-        refuse("contact_level", "a number below 1")
-    if not is_number(values["angle_step_deg"]):
-        refuse("angle_step_deg", "a number")
-    factor = values["interval_factor"]
-    if factor is not None and not (is_number(factor) and factor > 0):
-        refuse("interval_factor", "a positive number, or null for a model without deviations")
-    if not is_confidence(values["confidence"], values["taps"]):
-        refuse(
-            "confidence", "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
-        )
-    if not is_interval_levels(values["interval_levels"]):
-        refuse("interval_levels", "for each percentage a positive number for every region")
-    scaling = values["counts_per_unit"]
-    if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
-        refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")
-    for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
-        text = values[key]
-        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= LONGEST_SHOWN:
-            refuse(key, f"a printable text of 1 to {LONGEST_SHOWN} characters")
-    error = values["test_error"]
-    if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
-        refuse("test_error", "a map from taps to metrics")
-    _check_pad_and_traction(values, refuse)
-    takes_poses, reach_mm = values["takes_poses"], values["reach_mm"]
-    if not isinstance(takes_poses, bool):
-        refuse("takes_poses", "true or false")
-    if not is_number(reach_mm) or reach_mm < (LEAST_UNIT if takes_poses else 0):
-        refuse("reach_mm", f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0")
+    for key, is_kept, expected in _rules(values):
+        if not is_kept:
+            raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
     try:
-        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=takes_poses)
+        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=values["takes_poses"])
         readings = len(AXES) * values["rows"] * values["cols"]
         if trust is not None and trust.forward.operator.shape[1] != readings:
             raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
@@ -329,20 +287,59 @@ def _check(values: Mapping[str, Any]) -> None:
         raise ModelError(f"contract key 'trust' is damaged ({error}): export the model again") from error
 
 
-def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
+def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
+    """Yield a key, whether its value is lawful, and the expected value; a rule may rely on those before it."""
+    for key, most in MOST.items():
+        any_batch = key == "batch" and values[key] == ANY_BATCH
+        yield key, any_batch or _is_whole(values[key], most), f"a whole number from 1 to {most}"
+    taxels = values["rows"] * values["cols"]
+    yield "scale", taxels * values["scale"] ** 2 <= MOST_PIXELS, f"patterns of at most {MOST_PIXELS} pixels"
+    yield "tap_order", values["tap_order"] == TAP_ORDER, repr(TAP_ORDER)
+    yield "arithmetic", values["arithmetic"] in ARITHMETICS, " or ".join(map(repr, ARITHMETICS))
+    for key in ("output_full_scale", "pitch_mm", "contact_level"):
+        yield key, _is_from(LEAST_UNIT, values[key]), f"a positive number from {LEAST_UNIT:g}"
+    yield "contact_level", values["contact_level"] < 1, "a number below 1"
+    yield "angle_step_deg", is_number(values["angle_step_deg"]), "a number"
+    factor = values["interval_factor"]
+    is_factor = factor is None or (is_number(factor) and factor > 0)
+    yield "interval_factor", is_factor, "a positive number, or null for a model without deviations"
+    tables = "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
+    yield "confidence", is_confidence(values["confidence"], values["taps"]), tables
+    is_levels = is_interval_levels(values["interval_levels"])
+    yield "interval_levels", is_levels, "for each percentage a positive number for every region"
+    scaling = values["counts_per_unit"]
+    is_scaling = isinstance(scaling, list) and len(scaling) == 3 and all(_is_from(LEAST_UNIT, one) for one in scaling)
+    yield "counts_per_unit", is_scaling, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"
+    for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
+        text = values[key]
+        is_text = isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_SHOWN
+        yield key, is_text, f"a printable text of 1 to {LONGEST_SHOWN} characters"
+    error = values["test_error"]
+    is_error = isinstance(error, dict) and all(isinstance(metrics, dict) for metrics in error.values())
+    yield "test_error", is_error, "a map from taps to metrics"
     inputs = values["pad_inputs"]
-    if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
-        expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
-        refuse("pad_inputs", f"a list of [name, centre, spread], {expected}")
-    if len({name for name, _, _ in inputs}) < len(inputs):
-        refuse("pad_inputs", "no name twice")
-    if not isinstance(values["takes_gains"], bool):
-        refuse("takes_gains", "true or false")
-    scale = values["traction_scale"]
-    if scale is not None and (type(scale) is not int or not 1 <= scale <= MOST["scale"]):
-        refuse("traction_scale", f"a whole number from 1 to {MOST['scale']}, or null for a model without traction")
-    if scale is not None and len(AXES) * values["rows"] * values["cols"] * scale**2 > MOST_PIXELS:
-        refuse("traction_scale", f"tractions of at most {MOST_PIXELS} numbers")
+    expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
+    is_inputs = isinstance(inputs, list) and all(map(_is_pad_input, inputs))
+    yield "pad_inputs", is_inputs, f"a list of [name, centre, spread], {expected}"
+    yield "pad_inputs", len({name for name, _, _ in inputs}) == len(inputs), "no name twice"
+    for key in ("takes_gains", "takes_poses"):
+        yield key, isinstance(values[key], bool), "true or false"
+    scale, most = values["traction_scale"], MOST["scale"]
+    is_scale = scale is None or _is_whole(scale, most)
+    yield "traction_scale", is_scale, f"a whole number from 1 to {most}, or null for a model without traction"
+    numbers = len(AXES) * taxels * (scale or 0) ** 2
+    yield "traction_scale", numbers <= MOST_PIXELS, f"tractions of at most {MOST_PIXELS} numbers"
+    least_mm = LEAST_UNIT if values["takes_poses"] else 0
+    reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
+    yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach
+
+
+def _is_whole(value: object, most: int) -> bool:
+    return type(value) is int and 1 <= value <= most
+
+
+def _is_from(least: float, value: object) -> bool:
+    return is_number(value) and value >= least
 
 
 def _is_pad_input(value: Any) -> bool:
