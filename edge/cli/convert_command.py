@@ -112,8 +112,7 @@ def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
 
 
 def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.npz_file import write_npz
-    from edge.sinks.recorded_rows import recorded_rows
+    from edge.sinks.npz_file import recorded_rows, write_npz
 
     recording = replay.recordings[0]
     origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
@@ -135,8 +134,8 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
+    from edge.pipeline.sink import RunFacts
     from edge.sinks.mcap import McapScans
-    from edge.sinks.run_facts import RunFacts
 
     recording = replay.recordings[0]
     kind = recording.origin or "replay"

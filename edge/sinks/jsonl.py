@@ -19,9 +19,8 @@ import orjson
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
-from edge.sinks.run_facts import NOW, RunFacts
 
 PIPE_BYTES: Final = 1 << 20
 """Most that Linux gives to any user: at least a quarter of a second of two sensors' patterns, usually the double."""

@@ -14,14 +14,13 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, record
 from edge.sinks.mcap_writer import McapFile
 from edge.sinks.ros2.cdr_messages import RESULT, frame_of, log_message, result_message, transforms, wrench
 from edge.sinks.ros2.map_messages import UNITS, image, in_si
 from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
 from edge.sinks.ros2.topic_names import sensor_path
-from edge.sinks.run_facts import NOW, RunFacts
 from edge.terminal.forced_end import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses.timed_pose import TimedPose

@@ -19,10 +19,9 @@ from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import RunFacts, Sink
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import CountersInTurn, event_record, record
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from sink_samples import RUN, make_results, make_sure_results
 
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
+from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import ALWAYS
 from edge.sinks.jsonl import JsonLinesSink, has_room, record_line
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.scans.scan import ABSENT, VendorReading
 
 

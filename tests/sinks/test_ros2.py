@@ -16,12 +16,12 @@ from edge_samples import make_contract, make_wrench_result
 
 from edge.perception.event import Event
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.pad_frame import PadFrame

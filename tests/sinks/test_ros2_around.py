@@ -22,11 +22,11 @@ from edge.cli.run_options import parser
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
+from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import check_sink, open_sink
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
 from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.base import Notice
 
 __all__ = ["sink"]

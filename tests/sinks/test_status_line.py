@@ -13,8 +13,7 @@ from sink_samples import RUN, Terminal, make_results
 from edge.perception.event import Event, Note
 from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
-from edge.sinks.event_printer import MessageSink
-from edge.sinks.status_line import StatusSink
+from edge.sinks.status_line import MessageSink, StatusSink
 
 
 @pytest.mark.parametrize(("stream", "start"), [(io.StringIO(), ""), (Terminal(), "\r\x1b[K")])

@@ -32,10 +32,10 @@ from zenoh_samples import (
 
 from edge.errors import SinkError
 from edge.perception.event import Event, Note
+from edge.pipeline.sink import RunFacts
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
 from edge.sinks.registry import open_sink
-from edge.sinks.run_facts import RunFacts
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.forced_end import EXIT_FORCED
 

@@ -12,13 +12,12 @@ import numpy as np
 import orjson
 from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
-from numpy.typing import NDArray
 
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import event_record
 from edge.sinks.ros2.cdr_messages import frame_of, transforms, wrench, wrench_message
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
@@ -37,7 +36,6 @@ from edge.sinks.ros2.ros_types import (
     header,
 )
 from edge.sinks.ros2.topic_names import base_topic, sensor_topic
-from edge.sinks.run_facts import NOW, RunFacts
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
@@ -213,7 +211,7 @@ class Ros2Sink(Sink):
         frame = sensor.frame
         for name, values in (("pattern", result.pattern), ("deviation", result.deviation)):
             if values is not None:
-                self._publish_to(sensor, name, IMAGE, partial(_map_image, name, values, frame, unix_ns))
+                self._publish_to(sensor, name, IMAGE, partial(image, in_si(name, values), frame, unix_ns))
                 sensor.shown[name] = values.shape
         if result.centroid_mm is not None:
             x, y = (place / 1e3 for place in result.centroid_mm)
@@ -285,10 +283,6 @@ class Ros2Sink(Sink):
         if self._of_now:
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
-
-
-def _map_image(name: str, values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    return image(in_si(name, values), frame, unix_ns)
 
 
 def _command(name: str, message: bytes) -> Command | None:
