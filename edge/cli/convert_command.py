@@ -147,15 +147,15 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
         for scan, poses in _scans(replay):
             baseline = recording.baselines.get(scan.sensor)
             age_s = None if baseline is None else scan.time_ns / 1e9 - baseline.created_unix_s
-            to.file.drain()
+            to.drain()
             to.add_poses(poses)
             frame = scan.sensor if kind == "device" else f"{kind}/{scan.sensor}"
             to.add_scan(scan, kind, frame, baseline, age_s)
-            to.file.look()
+            to.look()
     except BaseException:
-        to.file.abandon()
+        to.abandon()
         raise
-    to.file.close()
+    to.close()
 
 
 def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
