@@ -14,10 +14,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.errors import ModelError, WindowError
 from edge.inference.bound_run import BoundRun, Outputs
-from edge.inference.contract import (
-    ANY_BATCH,
-    Contract,
-)
+from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_guard import read_model
 from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import flush_denormals, within_limit

@@ -7,6 +7,7 @@ calling thread only waits, and gives up in time.
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -55,20 +56,17 @@ def within_limit(
     Raises:
         ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
     """
-    made: list[Made] = []
-    failed: list[BaseException] = []
-    done = threading.Event()
+    made = Future[Made]()
 
     def run() -> None:
         try:
-            made.append(work())
+            made.set_result(work())
         except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
-            failed.append(error)
-        done.set()
+            made.set_exception(error)
 
     threading.Thread(target=run, name=_THREAD, daemon=True).start()
     until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
-    while not done.wait(_POLL_S):
+    while not wait([made], _POLL_S).done:
         now_s = time.monotonic()
         if asked_s is None and stop is not None and stop.is_set():
             asked_s = now_s
@@ -78,9 +76,7 @@ def within_limit(
         if now_s > until_s:
             give_up()
             raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
-    if failed:
-        raise failed[0]
-    return made[0]
+    return made.result()
 
 
 def unfinished_load() -> bool:
