@@ -33,7 +33,6 @@ ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
-"""Most pixels of a pattern: a run allocates a small multiple of it."""
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
@@ -50,41 +49,13 @@ Shape = tuple[Any, ...]
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """Inputs, outputs and measured errors of a model.
+    """Inputs, outputs and measured errors of a model; "The contract in a model" of docs/formats.md has each key.
 
     Attributes:
-        version: version of the contract.
-        batch: windows in one run, or ANY_BATCH.
-        taps: K, the number of taps in the window.
-        scale: pattern pixels per taxel pitch.
-        tap_order: order of the taps in the window.
-        angle_step_deg: rotation between neighbouring taps, in [deg].
-        counts_per_unit: counts that make one unit of network input, for x, y, z.
-        output_unit: unit of the pattern.
-        output_full_scale: the pattern's declared full scale, in output_unit.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        sensor: name of the sensor model.
-        rows: taxel rows.
-        cols: taxel columns.
-        pitch_mm: taxel pitch, in [mm].
-        arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are always float32.
-        interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
-            None if the model gives no deviation.
-        confidence: number of taps -> table of the pattern's error by its deviations, see
-            edge.inference.expected_error; empty if the model gives no deviation.
-        training_sha256: of the training configuration.
-        test_set_sha256: of the frozen test set that `test_error` was measured on.
+        confidence: number of taps -> table as edge.inference.expected_error takes it.
         test_error: number of taps -> metric name -> value; empty if the test set has another scale.
-        pad_inputs: properties of the pad that the model takes, see `pad_row`: name in PAD_RANGES, centre and spread.
-        takes_gains: True if it takes windows with the taxels' gains divided out, and an input that states whether they
-            are.
-        traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
-        trust: forward model and checks as JSON, see edge.inference.trust; empty if the model has none.
-        interval_levels: percentage -> deviations that make half of the interval that holds so many of the pixels in
-            each of edge.inference.intervals.REGIONS; empty if they were not measured.
-        takes_poses: True if it takes 1 to K taps, the earlier ones in any order, each with its pose, see
-            edge.inference.pose_input; False if it takes K taps by the schedule of `angle_step_deg`.
-        reach_mm: distance from the newest tap beyond which it takes no tap, in [mm]; 0 if it takes no poses.
+        trust: as edge.inference.trust reads it; empty if the model has no checks.
+        interval_levels: percentage -> deviations for each of edge.inference.intervals.REGIONS; empty if not measured.
     """
 
     version: int
@@ -210,20 +181,12 @@ class Contract:
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Convert zeroed counts (taps, 3, rows, cols) to network input units, same shape.
-
-        Args:
-            deformation_counts: as they were read.
-            gains: (3, rows, cols) that they are divided by, if available and the model takes them.
-        """
+        """Convert zeroed counts (taps, 3, rows, cols), over gains (3, rows, cols), to network input units."""
         divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
         return deformation_counts / (divisor if gains is None else divisor * gains)
 
     def pad_row(self, pad: Pad | None) -> NDArray[np.float32]:
         """Return a pad as model input.
-
-        Args:
-            pad: its properties; None if unknown.
 
         Returns:
             (pad_width,) float32: for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that

@@ -18,11 +18,9 @@ if TYPE_CHECKING:
     import onnxruntime
 
 LOAD_LIMIT_S: Final = 60.0
-"""Longest load: a thousand times that of the bundled models, and enough for a network fifty times as large on a busy
-machine."""
+"""Longest load: a thousand times that of the bundled models."""
 STOP_S: Final = 0.5
-"""Time that each part of a load may still take after a stop was requested: any usual one is done by then, and two
-in a row before a program is ended by force."""
+"""Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
 _POLL_S: Final = 0.1
 _THREAD: Final = "edge: loading a model"
 _IDENTITY: Final = (
@@ -89,11 +87,7 @@ def unfinished_load() -> bool:
 
 @cache
 def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> None:
-    """Build a session on this thread, so that onnxruntime makes denormals zero on it, which it does once in a process.
-
-    Args:
-        options_of: returns options with that setting.
-    """
+    """Build a session here: onnxruntime makes denormals zero once in a process, on the thread of the first session."""
     import onnxruntime  # here, so that the command line can call `unfinished_load` without it
 
     onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])
