@@ -147,12 +147,10 @@ def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator
 
 
 class _Topic(NamedTuple):
-    """Topic: the part of its name that stands for a sensor, the rest, its type, and a map's factor to its unit."""
-
     sensor: str
     name: str
     kind: MessageType
-    factor: float
+    factor: float  # of a map to its unit
 
 
 class _Rows:

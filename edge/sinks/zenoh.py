@@ -128,15 +128,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
 
 
 def open_session(target: str) -> "tuple[str, zenoh.Session]":
-    """Return the key of a target, and an open session.
-
-    Args:
-        target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
-
-    Raises:
-        UsageError: the target has another form.
-        SinkError: zenoh is not installed, or the session cannot be opened.
-    """
+    """Return the key of a target, and an open session; a SinkError where zenoh is missing, or cannot be opened."""
     key, configuration = understood(target)
     try:
         import zenoh

@@ -24,8 +24,6 @@ from edge.sinks.ros2 import cdr_messages, map_messages, ros_types
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
-from firmware_bridge.recording.scan_messages import decode_scan, encode_scan
-from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 __all__ = ["sink"]
@@ -75,58 +73,13 @@ def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
     assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
 
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    sec: types.int32
-    nanosec: types.uint32
-
-
-@dataclass
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class Scan(IdlStruct, typename="Scan"):
-    header: Header
-    sensor: str
-    number: types.int64
-    time_ns: types.int64
-    device_time_ns: types.int64
-    fresh: types.uint64
-    renewed: types.uint64
-    counts: types.array[types.int32, 48]
-    vendor_newtons: types.sequence[types.float32]
-    vendor_temperature_k: types.sequence[types.float32]
-    vendor_ups_hz: types.sequence[types.float32]
-
-
 UNIX_NS = 1_700_000_000_123_456_789
-STAMP = Time(1_700_000_000, 123_456_789)
 
 
 def test_another_image_is_not_taken_for_a_map():
     said = ros_types.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
         map_messages.image_map(ros_types.IMAGE.encode({**said, "encoding": "mono8"}))
-
-
-@pytest.mark.parametrize("number", range(4))
-def test_a_scan_is_what_cyclonedds_writes_and_comes_back_as_it_was(number):
-    for scan in odd_scans(4)[2 * number : 2 * number + 2]:
-        fresh, renewed = (sum(1 << i for i, one in enumerate(m.ravel()) if one) for m in (scan.fresh, scan.renewed))
-        data = encode_scan(scan, scan.sensor, UNIX_NS, fresh, renewed)
-        vendor = scan.vendor or VendorReading()
-        lists = [[] if a is None else a.ravel().tolist() for a in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)]
-        device_ns = -1 if scan.device_ns is None else scan.device_ns
-        expected = Scan(
-            Header(STAMP, scan.sensor), scan.sensor, scan.number, scan.time_ns, device_ns, fresh, renewed,
-            scan.counts.ravel().tolist(), *lists,
-        )  # fmt: skip
-        assert data == bytes(expected.serialize())
-        got = decode_scan(data)
-        assert (got.counts == scan.counts).all() and (got.fresh, got.renewed) == (fresh, renewed)
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():

@@ -55,20 +55,14 @@ NUMBERS: Final[Mapping[str, Callable[[Result], float | None]]] = {
 
 @dataclass(slots=True)
 class _Sensor:
-    """Writers of one sensor, and what they published last.
-
-    Attributes:
-        shown: maps whose last message still holds, by topic, with their shapes.
-        forced: the last wrench was of a pattern.
-        trouble: what the link has reported and not withdrawn, by the kind of event.
-    """
+    """Writers of one sensor, by what they publish, and what was published last."""
 
     frame: str
     last: Result
     writers: dict[str, DataWriter[Any]] = field(default_factory=dict)
-    shown: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    forced: bool = False
-    trouble: dict[str, str] = field(default_factory=dict)
+    shown: dict[str, tuple[int, ...]] = field(default_factory=dict)  # shapes of maps whose last message still holds
+    forced: bool = False  # the last wrench was of a pattern
+    trouble: dict[str, str] = field(default_factory=dict)  # of the link, not withdrawn, by the kind of event
 
 
 class Ros2Sink(Sink):
@@ -87,14 +81,9 @@ class Ros2Sink(Sink):
         clock_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Join the domain.
+        """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
 
-        Args:
-            topic: first part of all topics except those of the diagnostics and the frames.
-            environment: ROS_DOMAIN_ID and others are read from it.
-            run: with commands only where they are to be taken.
-            clock_ns: the clock of the scans that are of now, in [ns].
-            unix_ns: wall time, in [ns]; read once, because the clock may be set during the run.
+        `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
         self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
         self._of_now = run.unix_offset_ns is None
