@@ -43,11 +43,10 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import load_model, open_runtime
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import RunFacts, Sink
 from edge.pipeline.source_setup import links_to, settled, with_recorded
 from edge.sinks import registry as forms
 from edge.sinks.fan_out import Fan
-from edge.sinks.run_facts import RunFacts
 from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,

@@ -111,8 +111,7 @@ def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
 
 
 def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.npz_file import write_npz
-    from edge.sinks.recorded_rows import recorded_rows
+    from edge.sinks.npz_file import recorded_rows, write_npz
 
     recording = replay.recordings[0]
     origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
@@ -130,8 +129,8 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
+    from edge.pipeline.sink import RunFacts
     from edge.sinks.mcap import McapScans
-    from edge.sinks.run_facts import RunFacts
 
     recording = replay.recordings[0]
     kind = recording.origin or "replay"
@@ -143,15 +142,15 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
         for scan, poses in _scans(replay):
             baseline = recording.baselines.get(scan.sensor)
             age_s = None if baseline is None else scan.time_ns / 1e9 - baseline.created_unix_s
-            to.file.drain()
+            to.drain()
             to.add_poses(poses)
             frame = scan.sensor if kind == "device" else f"{kind}/{scan.sensor}"
             to.add_scan(scan, kind, frame, baseline, age_s)
-            to.file.look()
+            to.look()
     except BaseException:
-        to.file.abandon()
+        to.abandon()
         raise
-    to.file.close()
+    to.close()
 
 
 def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:

@@ -36,7 +36,7 @@ from edge.api import (
 )
 from edge.cli.run_options import runtime_options
 from edge.cli.user_commands import user_commands
-from edge.sinks.event_printer import MessageSink
+from edge.sinks.status_line import MessageSink
 from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
 

@@ -23,14 +23,10 @@ Outputs = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.floa
 
 
 class BoundRun:
-    """Arrays for so many windows of so many taps, bound to a session.
+    """Arrays for so many windows of so many taps, bound to a session; poses and pad are None where it takes none.
 
     Attributes:
         bindings: one for each call that a run needs.
-        window: input.
-        poses: input; None for a model without poses.
-        pad: input; None for a model without it.
-        outputs: read-only.
     """
 
     def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int, taps: int) -> None:

@@ -11,10 +11,8 @@ TAXELS: Final = BUNDLE_DIR / "taxels.npz"
 CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
 """File of the distribution of contacts by which a running sensor learns its gains."""
 DEFAULT_MODEL: Final = "stsr-int8"
-"""Model that assumes nothing: a model of several taps is wrong, and looks right, if the earlier taps were of another
-object or the pad was not turned."""
+"""Model that assumes nothing of earlier taps."""
 INT8_SUFFIX: Final = "-int8"
-"""Suffix of the file name of an int8 model, next to that of the same network in float32."""
 POSED_MODEL: Final = "mtsr7-int8"
 """Default where poses of the pad come: it combines up to 7 taps, and gives for one alone what DEFAULT_MODEL gives."""
 

@@ -1,7 +1,7 @@
 """Contract between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, Final
@@ -33,7 +33,6 @@ ARITHMETICS: Final = ("float32", "int8")
 KEY_PREFIX: Final = "tactile."
 MOST: Final = MappingProxyType({"batch": 1024, "taps": 64, "scale": 256, "rows": 64, "cols": 64})
 MOST_PIXELS: Final = 1 << 20
-"""Most pixels of a pattern: a run allocates a small multiple of it."""
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
@@ -50,41 +49,13 @@ Shape = tuple[Any, ...]
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """Inputs, outputs and measured errors of a model.
+    """Inputs, outputs and measured errors of a model; "The contract in a model" of docs/formats.md has each key.
 
     Attributes:
-        version: version of the contract.
-        batch: windows in one run, or ANY_BATCH.
-        taps: K, the number of taps in the window.
-        scale: pattern pixels per taxel pitch.
-        tap_order: order of the taps in the window.
-        angle_step_deg: rotation between neighbouring taps, in [deg].
-        counts_per_unit: counts that make one unit of network input, for x, y, z.
-        output_unit: unit of the pattern.
-        output_full_scale: the pattern's declared full scale, in output_unit.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        sensor: name of the sensor model.
-        rows: taxel rows.
-        cols: taxel columns.
-        pitch_mm: taxel pitch, in [mm].
-        arithmetic: one of ARITHMETICS, of the layers that take most of the time; window and outputs are always float32.
-        interval_factor: deviations that make half of the interval that holds 90 % of the pixels of taps not trained on;
-            None if the model gives no deviation.
-        confidence: number of taps -> table of the pattern's error by its deviations, see
-            edge.inference.expected_error; empty if the model gives no deviation.
-        training_sha256: of the training configuration.
-        test_set_sha256: of the frozen test set that `test_error` was measured on.
+        confidence: number of taps -> table as edge.inference.expected_error takes it.
         test_error: number of taps -> metric name -> value; empty if the test set has another scale.
-        pad_inputs: properties of the pad that the model takes, see `pad_row`: name in PAD_RANGES, centre and spread.
-        takes_gains: True if it takes windows with the taxels' gains divided out, and an input that states whether they
-            are.
-        traction_scale: traction pixels per taxel pitch; None if the model gives no traction.
-        trust: forward model and checks as JSON, see edge.inference.trust; empty if the model has none.
-        interval_levels: percentage -> deviations that make half of the interval that holds so many of the pixels in
-            each of edge.inference.intervals.REGIONS; empty if they were not measured.
-        takes_poses: True if it takes 1 to K taps, the earlier ones in any order, each with its pose, see
-            edge.inference.pose_input; False if it takes K taps by the schedule of `angle_step_deg`.
-        reach_mm: distance from the newest tap beyond which it takes no tap, in [mm]; 0 if it takes no poses.
+        trust: as edge.inference.trust reads it; empty if the model has no checks.
+        interval_levels: percentage -> deviations for each of edge.inference.intervals.REGIONS; empty if not measured.
     """
 
     version: int
@@ -210,20 +181,12 @@ class Contract:
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Convert zeroed counts (taps, 3, rows, cols) to network input units, same shape.
-
-        Args:
-            deformation_counts: as they were read.
-            gains: (3, rows, cols) that they are divided by, if available and the model takes them.
-        """
+        """Convert zeroed counts (taps, 3, rows, cols), over gains (3, rows, cols), to network input units."""
         divisor = np.asarray(self.counts_per_unit, dtype=np.float32)[None, :, None, None]
         return deformation_counts / (divisor if gains is None else divisor * gains)
 
     def pad_row(self, pad: Pad | None) -> NDArray[np.float32]:
         """Return a pad as model input.
-
-        Args:
-            pad: its properties; None if unknown.
 
         Returns:
             (pad_width,) float32: for each of `pad_inputs` (value - centre) / spread, 0 if unknown; then 1 for each that
@@ -273,53 +236,11 @@ def _shown(value: object) -> str:
 
 
 def _check(values: Mapping[str, Any]) -> None:
-    def refuse(key: str, expected: str) -> None:
-        raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
-
-    for key, most in MOST.items():
-        any_batch = key == "batch" and values[key] == ANY_BATCH
-        if not any_batch and (type(values[key]) is not int or not 1 <= values[key] <= most):
-            refuse(key, f"a whole number from 1 to {most}")
-    if values["rows"] * values["cols"] * values["scale"] ** 2 > MOST_PIXELS:
-        refuse("scale", f"patterns of at most {MOST_PIXELS} pixels")
-    if values["tap_order"] != TAP_ORDER:
-        refuse("tap_order", repr(TAP_ORDER))
-    if values["arithmetic"] not in ARITHMETICS:
-        refuse("arithmetic", " or ".join(map(repr, ARITHMETICS)))
-    for key in ("output_full_scale", "pitch_mm", "contact_level"):
-        if not is_number(values[key]) or values[key] < LEAST_UNIT:
-            refuse(key, f"a positive number from {LEAST_UNIT:g}")
-    if values["contact_level"] >= 1:
-        refuse("contact_level", "a number below 1")
-    if not is_number(values["angle_step_deg"]):
-        refuse("angle_step_deg", "a number")
-    factor = values["interval_factor"]
-    if factor is not None and not (is_number(factor) and factor > 0):
-        refuse("interval_factor", "a positive number, or null for a model without deviations")
-    if not is_confidence(values["confidence"], values["taps"]):
-        refuse(
-            "confidence", "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
-        )
-    if not is_interval_levels(values["interval_levels"]):
-        refuse("interval_levels", "for each percentage a positive number for every region")
-    scaling = values["counts_per_unit"]
-    if not isinstance(scaling, list) or len(scaling) != 3 or not all(is_number(v) and v >= LEAST_UNIT for v in scaling):
-        refuse("counts_per_unit", f"three positive numbers from {LEAST_UNIT:g}, for x, y, z")
-    for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
-        text = values[key]
-        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= LONGEST_SHOWN:
-            refuse(key, f"a printable text of 1 to {LONGEST_SHOWN} characters")
-    error = values["test_error"]
-    if not isinstance(error, dict) or not all(isinstance(v, dict) for v in error.values()):
-        refuse("test_error", "a map from taps to metrics")
-    _check_pad_and_traction(values, refuse)
-    takes_poses, reach_mm = values["takes_poses"], values["reach_mm"]
-    if not isinstance(takes_poses, bool):
-        refuse("takes_poses", "true or false")
-    if not is_number(reach_mm) or reach_mm < (LEAST_UNIT if takes_poses else 0):
-        refuse("reach_mm", f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0")
+    for key, is_kept, expected in _rules(values):
+        if not is_kept:
+            raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
     try:
-        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=takes_poses)
+        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=values["takes_poses"])
         readings = len(AXES) * values["rows"] * values["cols"]
         if trust is not None and trust.forward.operator.shape[1] != readings:
             raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
@@ -329,20 +250,59 @@ def _check(values: Mapping[str, Any]) -> None:
         raise ModelError(f"contract key 'trust' is damaged ({error}): export the model again") from error
 
 
-def _check_pad_and_traction(values: Mapping[str, Any], refuse: Callable[[str, str], None]) -> None:
+def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
+    """Yield a key, whether its value is lawful, and the expected value; a rule may rely on those before it."""
+    for key, most in MOST.items():
+        any_batch = key == "batch" and values[key] == ANY_BATCH
+        yield key, any_batch or _is_whole(values[key], most), f"a whole number from 1 to {most}"
+    taxels = values["rows"] * values["cols"]
+    yield "scale", taxels * values["scale"] ** 2 <= MOST_PIXELS, f"patterns of at most {MOST_PIXELS} pixels"
+    yield "tap_order", values["tap_order"] == TAP_ORDER, repr(TAP_ORDER)
+    yield "arithmetic", values["arithmetic"] in ARITHMETICS, " or ".join(map(repr, ARITHMETICS))
+    for key in ("output_full_scale", "pitch_mm", "contact_level"):
+        yield key, _is_from(LEAST_UNIT, values[key]), f"a positive number from {LEAST_UNIT:g}"
+    yield "contact_level", values["contact_level"] < 1, "a number below 1"
+    yield "angle_step_deg", is_number(values["angle_step_deg"]), "a number"
+    factor = values["interval_factor"]
+    is_factor = factor is None or (is_number(factor) and factor > 0)
+    yield "interval_factor", is_factor, "a positive number, or null for a model without deviations"
+    tables = "for each number of taps `doubt`, `error` and `gain`, lists of equal length, `doubt` rising"
+    yield "confidence", is_confidence(values["confidence"], values["taps"]), tables
+    is_levels = is_interval_levels(values["interval_levels"])
+    yield "interval_levels", is_levels, "for each percentage a positive number for every region"
+    scaling = values["counts_per_unit"]
+    is_scaling = isinstance(scaling, list) and len(scaling) == 3 and all(_is_from(LEAST_UNIT, one) for one in scaling)
+    yield "counts_per_unit", is_scaling, f"three positive numbers from {LEAST_UNIT:g}, for x, y, z"
+    for key in ("output_unit", "sensor", "training_sha256", "test_set_sha256"):
+        text = values[key]
+        is_text = isinstance(text, str) and text.isprintable() and 0 < len(text) <= LONGEST_SHOWN
+        yield key, is_text, f"a printable text of 1 to {LONGEST_SHOWN} characters"
+    error = values["test_error"]
+    is_error = isinstance(error, dict) and all(isinstance(metrics, dict) for metrics in error.values())
+    yield "test_error", is_error, "a map from taps to metrics"
     inputs = values["pad_inputs"]
-    if not isinstance(inputs, list) or not all(map(_is_pad_input, inputs)):
-        expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
-        refuse("pad_inputs", f"a list of [name, centre, spread], {expected}")
-    if len({name for name, _, _ in inputs}) < len(inputs):
-        refuse("pad_inputs", "no name twice")
-    if not isinstance(values["takes_gains"], bool):
-        refuse("takes_gains", "true or false")
-    scale = values["traction_scale"]
-    if scale is not None and (type(scale) is not int or not 1 <= scale <= MOST["scale"]):
-        refuse("traction_scale", f"a whole number from 1 to {MOST['scale']}, or null for a model without traction")
-    if scale is not None and len(AXES) * values["rows"] * values["cols"] * scale**2 > MOST_PIXELS:
-        refuse("traction_scale", f"tractions of at most {MOST_PIXELS} numbers")
+    expected = f"centre as a pad may have it, spread from {LEAST_UNIT:g}, names of: {', '.join(PAD_RANGES)}"
+    is_inputs = isinstance(inputs, list) and all(map(_is_pad_input, inputs))
+    yield "pad_inputs", is_inputs, f"a list of [name, centre, spread], {expected}"
+    yield "pad_inputs", len({name for name, _, _ in inputs}) == len(inputs), "no name twice"
+    for key in ("takes_gains", "takes_poses"):
+        yield key, isinstance(values[key], bool), "true or false"
+    scale, most = values["traction_scale"], MOST["scale"]
+    is_scale = scale is None or _is_whole(scale, most)
+    yield "traction_scale", is_scale, f"a whole number from 1 to {most}, or null for a model without traction"
+    numbers = len(AXES) * taxels * (scale or 0) ** 2
+    yield "traction_scale", numbers <= MOST_PIXELS, f"tractions of at most {MOST_PIXELS} numbers"
+    least_mm = LEAST_UNIT if values["takes_poses"] else 0
+    reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
+    yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach
+
+
+def _is_whole(value: object, most: int) -> bool:
+    return type(value) is int and 1 <= value <= most
+
+
+def _is_from(least: float, value: object) -> bool:
+    return is_number(value) and value >= least
 
 
 def _is_pad_input(value: Any) -> bool:

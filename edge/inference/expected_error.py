@@ -50,19 +50,11 @@ def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple
 def expect(table: Table, taps: int, pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> Expected | None:
     """Return the expected error of a pattern (H, W) made from so many taps; None if the table has none.
 
-    A pattern of zeros has none either.
+    Between two doubts it is interpolated; beyond the last the error grows with the doubt. A pattern of zeros has none.
     """
     about, size = doubt(pattern, deviation)
-    return expect_of(table, taps, about, size) if size > 0 else None
-
-
-def expect_of(table: Table, taps: int, about: float, size: float) -> Expected | None:
-    """Return the expected error of a pattern of that doubt and RMS; None if the table has none for so many taps.
-
-    Between two doubts it is interpolated; beyond the last the error grows with the doubt.
-    """
     row = table.get(str(taps))
-    if row is None:
+    if row is None or size == 0:
         return None
     levels = row["doubt"]
     error = float(np.interp(about, levels, row["error"])) * max(1.0, about / levels[-1])

@@ -22,12 +22,9 @@ def near_pixels(scale: int, pitch_mm: float) -> int:
 
 
 def regions(patterns: NDArray[np.floating], contact_level: float, near: int) -> NDArray[np.int8]:
-    """Return each pixel's region as an index of REGIONS, (n, H, W).
+    """Return each pixel's region as an index of REGIONS, (n, H, W), of patterns (n, H, W).
 
-    Args:
-        patterns: (n, H, W).
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        near: pixels outside the contact that are near it, see `near_pixels`.
+    A pixel from `contact_level` of its pattern's maximum is touched; `near` pixels from the contact are near it.
     """
     touched = patterns > np.float32(contact_level) * patterns.max(axis=(1, 2), keepdims=True)
     inside, edge = ~_grown(~touched, 1), _grown(touched, 1)
@@ -40,13 +37,9 @@ def half_widths_mm(
     deviations: NDArray[np.floating],
     region: NDArray[np.integer],
 ) -> NDArray[np.floating]:
-    """Return half widths of the intervals that hold so many percent of the pixels in each region, (n, H, W) in [mm].
+    """Return half widths (n, H, W) in [mm] of the intervals that hold so many percent of the pixels in each region.
 
-    Args:
-        levels: the contract's `interval_levels`.
-        percent: one of its keys.
-        deviations: (n, H, W) in [mm].
-        region: (n, H, W), see `regions`.
+    `levels` are the contract's `interval_levels`, of which `percent` is a key; deviations are (n, H, W) in [mm].
     """
     return deviations * np.asarray(levels[percent], dtype=np.float32)[region]
 

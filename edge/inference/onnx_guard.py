@@ -1,12 +1,8 @@
 """Check of a model file before onnxruntime reads it: one plain graph with its own weights, of bounded size.
 
-onnxruntime follows a tensor into a side file below the model's folder, which none of our models has, and a graph into
-graphs within it, which may run for ever. Only the two branches of an If may be such graphs, and they hold none
-themselves: one of the two is run once. The walk below covers the fields that lead to them and to the operators, of
-which only those of plain networks are allowed. It skips all else, weights among it, and refuses what it does not
-understand, since onnxruntime might read what passed unchecked.
-
-Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever: only the two
+branches of an If may be such. The walk covers the fields that lead to them and to the operators, skips all else, and
+refuses what it does not understand. Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,13 +14,12 @@ from edge.errors import ModelError
 from firmware_bridge.bounded_read import read_bounded
 
 MOST_BYTES: Final = 1 << 28
-"""Largest file: a hundred times the largest bundled model, ten times the paper's network."""
+"""Largest file: a hundred times the largest bundled model."""
 MOST_FIELDS: Final = 1 << 20
-"""Most fields, some seconds of walking; the bundled models have a thousand and a half."""
+"""Most fields, some seconds of walking."""
 MOST_NODES: Final = 5000
-"""Most operators, thirty times those of the largest bundled model; onnxruntime goes over all of them repeatedly."""
+"""Most operators; onnxruntime goes over all of them repeatedly."""
 MOST_DIMS: Final = 64
-"""Most dimensions of weights: the product of a million takes hours."""
 _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
@@ -36,10 +31,8 @@ Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze
 Where
 """
 OPERATORS: Final = frozenset(_NAMES.split())
-"""Operators that are allowed: of the exported models, of the networks that they are compared with, and of similar ones.
-No loop, no recurrence, nothing random, no text. docs/formats.md lists them too."""
+"""Operators that are allowed, as docs/formats.md lists them: no loop, no recurrence, nothing random, no text."""
 ONNX_DOMAINS: Final = ("", "ai.onnx")
-"""Both names of the standard operators; other domains belong to a vendor or to the file itself."""
 _LONGEST_NAME: Final = 40
 _HIGHEST_TAG: Final = (1 << 32) - 1
 _TAG_BYTES: Final = 5

@@ -14,25 +14,19 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.errors import ModelError, WindowError
 from edge.inference.bound_run import BoundRun, Outputs
-from edge.inference.contract import (
-    ANY_BATCH,
-    Contract,
-)
+from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_guard import read_model
 from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import flush_denormals, within_limit
 from firmware_bridge.errors import harmless
 
 WARM_UP_RUNS: Final = 10
-"""Runs before run times stay: the first takes 3 to 10 times as long as the tenth."""
 MOST_RUNS: Final = 32
 """Numbers of windows and of taps for which arrays are kept: four sensors with seven taps have 28."""
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
-"""Most characters of a message of onnxruntime, which may quote a whole graph."""
 NOT_WHILE_LOADING: Final = ["ConstantFolding"]
-"""Optimisers that are off while loading: folding of constants, which a stranger's file can make last hours, and which
-no flag ends. A run can be ended; the bundled models have no such work, and give the same to the bit."""
+"""Optimisers that are off while loading: a stranger's file can make the folding of constants last hours."""
 _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
@@ -65,11 +59,9 @@ class ModelSession:
     Attributes:
         name: of the model.
         contract: of the model.
-        deviation: standard deviation of each pixel of the last run's pattern, in its unit, or None where the model has
-            none. (H, W) float32 above zero, or (n, H, W) after n windows were run together: the session's own array,
-            read-only, and overwritten by the next run.
-        traction: on the pad in the last run, in [kPa], or None where the model gives none. (3, h, w) float32, or
-            (n, 3, h, w) after n windows were run together: as `deviation`, the session's own array.
+        deviation: of each pixel of the last run, (H, W) float32 above zero, or (n, H, W) after n windows were run
+            together; None without. Read-only, and overwritten by the next run.
+        traction: of the last run, (3, h, w) or (n, 3, h, w) float32 in [kPa], as `deviation`.
     """
 
     def __init__(self, path: Path, threads: int = 1, stop: threading.Event | None = None) -> None:
@@ -81,9 +73,8 @@ class ModelSession:
             stop: event that ends the loading early.
 
         Raises:
-            ModelError: the file is missing or not a model, has weights in a side file, an operator that is not allowed
-                or no contract, or a graph that does not keep the contract (the message names the key or tensor); or
-                loading takes too long.
+            ModelError: the file is no model that is allowed, its graph does not keep its contract, or loading takes
+                too long.
         """
         self._path = path
         self.name = harmless(path.stem, kept="")
@@ -153,18 +144,10 @@ class ModelSession:
         pads: Sequence[NDArray[np.float32]] | None = None,
         poses: Sequence[NDArray[np.float32]] | None = None,
     ) -> NDArray[np.float32]:
-        """Infer the patterns of several windows in one call; see `run`.
+        """Infer the patterns (n, H, W) of several windows, of different sensors, in one call; see `run`.
 
         A graph of one window a run is called once for each. With poses, windows may have different numbers of taps;
         those of a single tap are a call of their own, because a model may have a graph of its own for them.
-
-        Args:
-            windows: one or more, of different sensors.
-            pads: rows of the same sensors; by default those of unknown pads.
-            poses: of the taps of each window, for a model that takes poses.
-
-        Returns:
-            (n, H, W).
         """
         for window in windows:
             self._check_window(window)

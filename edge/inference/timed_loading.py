@@ -7,6 +7,7 @@ calling thread only waits, and gives up in time.
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -17,11 +18,9 @@ if TYPE_CHECKING:
     import onnxruntime
 
 LOAD_LIMIT_S: Final = 60.0
-"""Longest load: a thousand times that of the bundled models, and enough for a network fifty times as large on a busy
-machine."""
+"""Longest load: a thousand times that of the bundled models."""
 STOP_S: Final = 0.5
-"""Time that each part of a load may still take after a stop was requested: any usual one is done by then, and two
-in a row before a program is ended by force."""
+"""Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
 _POLL_S: Final = 0.1
 _THREAD: Final = "edge: loading a model"
 _IDENTITY: Final = (
@@ -55,20 +54,17 @@ def within_limit(
     Raises:
         ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
     """
-    made: list[Made] = []
-    failed: list[BaseException] = []
-    done = threading.Event()
+    made = Future[Made]()
 
     def run() -> None:
         try:
-            made.append(work())
+            made.set_result(work())
         except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
-            failed.append(error)
-        done.set()
+            made.set_exception(error)
 
     threading.Thread(target=run, name=_THREAD, daemon=True).start()
     until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
-    while not done.wait(_POLL_S):
+    while not wait([made], _POLL_S).done:
         now_s = time.monotonic()
         if asked_s is None and stop is not None and stop.is_set():
             asked_s = now_s
@@ -78,9 +74,7 @@ def within_limit(
         if now_s > until_s:
             give_up()
             raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
-    if failed:
-        raise failed[0]
-    return made[0]
+    return made.result()
 
 
 def unfinished_load() -> bool:
@@ -93,11 +87,7 @@ def unfinished_load() -> bool:
 
 @cache
 def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> None:
-    """Build a session on this thread, so that onnxruntime makes denormals zero on it, which it does once in a process.
-
-    Args:
-        options_of: returns options with that setting.
-    """
+    """Build a session here: onnxruntime makes denormals zero once in a process, on the thread of the first session."""
     import onnxruntime  # here, so that the command line can call `unfinished_load` without it
 
     onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])

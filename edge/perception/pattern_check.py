@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
 from edge.inference.expected_error import doubt
-from edge.inference.familiarity import contact_features, pose_tap_features, tap_features
-from edge.inference.trust import Trust
+from edge.inference.trust import Trust, contact_features, pose_tap_features, tap_features
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]

@@ -26,13 +26,13 @@ def write_csv(
     *,
     emulated: bool,
 ) -> None:
-    """Write the scans of a sensor that have all readings: a CSV has no cell for an absent one.
+    """Write the scans of a sensor that have all readings, since a CSV has no cell for an absent one.
 
     Args:
         path: of the file.
-        track: scans of the sensor, each taxel in its place.
+        track: scans of the sensor, each taxel in its place; written in the order of the id map, by the mounting.
         times_ns: (n,) times of the scans since the first one, in [ns].
-        mounting: of the sensor: a CSV holds the taxels in the order of the id map.
+        mounting: of the sensor.
         poses: of the pad, on the same clock, in the order of the scans that they served first.
         emulated: the sensor is emulated.
     """

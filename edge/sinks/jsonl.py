@@ -19,12 +19,11 @@ import orjson
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
-from edge.sinks.run_facts import NOW, RunFacts
 
 PIPE_BYTES: Final = 1 << 20
-"""Most that Linux gives to any user: at least a quarter of a second of two sensors' patterns, usually the double."""
+"""Most that Linux gives to any user."""
 _PAGE_BYTES: Final = 4096
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _ALL: Final = RecordForm(maps=True)
@@ -40,12 +39,7 @@ class JsonLinesSink(Sink):
     """
 
     def __init__(self, target: str, run: RunFacts = NOW) -> None:
-        """Open the target; a file that exists is replaced.
-
-        Raises:
-            UsageError: a record has no such field.
-            SinkError: the target cannot be opened.
-        """
+        """Open the target; a file that exists is replaced."""
         self._target = "stdout" if target == "-" else target
         self._run = run
         self._form = _ALL if run.fields is None else RecordForm(chosen_fields(run.fields), maps=True)

@@ -14,14 +14,13 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, record
 from edge.sinks.mcap_writer import McapFile
 from edge.sinks.ros2.cdr_messages import RESULT, frame_of, log_message, result_message, transforms, wrench
 from edge.sinks.ros2.map_messages import UNITS, image, in_si
 from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
 from edge.sinks.ros2.topic_names import sensor_path
-from edge.sinks.run_facts import NOW, RunFacts
 from edge.terminal.stop_signals import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -46,13 +45,10 @@ REPEAT_NS: Final = NS_PER_S
 """Time from which on a sensor's facts and baseline are repeated, in [ns]: a part of a file has them, too."""
 
 
-class McapScans:
+class McapScans(McapFile):
     """Writer of scans and poses, and what they mean, into a new file; `add` puts other messages next to them.
 
-    Its methods raise an OSError where an earlier record cannot be written.
-
     Attributes:
-        file: the file, on the disk as a whole up to the last second.
         offset_ns: added to a time of the scans gives [ns] since 1970.
     """
 
@@ -96,15 +92,15 @@ class McapScans:
         with suppress(PackageNotFoundError):
             release = version("tactile-edge-sr")
         try:
-            self.file = McapFile(path, "ros2", f"tactile-edge-sr {release}", clock_s)
+            super().__init__(path, "ros2", f"tactile-edge-sr {release}", clock_s)
             try:
                 for name, fields in (facts or {}).items():
-                    self.file.add_metadata(name, fields)
-                self.file.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
+                    self.add_metadata(name, fields)
+                self.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
                 for fields in self._mountings.values():
-                    self.file.add_metadata(MOUNTING_METADATA, fields)
+                    self.add_metadata(MOUNTING_METADATA, fields)
             except BaseException:  # Ctrl-C, too: nothing else would end a thread that has just been started
-                self.file.abandon()
+                self.abandon()
                 raise
         except FileExistsError as error:
             raise SinkError(f"{path} exists: give another name, or delete it first") from error
@@ -114,24 +110,16 @@ class McapScans:
     @property
     def scans(self) -> int:
         """Number of scans on the disk so far, of all sensors."""
-        return sum(self.file.written.get(number, 0) for (_, name), number in self._channels.items() if name == "scan")
+        return sum(self.written.get(number, 0) for (_, name), number in self._channels.items() if name == "scan")
 
     def add_scan(
         self, scan: Scan, kind: SourceKind, frame: str, baseline: Baseline | None, baseline_age_s: float | None
     ) -> None:
-        """Add one scan; what it means, and a new baseline, come first.
-
-        Args:
-            scan: the scan.
-            kind: of the source that it comes from.
-            frame: frame_id of its message.
-            baseline: that is subtracted from it; None without.
-            baseline_age_s: None where that is unknown.
-        """
+        """Add one scan of a kind of source with its frame_id; what it means, and a new baseline, come first."""
         sensor, unix_ns = scan.sensor, scan.time_ns + self.offset_ns
         source = {"kind": kind}
         if not self._source_told:
-            self.file.add_metadata(SOURCE_METADATA, source)
+            self.add_metadata(SOURCE_METADATA, source)
             self._source_told = True
         repeat = unix_ns >= self._repeat_ns.get(sensor, 0)
         if repeat:
@@ -162,12 +150,12 @@ class McapScans:
         channel = self._channels.get((sensor, name))
         if channel is None:
             if kind.name not in self._schemas:
-                self._schemas[kind.name] = self.file.add_schema(kind.name, "ros2msg", kind.definition)
+                self._schemas[kind.name] = self.add_schema(kind.name, "ros2msg", kind.definition)
             topic = f"/{sensor_path(sensor)}/{name}" if sensor else name
             about = {"sensor": sensor} | ({"unit": UNITS[name].name} if name in UNITS else {})
-            channel = self.file.add_channel(topic, "cdr", self._schemas[kind.name], about)
+            channel = self.add_channel(topic, "cdr", self._schemas[kind.name], about)
             self._channels[sensor, name] = channel
-        self.file.add_message(channel, unix_ns, data)
+        self.add_message(channel, unix_ns, data)
 
 
 class McapSink(Sink):
@@ -185,25 +173,24 @@ class McapSink(Sink):
         self.unwritten = 0
         self._failed = False
         facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
-        self._to = McapScans(path, run, facts, clock_s)
-        self._file = self._to.file
+        self._file = McapScans(path, run, facts, clock_s)
 
     @property
     def scans(self) -> int:
         """Number of scans on the disk so far, of all sensors."""
-        return self._to.scans
+        return self._file.scans
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Add the messages of one scan."""
-        self._try_if_room(self._add_result, result, counters)
+        self._try(self._act_if_room, self._add_result, result, counters)
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
         """Add poses."""
-        self._try_if_room(self._to.add_poses, poses)
+        self._try(self._act_if_room, self._file.add_poses, poses)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Add an event."""
-        self._try_if_room(self._add_events, (event,))
+        self._try(self._act_if_room, self._add_events, (event,))
 
     def wait(self) -> None:
         """Pass on the open chunk when it is due, while no scan comes."""
@@ -220,7 +207,7 @@ class McapSink(Sink):
             self._path.unlink(missing_ok=True)
 
     def _add_result(self, result: Result, counters: Mapping[str, int]) -> None:
-        scan, to = result.scan, self._to
+        scan, to = result.scan, self._file
         sensor, unix_ns, frame = scan.sensor, scan.time_ns + to.offset_ns, frame_of(result)
         on_bus_unix_ns = scan.on_bus_ns + to.offset_ns
         fields = record(result, self._turns.of(result, counters))
@@ -235,29 +222,24 @@ class McapSink(Sink):
 
     def _add_events(self, events: Sequence[Event]) -> None:
         for event in events:
-            unix_ns = event.time_ns + self._to.offset_ns
-            self._to.add("", "/events", LOG, unix_ns, log_message(event, unix_ns))
+            unix_ns = event.time_ns + self._file.offset_ns
+            self._file.add("", "/events", LOG, unix_ns, log_message(event, unix_ns))
         self._file.look()  # after the last message, so that a due chunk does not end in mid-scan
 
-    def _try_if_room(self, act: Callable[..., None], *given: object) -> None:
+    def _act_if_room(self, act: Callable[..., None], *given: object) -> None:
         """Do something if there is room for one more record; else count it as left out."""
+        if self._file.full():
+            if not self._run.lossless:
+                self.unwritten += 1
+                return
+            self._file.drain()
+        act(*given)
+
+    def _try(self, act: Callable[..., None], *given: object) -> None:
         try:
-            if self._file.full():
-                if not self._run.lossless:
-                    self.unwritten += 1
-                    return
-                self._file.drain()
             act(*given)
         except OSError as error:
-            raise self._failure(error) from error
-
-    def _try(self, act: Callable[[], None]) -> None:
-        try:
-            act()
-        except OSError as error:
-            raise self._failure(error) from error
-
-    def _failure(self, error: OSError) -> SinkError:
-        self._failed = True
-        reason = error.strerror or error
-        return SinkError(f"recording into {self._path} stopped: {reason}; its {self.scans} scans can be played")
+            self._failed = True
+            reason = error.strerror or error
+            words = f"recording into {self._path} stopped: {reason}; its {self.scans} scans can be played"
+            raise SinkError(words) from error

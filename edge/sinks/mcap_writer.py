@@ -28,26 +28,17 @@ class McapFile:
     Every method but `abandon` raises an OSError where it, or an earlier record, cannot be written.
 
     Attributes:
-        messages: number of messages added so far.
         written: number of messages on the disk, by channel.
-        size_bytes: size on the disk so far.
     """
 
     def __init__(self, path: Path, profile: str, library: str, clock_s: Callable[[], float] = time.monotonic) -> None:
-        """Begin the file.
-
-        Args:
-            path: of the file, which must not exist yet.
-            profile: of MCAP, such as "ros2".
-            library: name of the library that writes the file.
-            clock_s: monotonic, in [s].
-        """
+        """Begin the file, which must not exist yet, with a profile of MCAP and the name of the library that writes."""
         self._file = path.open("xb", buffering=0)
         self._clock_s = clock_s
         self._made = bytearray()
-        self.size_bytes = 0
+        self._size_bytes = 0
         self.written: dict[int, int] = {}
-        self._schemas = self._channels = 0
+        self._schema_count = self._channel_count = 0  # as the public writer numbers them
         self._writer = Writer(self, chunk_size=2 * MOST_CHUNK_BYTES)  # type: ignore[arg-type]  # write, tell and flush
         self._jobs: list[Callable[[], object]] = [partial(self._writer.start, profile, library)]
         self._sequences: dict[int, int] = {}
@@ -58,7 +49,8 @@ class McapFile:
         self._failed = False
 
     @property
-    def messages(self) -> int:  # noqa: D102 - above
+    def messages(self) -> int:
+        """Number of messages added so far."""
         return sum(self._sequences.values())
 
     def write(self, data: bytes) -> int:
@@ -68,22 +60,22 @@ class McapFile:
 
     def tell(self) -> int:
         """Return the place of the next byte of the public writer."""
-        return self.size_bytes + len(self._made)
+        return self._size_bytes + len(self._made)
 
     def flush(self) -> None:
         """Do nothing: `_run` puts the bytes on the disk."""
 
     def add_schema(self, name: str, encoding: str, text: str) -> int:
         """Add a schema and return its id."""
-        self._schemas += 1  # as the public writer numbers them
+        self._schema_count += 1
         self._jobs.append(partial(self._writer.register_schema, name, encoding, text.encode()))
-        return self._schemas
+        return self._schema_count
 
     def add_channel(self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]) -> int:
         """Add a channel and return its id."""
-        self._channels += 1
+        self._channel_count += 1
         self._jobs.append(partial(self._writer.register_channel, topic, encoding, schema, dict(metadata)))
-        return self._channels
+        return self._channel_count
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add facts that hold for the whole file, and pass them to the writing thread at once."""
@@ -167,6 +159,6 @@ class McapFile:
                     done += self._file.write(left[done:])
         except OSError:
             self._failed = True
-            os.ftruncate(self._file.fileno(), self.size_bytes)
+            os.ftruncate(self._file.fileno(), self._size_bytes)
             raise
-        self.size_bytes += len(data)
+        self._size_bytes += len(data)

@@ -3,24 +3,45 @@
 import json
 import shutil
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from edge.errors import SinkError
-from edge.perception.field import Out
-from edge.perception.result_fields import FIELDS
+from edge.perception.field import Field, Out
+from edge.perception.result_fields import FIELDS, MAPS
+from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.ros2.map_messages import UNITS
+from edge.sinks.ros2.ros_types import IMAGE
+from firmware_bridge.errors import RecordingError
+from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.mcap_reader import mcap_files
+from firmware_bridge.recording.mcap_records import MESSAGE, DamageError, records
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from firmware_bridge.recording.scan_messages import mounting_text
+from firmware_bridge.recording.scan_messages import (
+    BASELINE_NAME,
+    SCAN_NAME,
+    decode_baseline,
+    decode_scan,
+    mounting_text,
+)
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.zeroing.baseline import Baseline
 
 KINDS: Final[Mapping[str, tuple[str, Any]]] = {
     **{field.name: (field.kind.array, field.kind.unknown) for field in FIELDS if Out.NPZ in field.out},
@@ -28,6 +49,13 @@ KINDS: Final[Mapping[str, tuple[str, Any]]] = {
 }
 """numpy's type of each array, and the value of a row where it is unknown."""
 _PIECE_BYTES: Final = 1 << 20
+_MAP_NAMES: Final = frozenset(field.name for field in MAPS)
+_OF_SCANS: Final = {"time_ns", "sensor", "scan", "device_time_ns", "counts", "has_pattern", "baseline_counts"}
+_OF_RECORDS: Final = tuple(
+    field for field in FIELDS if Out.NPZ in field.out and field.name not in _MAP_NAMES | _OF_SCANS
+)
+_ELSEWHERE: Final = {"scan_pose": ("pose",), "centre_of_pressure_mm": ("wrench", "centre_of_pressure_mm")}
+"""Places in a record of arrays that have another name there."""
 
 
 def write_npz(
@@ -105,3 +133,139 @@ def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
         "pose_holds": np.array([one.holds for one in poses]),
         "pose_used_from_ns": np.array([-1 if one.used_from_ns is None else one.used_from_ns for one in poses]),
     }
+
+
+def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a recording that `load_recording` has read, in the order of its messages.
+
+    Raises:
+        RecordingError: a result or a map cannot be read.
+        OSError: the file cannot be read.
+    """
+    baselines: dict[str, Baseline] = {}
+    for file in mcap_files(path)[0]:
+        yield from _Rows(file, geometry, origin, baselines).rows()
+
+
+class _Topic(NamedTuple):
+    sensor: str
+    name: str
+    kind: MessageType
+    factor: float  # of a map to its unit
+
+
+class _Rows:
+    def __init__(self, path: Path, geometry: SensorGeometry, origin: str, baselines: dict[str, Baseline]) -> None:
+        self._path, self._geometry, self._origin, self._baselines = path, geometry, origin, baselines
+        self._types: dict[int, MessageType] = {}
+        self._topics: dict[int, _Topic] = {}
+        self._taps = 1
+        self._of = ""
+        self._row: dict[str, Any] | None = None
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        try:
+            with self._path.open("rb") as file:
+                file.seek(len(MCAP0_MAGIC))
+                for opcode, data in records(file):
+                    if opcode != Opcode.MESSAGE:
+                        self._take(opcode, ReadDataStream(BytesIO(data)))
+                        continue
+                    channel, _, log_ns, _ = MESSAGE.unpack_from(data)
+                    topic = self._topics.get(channel)
+                    if topic is None:
+                        continue
+                    if topic.kind.name == SCAN_NAME and self._row is not None:
+                        yield self._row
+                    self._read(topic, log_ns, data[MESSAGE.size :])
+        except DamageError:
+            pass  # a note of `load_recording` states it
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RecordingError(f"{self._path}: a result that cannot be read: {str(error)[:120]}") from error
+        if self._row is not None:
+            yield self._row
+
+    def _take(self, opcode: int, stream: ReadDataStream) -> None:
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            if schema.name in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
+                self._types[schema.id] = MessageType.of(schema.name, schema.data.decode())
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            sensor, _, name = channel.topic.rpartition("/")
+            kind = self._types.get(channel.schema_id)
+            if kind is not None:
+                # Earlier releases wrote maps in their own units, and stated none.
+                factor = UNITS[name].factor if name in UNITS and channel.metadata.get("unit") else 1.0
+                self._topics[channel.id] = _Topic(sensor, name, kind, factor)
+        elif opcode == Opcode.METADATA:
+            metadata = Metadata.read(stream)
+            if metadata.name == "contract":
+                self._taps = int(metadata.metadata.get("taps", "1"))
+
+    def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
+        if topic.kind.name == SCAN_NAME:
+            self._of, self._row = topic.sensor, self._begun(data, log_ns)
+        elif topic.kind.name == BASELINE_NAME:
+            baseline = decode_baseline(data, self._geometry)
+            self._baselines[baseline.sensor] = baseline
+        elif topic.sensor != self._of or self._row is None:
+            return
+        elif topic.kind.name == RESULT.name:
+            record = json.loads(topic.kind.decode(data)["record"])
+            known = (field for field in _OF_RECORDS if field.name != "poses" or record.get("poses") is not None)
+            self._row |= {field.name: _value(field, record, self._taps) for field in known}
+        elif topic.name in _MAP_NAMES:
+            self._row |= {topic.name: _map(topic, data), "has_pattern": True}
+
+    def _begun(self, data: memoryview, log_ns: int) -> dict[str, Any]:
+        scan = decode_scan(data, self._geometry)
+        row: dict[str, Any] = {
+            "time_ns": scan.time_ns,
+            "sensor": scan.sensor,
+            "scan": scan.number,
+            "device_time_ns": scan.device_time_ns,
+            "counts": scan.counts,
+            "source": self._origin,
+            "origin": self._origin,
+            "has_pattern": False,
+        }
+        baseline = self._baselines.get(scan.sensor)
+        if baseline is not None:
+            row["baseline"], row["baseline_counts"] = baseline.id, baseline.counts
+            row["baseline_age_s"] = log_ns / NS_PER_S - baseline.created_unix_s
+        return row
+
+
+def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
+    """Return the value of a field in a record, as an array holds it."""
+    value: Any = record
+    for key in _ELSEWHERE.get(field.name, (field.name,)):
+        value = None if value is None else value.get(key)
+    if field.name == "poses":
+        poses = np.full((taps, 5), np.nan, np.float32)
+        poses[: len(value)] = value[:taps]
+        return poses
+    if field.parts:
+        known = [np.nan if one is None else one for one in _flat(value)]
+        return (known + [np.nan] * len(field.parts))[: len(field.parts)]
+    if value is None:
+        return field.kind.unknown
+    return sum(1 << int(taxel) for taxel in value) if field.name == "dead" else value
+
+
+def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:
+    image = IMAGE.decode(data)
+    values = image["data"].view("<f4") / np.float32(topic.factor)
+    if image["encoding"] == "32FC3":  # a traction of an earlier release
+        return values.reshape(image["height"], image["width"], 3).transpose(2, 0, 1)
+    return values.reshape((3, -1, image["width"]) if topic.name == "traction" else (-1, image["width"]))
+
+
+def _flat(value: Any) -> list[float | None]:
+    """Return the numbers of a value, in their order."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for one in value for number in _flat(one)]
+    return [value]

@@ -8,9 +8,8 @@ from typing import Final
 
 from edge.errors import UsageError
 from edge.inference.contract import Contract
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.ros2.topic_names import base_topic
-from edge.sinks.run_facts import NOW, RunFacts
 from firmware_bridge.extras import how_to_install
 
 FORMS: Final = (

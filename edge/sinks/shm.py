@@ -1,10 +1,8 @@
 """Latest result of each sensor in shared memory, for a control loop on the same machine. Linux.
 
-docs/middleware.md holds the layout as tables. Each sensor has a slot, and each slot two halves: the writer fills the
-half that is not the newest and then counts `sequence` up, so that a reader never waits, not even for a writer that was
-stopped or killed half-way. A reader's copy is whole if the half holds that sequence and its checksum is right. On
-x86-64 stores and loads keep their order and the checksum fails only for a copy that took longer than a period;
-elsewhere it replaces the barriers that Python lacks.
+docs/middleware.md holds the layout as tables. The writer fills the half of a slot that is not the newest, then counts
+`sequence` up, so that a reader never waits, not even for a writer that was killed half-way. A copy is whole if the half
+holds that sequence and its checksum is right; the checksum stands for the barriers that Python lacks.
 """
 
 import fcntl
@@ -48,11 +46,7 @@ HEADER: Final = (
     *(("writer_pid", "Q"), ("pattern_unit", "16s")),
     *((name, "I") for name in ("traction_at", "traction_height", "traction_width")),
 )
-"""Name and struct's character of each field from byte 0 on; then, at HEARTBEAT_AT, `heartbeat_ns`, a q.
-
-`traction_at` is 0 where the model gives no traction, and with writers from before tractions, whose halves lack the
-fields from `wrench_origin` on.
-"""
+"""Name and struct's character of each field from byte 0 on; then, at HEARTBEAT_AT, `heartbeat_ns`, a q."""
 
 IN_MEMORY: Final = sorted((field for field in FIELDS if (field.byte or 0) > 0), key=lambda field: field.byte or 0)
 """Single values and vectors of a result, in the order of their bytes."""
@@ -154,10 +148,8 @@ class SharedMemorySink(Sink):
             raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
         if not folder.is_dir():
             raise SinkError(f"no {folder} here: shm: needs Linux")
-        self._path = folder / name
-        self._clock_ns = clock_ns
-        height, width = contract.pattern_shape
-        self._layout = Layout(contract.rows, contract.cols, height, width, contract.traction_shape)
+        self._path, self._clock_ns = folder / name, clock_ns
+        self._layout = Layout(contract.rows, contract.cols, *contract.pattern_shape, contract.traction_shape)
         try:
             self._file, self._memory = self._create(contract.output_unit)
         except SinkError:

@@ -19,10 +19,9 @@ from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import RunFacts, Sink
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import CountersInTurn, event_record, record
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:
@@ -129,15 +128,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
 
 
 def open_session(target: str) -> "tuple[str, zenoh.Session]":
-    """Return the key of a target, and an open session.
-
-    Args:
-        target: KEY, KEY?connect=ENDPOINT[,ENDPOINT] or KEY?config=FILE.json5.
-
-    Raises:
-        UsageError: the target has another form.
-        SinkError: zenoh is not installed, or the session cannot be opened.
-    """
+    """Return the key of a target, and an open session; a SinkError where zenoh is missing, or cannot be opened."""
     key, configuration = understood(target)
     try:
         import zenoh

@@ -15,7 +15,6 @@ from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
 from firmware_bridge.poses.pose_track import GAP_NS
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.pose_columns import PoseColumns
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
@@ -25,21 +24,18 @@ from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep
 class PoseLane:
     """Poses of one recording, in their order, each at the scan that it served first."""
 
-    def __init__(self, poses: PoseColumns, first_ns: int, sensors: Sequence[str] = ()) -> None:
-        """Begin before the first pose.
+    def __init__(self, poses: Sequence[TimedPose], first_ns: int, sensors: Sequence[str] = ()) -> None:
+        """Begin before the first pose of a recording whose first scan has this time in [ns].
 
-        Args:
-            poses: of the recording, with times.
-            first_ns: time of the first scan of the recording, in [ns].
-            sensors: those for which poses of all sensors are meant, where others are played as well.
+        `sensors` are those for which poses of all sensors are meant, where others are played as well.
         """
         self._poses = poses
         self._first_ns = first_ns
         self._sensors = sensors
         # A file of another program does not state which scan a pose served. There each pose comes early, so that it is
         # interpolated; one that comes earlier than the longest gap would not be used earlier.
-        stated = poses.used_from_ns >= 0
-        self._due_ns = np.where(stated, poses.used_from_ns, poses.time_ns - GAP_NS) - first_ns
+        used_from_ns = (one.time_ns - GAP_NS if one.used_from_ns is None else one.used_from_ns for one in poses)
+        self._due_ns = np.fromiter(used_from_ns, np.int64, len(poses)) - first_ns
         self._row = 0
 
     def begin_at(self, due_ns: int) -> None:
@@ -50,19 +46,10 @@ class PoseLane:
     def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
         """Yield the next poses that a scan uses, at `due_ns` [ns] after the first, which is played at `start_ns`."""
         while self._row < len(self._poses) and self._due_ns[self._row] <= due_ns:
-            pose = self._poses.at(self._row, start_ns - self._first_ns)
+            pose = self._poses[self._row].later(start_ns - self._first_ns)
             self._row += 1
-            if pose.sensor is not None or not self._sensors:
-                yield pose
-                continue
-            for sensor in self._sensors:
-                yield TimedPose(pose.pose, pose.time_ns, sensor, pose.holds, pose.used_from_ns)
-
-
-def timed_by_rows(poses: PoseColumns, due_times_ns: NDArray[np.int64]) -> PoseColumns:
-    """Return poses of rows with the times of the rows, since the first one, in [ns]."""
-    times_ns = due_times_ns[poses.time_ns]
-    return PoseColumns(times_ns, poses.values, poses.sensors, poses.sensor, poses.holds, times_ns)
+            for sensor in (pose.sensor,) if pose.sensor is not None or not self._sensors else self._sensors:
+                yield replace(pose, sensor=sensor)
 
 
 class ReplayLink(Link):

@@ -12,8 +12,8 @@ from edge import api
 from edge.api import open_recording, open_runtime
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
+from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.formats import load_recording

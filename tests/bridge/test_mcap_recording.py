@@ -25,12 +25,12 @@ from mcap_samples import (
 )
 
 from edge.api import open_runtime, open_source
+from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.map_messages import image_map, in_si
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording

@@ -12,9 +12,9 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_samples import OFFSET_NS, make_results, odd_scans
 
 from edge.perception.event import Event
+from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import RESULT
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 

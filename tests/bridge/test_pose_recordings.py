@@ -11,8 +11,8 @@ from pose_samples import PosedModel
 from edge import api
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
+from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose

@@ -16,8 +16,8 @@ from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, recor
 from edge.cli import main as cli
 from edge.perception.result import Result
 from edge.perception.result_fields import MAPS
+from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose

@@ -13,9 +13,9 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
 from edge.errors import UsageError, WindowError
-from edge.inference.familiarity import ERROR_UNITS, MOST_ERROR, PLACE_MM, pair_width, pose_tap_features, tap_features
 from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import pose_rows, scheduled_rows
+from edge.inference.trust import ERROR_UNITS, MOST_ERROR, PLACE_MM, pair_width, pose_tap_features, tap_features
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.poses.pad_pose import PadPose
 

@@ -16,7 +16,6 @@ from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_cont
 
 from edge.errors import ModelError
 from edge.inference.contract import Contract
-from edge.inference.familiarity import check_of, contact_features, tap_features
 from edge.inference.forward_model import GRID, KPA, condensed, features
 from edge.inference.onnx_session import ModelSession
 from edge.inference.small_network import (
@@ -28,7 +27,7 @@ from edge.inference.small_network import (
     small_network,
     unpacked,
 )
-from edge.inference.trust import trust_of
+from edge.inference.trust import check_of, contact_features, tap_features, trust_of
 
 GAIN_ERROR = 0.075
 

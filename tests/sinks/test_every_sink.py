@@ -1,7 +1,6 @@
 """Contract of every sink: each kind of result and event comes back, it fails alone, and ends cleanly."""
 
 import contextlib
-import io
 import json
 import os
 import subprocess
@@ -10,16 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ROOT, ListSink, make_scan
+from edge_samples import ROOT, ListSink
 from mcap_samples import messages_of
 from sink_readers import CONTRACT, EVENTS, KINDS, PERIOD_NS, Jsonl, Mcap, Ros2, every_kind, told
-from sink_samples import RUN, Terminal, make_results, make_sure_results
+from sink_samples import RUN, make_results, make_sure_results
 
 from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.perception.event import Event
-from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from edge.sinks.event_printer import MessageSink
 from edge.sinks.fan_out import Fan
 from edge.sinks.json_encoding import COUNTED_NS
 from edge.sinks.jsonl import JsonLinesSink
@@ -267,19 +264,3 @@ class TestFan:
         with pytest.raises(SinkError, match="no room"):
             fan.close()
         assert good.closed
-
-
-@pytest.mark.parametrize("terminal", [True, False])
-def test_events_are_lines_on_stderr(terminal):
-    stream = Terminal() if terminal else io.StringIO()
-    MessageSink(stream).tell(Event(0, "lost", None, "the cable is out"), {})
-    assert stream.getvalue() == ("\r\x1b[K" if terminal else "") + "edge-sr: the cable is out\n"
-
-
-def test_the_events_of_a_result_are_lines():
-    stream = io.StringIO()
-    messages = MessageSink(stream)
-    for number, texts in enumerate([[], ["zeroing refused", "zeroed; again"]]):
-        events = tuple(Event(number, "refused", None, text) for text in texts)
-        messages.write(Result(make_scan(number), "device", "tiny", "idle", events=events), {})
-    assert stream.getvalue() == "edge-sr: zeroing refused\nedge-sr: zeroed; again\n"

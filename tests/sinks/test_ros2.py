@@ -16,12 +16,12 @@ from edge_samples import make_contract, make_wrench_result
 
 from edge.perception.event import Event
 from edge.pipeline.commands import Command, Commands
+from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
 from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.pad_frame import PadFrame
@@ -219,9 +219,17 @@ def test_subscribers_get_force_and_torque_of_a_model_with_traction(sink):
     assert result.wrench is not None and result.traction is not None
     result = replace(result, deviation=result.pattern / 10)
     torque_n_m = [torque / 1000 for torque in result.wrench.torque_n_mm]
-    with Listener({"skin/s4/wrench": WRENCH, "skin/s4/points": CLOUD}) as listener:
-        both = ("skin/s4/points", "skin/s4/wrench")
-        listener.until(lambda: all(map(listener.of, both)), lambda: sink.write(result, {}))
+    numbers = {
+        "skin/s4/force_z_n": result.wrench.force_n[2],
+        "skin/s4/shear_ratio": result.wrench.shear_ratio,
+        "skin/s4/force_counts": result.force_counts,
+        "skin/s4/uncertainty_m": None if result.interval_mm is None else result.interval_mm / 1e3,
+    }
+    topics = {"skin/s4/wrench": WRENCH, "skin/s4/points": CLOUD} | dict.fromkeys(numbers, FLOAT)
+    with Listener(topics) as listener:
+        listener.until(lambda: all(map(listener.of, topics)), lambda: sink.write(result, {}))
+        for topic, number in numbers.items():
+            np.testing.assert_equal(listener.of(topic)[0]["data"], math.nan if number is None else number)
         for message in listener.of("skin/s4/wrench"):
             assert list(message["wrench"]["force"].values()) == list(result.wrench.force_n)
             assert list(message["wrench"]["torque"].values()) == torque_n_m
@@ -264,15 +272,14 @@ def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back()
     assert commands.poll() == [], "asked of a sink that is closed"
 
 
-def test_commands_are_taken_only_where_that_was_asked_for(sink):
-    commands = Commands()
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ENVIRONMENT.items():
-            patch.setenv(name, value)
-        for text, listens in (("ros2:skin", False), ("ros2:skin?commands", True)):
-            made = open_sink(text, make_contract(), RunFacts(commands=commands))
-            assert (made._asked is not None) == listens
-            made.close()
+@pytest.mark.parametrize(("text", "listens"), [("ros2:skin", False), ("ros2:skin?commands", True)])
+def test_commands_are_taken_only_where_that_was_asked_for(text, listens, monkeypatch):
+    for name, value in ENVIRONMENT.items():
+        monkeypatch.setenv(name, value)
+    commands, asked = Commands(), []
+    commands.ask = asked.append
+    open_sink(text, make_contract(), RunFacts(commands=commands)).close()
+    assert bool(asked) is listens
 
 
 def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_dds_is(monkeypatch):

@@ -22,11 +22,11 @@ from edge.cli.run_options import parser
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
+from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import check_sink, open_sink
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
 from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.links.base import Notice
 
 __all__ = ["sink"]
@@ -113,16 +113,20 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     assert "scan_age_s" not in {pair["key"] for status in said for pair in status["values"]}
 
 
-def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another(sink):
+def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another():
+    clock, published = Clock(), []
+    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock)
     for name in ("left/4", "right/4"):
         sink.write(contact(1, sensor=name), {})
-    left, right = sink._sensors["left/4"], sink._sensors["right/4"]
-    for kind in ("lost", "trouble"):
-        sink.tell(Event.of(Notice(time.monotonic_ns(), kind, "left: the plug is out", "left/")), {})
-    assert left.trouble.keys() == {"lost", "trouble"} and not left.shown
-    assert right.trouble == {} and len(right.shown) == 2
-    sink.tell(Event.of(Notice(time.monotonic_ns(), "well", "right: well", "right/")), {})
-    assert left.trouble.keys() == {"lost", "trouble"}
+    keep_published(sink, published)
+    for kind, link in (("lost", "left"), ("trouble", "left"), ("well", "right")):
+        sink.tell(Event.of(Notice(clock.now_ns, kind, f"{link}: {kind}", f"{link}/")), {})
+    assert [one["data"] for one in published if one.get("data") in ("lost", "silent")] == ["lost"]
+    clock.now_ns += 1_000_000_000
+    sink.wait()
+    (left, right) = (status["message"] for one in published for status in one.get("status", ()))
+    assert left.endswith("left: lost; left: trouble") and "trouble" not in right
+    sink.close()
 
 
 ROS_TOPIC = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")

@@ -12,24 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import ros2_messages
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import make_wrench_result
+from edge_samples import make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
-from ros2_samples import contact, sink
+from ros2_samples import sink
 
 from edge.perception.event import Event
 from edge.sinks.json_encoding import record
 from edge.sinks.ros2 import cdr_messages, map_messages, ros_types
-from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
-from edge.sinks.ros2.diagnostics import Level
-from edge.sinks.ros2.map_messages import points
 from firmware_bridge.errors import CdrError
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.cdr import MessageType
-from firmware_bridge.recording.scan_messages import decode_scan, encode_scan
-from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 
 __all__ = ["sink"]
@@ -53,62 +47,19 @@ def test_every_type_is_ros_own():
         ]
 
 
-@pytest.fixture
-def published(sink):
-    """The messages of one result and its diagnostics by topic, as bytes with the name of their type."""
-    kept = {}
+def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
+    """The types are made of ROS's definitions, so those of the sink have no part in them."""
+    sent, result, frames = [], make_wrench_result(), {"a": PadFrame("tool0"), "b/c": PadFrame("base_link")}
 
     def keep(writer, message):
         package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
-        name = f"{package}/msg/{kind.removeprefix('dds_.').removesuffix('_')}"
-        kept[writer.topic.name.removeprefix("rt/")] = (name, message)
+        sent.append((f"{package}/msg/{kind.removeprefix('dds_.').removesuffix('_')}", message))
 
     sink._publish, sink._is_read = keep, lambda writer: True
-    result = make_wrench_result()
-    scan = replace(result.scan, device_ns=result.scan.time_ns - 7_000_000)
     event = Event(3, "refused", "4", "not done, ä")
-    result = replace(result, scan=scan, deviation=result.pattern / 10, centroid_mm=(1.0, 2.0), events=(event,))
-    sink.write(result, {"dropped": 1})
-    sink._diagnose()
-    unix_ns = scan.device_ns + sink._unix_offset_ns
-    return result, unix_ns, kept
-
-
-def test_bytes_on_the_wire_are_plain_cdr(published):
-    result, unix_ns, kept = published
-    decoded = {topic: ros2_messages.decode(*sent) for topic, sent in kept.items()}
-    pattern = decoded["skin/s4/pattern"]
-    assert bytes(pattern.pop("data")) == (result.pattern * np.float32(1e-3)).tobytes()
-    stamp = dict(zip(("sec", "nanosec"), divmod(unix_ns, 10**9), strict=True))
-    header = {"stamp": stamp, "frame_id": cdr_messages.frame_of(result)}
-    expected = {"height": 40, "width": 40, "encoding": "32FC1", "is_bigendian": 0, "step": 160}
-    assert pattern == {"header": header, **expected}
-    taxels = decoded["skin/s4/taxels"]
-    assert {key: taxels[key] for key in ("height", "width", "step")} == {"height": 12, "width": 4, "step": 16}
-    assert bytes(taxels["data"]) == result.scan.counts.astype("<f4").tobytes()
-    wrench = decoded["skin/s4/wrench"]
-    assert wrench["header"] == header and wrench["wrench"]["force"]["z"] == result.wrench.force_n[2]
-    said = json.loads(decoded["skin/events"]["data"])
-    assert (said["event"], said["sensor"], said["note"]) == ("refused", "4", "not done, ä")
-    assert said["counters"] == {"dropped": 1}
-    (status,) = decoded["diagnostics"]["status"]
-    values = {pair["key"]: pair["value"] for pair in status["values"]}
-    assert status["level"] == Level.WARN and "1 dropped" in status["message"]
-    assert (values["state"], values["pattern_unit"]) == ("contact", "mm")
-    numbers = {topic: message["data"] for topic, message in decoded.items() if kept[topic][0] == "std_msgs/msg/Float64"}
-    assert numbers["skin/s4/force_z_n"] == result.wrench.force_n[2]
-    assert numbers["skin/s4/shear_ratio"] == result.wrench.shear_ratio
-    assert numbers["skin/s4/area_m2"] == result.area_mm2 / 1e6
-    unknown = [topic for topic, value in numbers.items() if math.isnan(value)]
-    assert unknown == [] if result.interval_mm is not None else unknown == ["skin/s4/uncertainty_m"]
-
-
-def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(published):
-    """The types are made of ROS's definitions, so those of the sink have no part in them."""
-    result, unix_ns, kept = published
-    cloud = points(result, USPA44, "4", unix_ns)
-    frames = cdr_messages.transforms({"a": PadFrame("tool0"), "b/c": PadFrame("base_link")}, unix_ns)
-    sent = [*kept.values(), ("sensor_msgs/msg/PointCloud2", cloud), ("tf2_msgs/msg/TFMessage", frames)]
+    sink.write(replace(result, deviation=result.pattern / 10, centroid_mm=(1.0, 2.0), events=(event,)), {"dropped": 1})
+    sink.close()
+    sent += [("tf2_msgs/msg/TFMessage", cdr_messages.transforms(frames, UNIX_NS))]
     assert {name for name, _ in sent} == TYPE_HASHES.keys(), "every type that is published"
     for name, message in sent:
         again = ros2_messages.dds_type(name).deserialize(message).serialize(use_version_2=False)
@@ -116,48 +67,13 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(publish
         assert len(again) - len(message) < 4
 
 
-def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts(sink):
-    kept = []
-    sink._publish = lambda writer, message: kept.append((writer.topic.name, message))
-    sink._is_read = lambda writer: True
-    result = contact(1)
-    counts = result.scan.counts.copy()
-    counts[:, 1, 2] = -1
-    sink.write(replace(result, scan=replace(result.scan, counts=counts)), {})
-    (taxels,) = (message for topic, message in kept if topic == "rt/skin/s4/taxels")
-    values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", taxels)["data"]), "<f4")
-    assert np.isnan(values.reshape(3, 4, 4)[:, 1, 2]).all() and np.isnan(values).sum() == 3
-
-
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    sec: types.int32
-    nanosec: types.uint32
-
-
-@dataclass
-class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class Scan(IdlStruct, typename="Scan"):
-    header: Header
-    sensor: str
-    number: types.int64
-    time_ns: types.int64
-    device_time_ns: types.int64
-    fresh: types.uint64
-    renewed: types.uint64
-    counts: types.array[types.int32, 48]
-    vendor_newtons: types.sequence[types.float32]
-    vendor_temperature_k: types.sequence[types.float32]
-    vendor_ups_hz: types.sequence[types.float32]
+def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
+    image = map_messages.image(map_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
+    values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", image)["data"]), "<f4")
+    assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
 
 
 UNIX_NS = 1_700_000_000_123_456_789
-STAMP = Time(1_700_000_000, 123_456_789)
 
 
 def test_another_image_is_not_taken_for_a_map():
@@ -166,26 +82,9 @@ def test_another_image_is_not_taken_for_a_map():
         map_messages.image_map(ros_types.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
-@pytest.mark.parametrize("number", range(4))
-def test_a_scan_is_what_cyclonedds_writes_and_comes_back_as_it_was(number):
-    for scan in odd_scans(4)[2 * number : 2 * number + 2]:
-        fresh, renewed = (sum(1 << i for i, one in enumerate(m.ravel()) if one) for m in (scan.fresh, scan.renewed))
-        data = encode_scan(scan, scan.sensor, UNIX_NS, fresh, renewed)
-        vendor = scan.vendor or VendorReading()
-        lists = [[] if a is None else a.ravel().tolist() for a in (vendor.newtons, vendor.temperature_k, vendor.ups_hz)]
-        device_ns = -1 if scan.device_ns is None else scan.device_ns
-        expected = Scan(
-            Header(STAMP, scan.sensor), scan.sensor, scan.number, scan.time_ns, device_ns, fresh, renewed,
-            scan.counts.ravel().tolist(), *lists,
-        )  # fmt: skip
-        assert data == bytes(expected.serialize())
-        got = decode_scan(data)
-        assert (got.counts == scan.counts).all() and (got.fresh, got.renewed) == (fresh, renewed)
-
-
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():
     for result in make_results(odd_scans(4)):
-        said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
+        said = cdr_messages.RESULT.decode(cdr_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
         told = json.loads(said["record"])
         assert told["counts"][2][1][1] == (result.scan.counts[2, 1, 1] if result.scan.fresh[1, 1] else None)
         assert told["counters"] == {"late": 1} and said["header"]["frame_id"] == result.scan.sensor

@@ -138,7 +138,6 @@ class TestReading:
         ("words", "line"),
         [
             (["left/4", "--pretend"], r"\d+ counts, pattern not checked"),
-            (["left/4"], "nothing to act on: its source is emulated, not a device: .*"),
             (["5"], "nothing to act on: no sensor 5, but left/4.*"),
         ],
     )

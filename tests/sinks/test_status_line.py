@@ -13,14 +13,17 @@ from sink_samples import RUN, Terminal, make_results
 from edge.perception.event import Event, Note
 from edge.perception.result import NextTap
 from edge.perception.runtime import Runtime
-from edge.sinks.event_printer import MessageSink
-from edge.sinks.status_line import StatusSink
+from edge.sinks.status_line import MessageSink, StatusSink
 
 
-def test_what_others_wrote_does_nothing_to_the_terminal():
-    stream = io.StringIO()
-    MessageSink(stream).tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
-    assert stream.getvalue() == "edge-sr: \\x1b[2J\\x9b\\rpad\\n\\ud800 in µm\n"
+@pytest.mark.parametrize(("stream", "start"), [(io.StringIO(), ""), (Terminal(), "\r\x1b[K")])
+def test_events_are_lines_and_what_others_wrote_does_nothing_to_the_terminal(stream, start):
+    messages = MessageSink(stream)
+    messages.tell(Event(0, "trouble", None, "\x1b[2J\x9b\rpad\n\ud800 in µm"), {})
+    told = tuple(Event(1, "refused", None, text) for text in ("zeroing refused", "zeroed; again"))
+    messages.write(replace(make_results(1)[0], events=told), RUN)
+    lines = ("\\x1b[2J\\x9b\\rpad\\n\\ud800 in µm", "zeroing refused", "zeroed; again")
+    assert stream.getvalue() == "".join(f"{start}edge-sr: {line}\n" for line in lines)
 
 
 def test_a_terminal_that_knows_no_escape_sequences_gets_none(monkeypatch):

@@ -11,8 +11,8 @@ from mcap.writer import Writer
 
 from edge.cli import main as cli
 from edge.perception.runtime import Runtime
+from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
-from edge.sinks.run_facts import RunFacts
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
 

@@ -14,12 +14,11 @@ from sink_samples import make_sure_results
 
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import RunFacts, Sink
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2.cdr_messages import RESULT
 from edge.sinks.ros2.map_messages import image_map
 from edge.sinks.ros2.ros_types import LOG
-from edge.sinks.run_facts import RunFacts
 
 CONTRACT = make_contract(interval_factor=1.6)
 PERIOD_NS = 10_000_000

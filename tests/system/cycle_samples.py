@@ -168,7 +168,6 @@ class Worth:
         scans: number of scans.
         whole: scans with sixteen new readings.
         mixed: whole scans of more than one cycle.
-        mixed_torn: other scans of more than one cycle.
         waits_ms: times from the last frame of a cycle, as it was read, to its scan.
         counters: counters of the reader.
         numbers: cycles of whole scans, by sensor.
@@ -177,7 +176,6 @@ class Worth:
     scans: int = 0
     whole: int = 0
     mixed: int = 0
-    mixed_torn: int = 0
     waits_ms: list[float] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
     numbers: dict[str, list[int]] = field(default_factory=dict)
@@ -219,7 +217,6 @@ def _judge(scan: Scan, now_ns: int, read_ns: dict[tuple[str, int], int], worth: 
     worth.scans += 1
     worth.whole += scan.whole
     worth.mixed += scan.whole and len(numbers) > 1
-    worth.mixed_torn += not scan.whole and len(numbers) > 1
     if scan.whole:
         worth.numbers.setdefault(scan.sensor, []).append(int(numbers[-1]))
         worth.waits_ms.append((now_ns - read_ns[scan.sensor, int(numbers[-1])]) / 1e6)

@@ -106,7 +106,6 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "save_baselines: 1 -> 2": "the blanks before a line of the file",
     },
     "contract": {
-        "_check_pad_and_traction: False -> True": "asked for nothing but whether it is of a kind",
         "_is_pad_input: 1.0 -> 2.0": "the range of no constant, whose lowest value is above its highest",
         "_is_pad_input: return False -> return None": "its caller asks for nothing but whether it is true",
     },

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.familiarity import Check, pair_width, pose_tap_features, tap_features
 from edge.inference.small_network import SmallNetwork
+from edge.inference.trust import Check, pair_width, pose_tap_features, tap_features
 from edge.perception.pattern_check import LEAST_COUNTS
 from train.data.press_batches import COUNTS_PER_UNIT, read_presses, stated_poses
 from train.data.presses import PressSet

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.familiarity import QUIET_UNITS, Check
 from edge.inference.forward_model import ForwardModel, condensed, features, forward_model
 from edge.inference.small_network import small_network
-from edge.inference.trust import Trust
+from edge.inference.trust import QUIET_UNITS, Check, Trust
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet

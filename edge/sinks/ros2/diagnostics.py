@@ -37,12 +37,8 @@ def diagnose(
 ) -> Diagnosis:
     """Return the state of a sensor by its newest result.
 
-    Args:
-        result: newest result of the sensor.
-        counters: up to now, of the whole run.
-        before: counters at the previous diagnosis; losses since then are reported.
-        silence_s: time since its last scan, in [s]; None where scans are of another time.
-        trouble: what the link has reported and not withdrawn.
+    Losses are those since the counters before; `silence_s` is None where scans are of another time, and `trouble` is
+    what the link has reported and not withdrawn.
     """
     losses = {name: counters.get(name, 0) - before.get(name, 0) for name in _LOSSES}
     findings = list(_findings(result, losses, silence_s, trouble))

@@ -12,13 +12,12 @@ import numpy as np
 import orjson
 from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
-from numpy.typing import NDArray
 
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
-from edge.pipeline.sink import Sink
+from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import event_record
 from edge.sinks.ros2.cdr_messages import frame_of, transforms, wrench, wrench_message
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
@@ -37,7 +36,6 @@ from edge.sinks.ros2.ros_types import (
     header,
 )
 from edge.sinks.ros2.topic_names import base_topic, sensor_topic
-from edge.sinks.run_facts import NOW, RunFacts
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
@@ -57,20 +55,14 @@ NUMBERS: Final[Mapping[str, Callable[[Result], float | None]]] = {
 
 @dataclass(slots=True)
 class _Sensor:
-    """Writers of one sensor, and what they published last.
-
-    Attributes:
-        shown: maps whose last message still holds, by topic, with their shapes.
-        forced: the last wrench was of a pattern.
-        trouble: what the link has reported and not withdrawn, by the kind of event.
-    """
+    """Writers of one sensor, by what they publish, and what was published last."""
 
     frame: str
     last: Result
     writers: dict[str, DataWriter[Any]] = field(default_factory=dict)
-    shown: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    forced: bool = False
-    trouble: dict[str, str] = field(default_factory=dict)
+    shown: dict[str, tuple[int, ...]] = field(default_factory=dict)  # shapes of maps whose last message still holds
+    forced: bool = False  # the last wrench was of a pattern
+    trouble: dict[str, str] = field(default_factory=dict)  # of the link, not withdrawn, by the kind of event
 
 
 class Ros2Sink(Sink):
@@ -89,14 +81,9 @@ class Ros2Sink(Sink):
         clock_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Join the domain.
+        """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
 
-        Args:
-            topic: first part of all topics except those of the diagnostics and the frames.
-            environment: ROS_DOMAIN_ID and others are read from it.
-            run: with commands only where they are to be taken.
-            clock_ns: the clock of the scans that are of now, in [ns].
-            unix_ns: wall time, in [ns]; read once, because the clock may be set during the run.
+        `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
         self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
         self._of_now = run.unix_offset_ns is None
@@ -213,7 +200,7 @@ class Ros2Sink(Sink):
         frame = sensor.frame
         for name, values in (("pattern", result.pattern), ("deviation", result.deviation)):
             if values is not None:
-                self._publish_to(sensor, name, IMAGE, partial(_map_image, name, values, frame, unix_ns))
+                self._publish_to(sensor, name, IMAGE, partial(image, in_si(name, values), frame, unix_ns))
                 sensor.shown[name] = values.shape
         if result.centroid_mm is not None:
             x, y = (place / 1e3 for place in result.centroid_mm)
@@ -285,10 +272,6 @@ class Ros2Sink(Sink):
         if self._of_now:
             return self._clock_ns()
         return max((sensor.last.scan.time_ns for sensor in self._sensors.values()), default=0)
-
-
-def _map_image(name: str, values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    return image(in_si(name, values), frame, unix_ns)
 
 
 def _command(name: str, message: bytes) -> Command | None:
