@@ -102,6 +102,12 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     return float(low), float(high)
 
 
+def band(series: Iterable[tuple[NDArray[np.floating], NDArray[np.integer]]]) -> tuple[NDArray, NDArray]:
+    """Return the means of m series of values and taps, (m,), and their intervals' reach to both sides, (2, m)."""
+    mean, bounds = zip(*((values.mean(), bootstrap_interval(values, taps)) for values, taps in series), strict=True)
+    return np.array(mean), np.abs(np.transpose(bounds) - np.array(mean))
+
+
 def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:
     """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3)."""
     low, high = bootstrap_interval(values, taps)

@@ -13,9 +13,8 @@ from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOption
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.scans.scan import Scan, ScanSeries
+from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.frozen_presses import FrozenPresses
 from train.report import Row, bootstrap_interval
@@ -31,11 +30,7 @@ _TAP_SCANS: Final = 2
 
 
 class PushedSensor:
-    """Sensor whose scans go through a runtime of its own.
-
-    Attributes:
-        suspected: whether the last scan's events leave the sensor suspected.
-    """
+    """Sensor whose scans go through a runtime of its own; `suspected` if the last scan's events leave it so."""
 
     def __init__(self, model: Model, pad: Pad | None = None, seed: int = 0, options: RuntimeOptions = SHIPPED) -> None:
         baseline = Baseline.of(_SENSOR, _REST.astype(np.float32), created_unix_s=0.0, scans=100, origin="start-up")
@@ -49,27 +44,17 @@ class PushedSensor:
         """Draw the noise of a scan, (3, rows, cols) in counts."""
         return NOISE_COUNTS * self._rng.standard_normal(USPA44.scan_shape, dtype=np.float32)
 
-    def scan(self, counts: NDArray[np.floating]) -> Scan:
-        """Return the next scan, of zeroed counts (3, rows, cols)."""
+    def push(self, counts: NDArray[np.floating], *, infer: bool = True) -> Result:
+        """Return the result of the next scan, of zeroed counts (3, rows, cols)."""
         self._time_ns += _PERIOD_NS
         raw = np.clip(_REST + np.rint(counts).astype(np.int32), 1, 65_534)
-        return self._series.close(raw, self._time_ns)
-
-    def push(self, counts: NDArray[np.floating], *, infer: bool = True, pose: PadPose | None = None) -> Result:
-        """Return the result of the next scan, of zeroed counts (3, rows, cols), with the pad's pose at that time."""
-        if pose is not None:
-            self._runtime.pose(pose, self._time_ns + _PERIOD_NS)
-        return self.take(self.scan(counts), infer=infer)
-
-    def take(self, scan: Scan, *, infer: bool = True) -> Result:
-        """Return the result of a scan."""
-        result = self._runtime.push(scan, infer=infer)
+        result = self._runtime.push(self._series.close(raw, self._time_ns), infer=infer)
         for event in result.events:
             self.suspected = event.kind == "suspected" or (self.suspected and event.kind != "cleared")
         return result
 
     def free(self) -> Result:
-        """Return the last result of a free pad's scans."""
+        """Return the last result of a free pad."""
         return [self.push(self.noise()) for _ in range(_FREE_SCANS)][-1]
 
     def touch(self, counts: NDArray[np.floating]) -> Result:
@@ -93,7 +78,7 @@ CONTACTS: Final = max(AFTER) + 1
 _OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
 """Reasons that a scan gives by itself."""
 RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
-"""RMS error of a pattern over the RMS of the truth: below the first it is right, above the others wrong and far off."""
+"""RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
 _LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
 
 
@@ -111,7 +96,7 @@ class Verdicts:
     sensor: NDArray[np.int64]
     reason: NDArray[np.str_]
     checked: NDArray[np.bool_]
-    suspected: dict[int, NDArray[np.bool_]]
+    suspected: dict[int, list[bool]]
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
@@ -126,7 +111,9 @@ class Verdicts:
         row |= {"too light": int((~self.checked).sum()), "flagged %": share(self.flagged, self.sensor)}
         row |= {f"{reason} %": round(100 * float((self.reason == reason).mean()), 1) for reason in _OWN[1:]}
         return row | {
-            f"sensor, after {number} %": share(sensors) for number, sensors in self.suspected.items() if len(sensors)
+            f"sensor, after {number} %": share(np.array(sensors))
+            for number, sensors in self.suspected.items()
+            if sensors
         }
 
 
@@ -186,18 +173,11 @@ def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
 
 
 def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Verdicts:
-    """Return the verdicts on the contacts of each sensor, one scan each, in their order.
-
-    Args:
-        model: of the runtime.
-        sensors: readings (n, 3, rows, cols) of each.
-        pads: what the sensor file of each holds.
-    """
+    """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds."""
     rows: list[tuple[int, str, bool]] = []
     suspected: dict[int, list[bool]] = {number: [] for number in AFTER}
     for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
-        sensor = PushedSensor(model, pad, seed=number)
-        seen = 0
+        sensor, seen = PushedSensor(model, pad, seed=number), 0
         for counts in contacts:
             result = sensor.touch(counts)
             if result.pattern is None:
@@ -207,12 +187,8 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
             if seen in suspected:
                 suspected[seen].append(sensor.suspected)
             seen += 1
-    return Verdicts(
-        np.array([row[0] for row in rows], dtype=np.int64),
-        np.array([row[1] for row in rows], dtype=np.str_),
-        np.array([row[2] for row in rows], dtype=bool),
-        {number: np.array(sensors) for number, sensors in suspected.items()},
-    )
+    number, reason, checked = zip(*rows, strict=True) if rows else ((), (), ())
+    return Verdicts(np.array(number, dtype=int), np.array(reason, dtype=str), np.array(checked, dtype=bool), suspected)
 
 
 def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
@@ -226,7 +202,6 @@ def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> 
         result = PushedSensor(model, pad, seed=number, options=_LIGHT).touch(counts)
         if result.pattern is None or result.trusted is None:
             continue
-        truth = truths[number]
-        off = float(np.sqrt(np.mean((result.pattern - truth) ** 2) / np.mean(truth**2)))
+        off = float(np.sqrt(np.mean((result.pattern - truths[number]) ** 2) / np.mean(truths[number] ** 2)))
         rows.append((number, off, result.trusted, sum_z < ON_COUNTS))
     return Judged(*map(np.array, zip(*rows, strict=True)))

@@ -2,8 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,6 @@ from numpy.typing import NDArray
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses
-from train.experiments.support.workbench import Figures
-from train.report import Row, with_interval
 
 NOTHING, ALL = "nothing", "pad and gains"
 """Levels of knowledge about a sensor: nothing, or all constants of its pad with the taxels' gains."""
@@ -20,15 +17,8 @@ SHORT: Final = {NOTHING: "model", ALL: "model, all known"}
 """Names of the levels in tables."""
 
 
-@dataclass(frozen=True, slots=True)
-class Inferred:
-    """Output of a model for n windows.
-
-    Attributes:
-        patterns: (n, H, W) in [mm].
-        deviations: (n, H, W) in [mm]; zeros if the model gives none.
-        run_time_us: median of a window on one thread, scaling included, in [us].
-    """
+class Inferred(NamedTuple):
+    """Patterns and deviations (n, H, W) in [mm], zeros if the model gives none, and the median run time in [us]."""
 
     patterns: NDArray[np.float32]
     deviations: NDArray[np.float32]
@@ -46,13 +36,9 @@ def infer(
     pads: Sequence[Pad | None],
     poses: NDArray[np.float32] | None = None,
 ) -> Inferred:
-    """Run a model as the runtime does, window by window.
+    """Run a model as the runtime does, on each window of as many taps as it takes, (n, taps, 3, rows, cols) as read.
 
-    Args:
-        model: the session.
-        windows: (n, taps, 3, rows, cols) in zeroed counts as read, with as many taps as the model takes.
-        pads: constants that are available for each of the n sensors.
-        poses: (n, taps, 5) of the taps, for a model that takes them; None for the paper's schedule.
+    `pads` are the constants that are known of each sensor; poses are (n, taps, 5), None for the paper's schedule.
     """
     contract = model.contract
     patterns, deviations, times_s = [], [], []
@@ -72,13 +58,3 @@ def infer(
 def infer_presses(model: ModelSession, frozen: FrozenPresses, known: str) -> Inferred:
     """Run a model on frozen presses with what a level of knowledge provides."""
     return infer(model, frozen.windows(model.contract.taps), known_pads(frozen, known))
-
-
-def pattern_cells(figures: Figures, groups: NDArray[np.integer]) -> Row:
-    """Return errors of patterns as cells of a row, with the interval by group."""
-    return {
-        "PSNR dB": with_interval(figures["psnr_db"], groups),
-        "IoU": round(float(figures["contact_iou"].mean()), 3),
-        "edge mm": round(float(figures["boundary_mm"].mean()), 3),
-        "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
-    }

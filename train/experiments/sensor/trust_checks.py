@@ -19,14 +19,7 @@ from train.data.generation_config import SEED
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.data.world import World
 from train.errors import CheckpointError
-from train.experiments.sensor.contact_verdicts import (
-    CONTACTS,
-    Judged,
-    contacts_of,
-    judged,
-    of_one_sensor_each,
-    verdicts_on,
-)
+from train.experiments.sensor.contact_verdicts import CONTACTS, contacts_of, judged, of_one_sensor_each, verdicts_on
 from train.experiments.sensor.real import play
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
 from train.experiments.sensor.shipped import ALL, NOTHING, known_pads
@@ -36,7 +29,6 @@ from train.families.catalogue import SHARES
 from train.report import Report, Row
 
 JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
-_QUICK: Final = 12
 _MODELS: Final = ("stsr", "stsr-small", "mtsr2", "mtsr4", "mtsr7")
 _SEVERAL: Final = "mtsr4"
 
@@ -54,15 +46,19 @@ def run(bench: Workbench, folder: Path) -> Path:
         if one.contract.read_trust() is None:
             raise CheckpointError(f"{one.name} has no checks: give it some with export.checks")
     wide = bench.wide_test()
-    wide = wide.pick(np.arange(_QUICK)) if bench.quick else wide
+    wide = wide.pick(np.arange(12)) if bench.quick else wide
     # A third of the sensors is enough for the faults, and half of the presses to compare models.
     sensors = of_one_sensor_each(wide.pick(wide.presses.pad % 3 == 0))
     report = Report("trust-checks", folder, __file__, bench.used, quick=bench.quick)
     fresh = freeze_presses(bench.presses("judged", JUDGED), SEED)
     verdicts = judged(model, fresh, known_pads(fresh, NOTHING))
     report.say(_METHOD)
-    report.table(_by_family(verdicts, fresh), _FAMILIES)
-    report.table(_by_model(models, fresh.pick(np.arange(0, len(fresh), 2))), _BY_MODEL, "models")
+    family = fresh.presses.family[verdicts.index]
+    which = {name: (family == name) & ~verdicts.light for name in SHARES}
+    which |= {"all": ~verdicts.light, "light": verdicts.light}
+    report.table([{"contacts of": name} | verdicts.cells(here) for name, here in which.items()], _FAMILIES)
+    text = "Half of these contacts by model, one tap each, of all families."
+    report.table(_by_model(models, fresh.pick(np.arange(0, len(fresh), 2))), text, "models")
     if recording_paths(recordings_folder()):
         report.table(_grips(models), _GRIPS, "grips")
     report.table(_detected(model, sensors), _DETECTED, "faults")
@@ -81,7 +77,6 @@ _FAMILIES: Final = (
     "Fresh contacts by family, every press of a sensor of its own. `light`: a summed z of 750 to 1500 counts, in "
     "which a contact can end, but not begin; the other rows leave them out."
 )
-_BY_MODEL: Final = "Half of these contacts by model, one tap each, of all families."
 _GRIPS: Final = (
     "Scans under load of real grips by trial, both fingers, with the rest level of the trial that ends free: not "
     "believed, in %, wanted at most 3."
@@ -94,13 +89,6 @@ _DETECTED: Final = (
 )
 
 
-def _by_family(verdicts: Judged, presses: FrozenPresses) -> list[Row]:
-    family = presses.presses.family[verdicts.index]
-    which = {name: (family == name) & ~verdicts.light for name in SHARES}
-    which |= {"all": ~verdicts.light, "light": verdicts.light}
-    return [{"contacts of": name} | verdicts.cells(here) for name, here in which.items()]
-
-
 def _by_model(models: Sequence[ModelSession], presses: FrozenPresses) -> list[Row]:
     rows: list[Row] = []
     for model in tracked(models, "models", "model"):
@@ -111,8 +99,7 @@ def _by_model(models: Sequence[ModelSession], presses: FrozenPresses) -> list[Ro
 
 
 def _grips(models: Sequence[ModelSession]) -> list[Row]:
-    grips = recorded_grips(recordings_folder())
-    rows: list[Row] = []
+    grips, rows = recorded_grips(recordings_folder()), list[Row]()
     for trial in tracked(sorted({grip.trial for grip in grips}), "playing", "trial"):
         row: Row = {"trial": trial}
         for model in models:

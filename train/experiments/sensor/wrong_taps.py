@@ -1,9 +1,9 @@
 """Windows whose earlier taps do not belong to the newest one: what the runtime's guard drops, and what that saves."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses
 from train.experiments.sensor.contact_verdicts import PushedSensor, share
 from train.physics.gripped import MAX_INDENTATION_MM
-from train.report import Row, bootstrap_interval
+from train.report import Row, signed_interval
 
 _DEPTHS: Final = (0.85, 1.15)
 _SEED: Final = 17
@@ -31,27 +31,17 @@ _PSNR: Final = (
     "shipped, and every tap is used."
 )
 
-Table = tuple[Sequence[Row], str, str]
-"""Rows, caption and name of a table."""
 
-
-@dataclass(frozen=True, slots=True)
-class Guarded:
-    """Outcome of the runtime for n windows.
-
-    Attributes:
-        psnr_db: (n,) of the patterns.
-        taps_used: (n,).
-        foreign: (n, K - 1), True where an earlier tap does not belong, by the runtime; empty without a guard.
-    """
+class Guarded(NamedTuple):
+    """Outcome for n windows: PSNR (n,) in [dB], taps used (n,), and which earlier ones do not belong, (n, K - 1)."""
 
     psnr_db: NDArray[np.float64]
     taps_used: NDArray[np.int64]
     foreign: NDArray[np.bool_]
 
 
-def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> Iterator[Table]:
-    """Yield the tables of dropped taps and of PSNR."""
+def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> Iterator[tuple[list[Row], str, str]]:
+    """Yield the tables of dropped taps and of PSNR: rows, caption and name."""
     guarding, unguarded = ModelSession(several), ModelSession(several)
     unguarded.contract = replace(unguarded.contract, trust={})
     taps, name_of = guarding.contract.taps, guarding.name
@@ -71,16 +61,10 @@ def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> I
         row[single.name] = round(float(alone.psnr_db.mean()), 2)
         for how, one in (("no guard", off), ("guard", on)):
             row[f"{name_of}, {how}"] = round(float(one.psnr_db.mean()), 2)
-            row[f"{how}, over one tap"] = _over(one, alone, pads)
+            row[f"{how}, over one tap"] = signed_interval(one.psnr_db - alone.psnr_db, pads)
         losses.append(row)
     yield dropped, _DROPPED, "taps"
     yield losses, _PSNR, "psnr"
-
-
-def _over(one: Guarded, other: Guarded, pads: NDArray[np.integer]) -> str:
-    gained = one.psnr_db - other.psnr_db
-    low, high = bootstrap_interval(gained, pads)
-    return f"{gained.mean():+.2f} ({low:+.2f}..{high:+.2f})"
 
 
 def firm(sensors: FrozenPresses) -> FrozenPresses:
