@@ -43,13 +43,9 @@ Maps = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Method that computes patterns.
+    """Method that computes maps of all surfaces and steps, and the time for one surface's steps, of the fastest run.
 
-    Attributes:
-        name: as shown in tables.
-        maps: of all surfaces and steps, in the method's own unit if `scaled`.
-        time_s: of one surface's steps together, the fastest of a few runs, in [s].
-        scaled: True where one factor for all maps brings them to [mm], by least squares against the truth.
+    Where `scaled`, maps are in its own unit: one factor brings all to [mm], by least squares against the truth.
     """
 
     name: str

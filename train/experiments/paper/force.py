@@ -36,14 +36,9 @@ _REACHED: Final = 0.99
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Scans of one range of forces.
+    """Scans of one range of forces: windows (n, K, 3, rows, cols) in zeroed counts, truth (n, H, W), sequences (n,).
 
-    Attributes:
-        force_n: bounds of the range, in [N].
-        windows: (n, K, 3, rows, cols) in zeroed counts: the newest tap while pressing, the earlier ones at their ends.
-        patterns: (n, H, W), truth, in [mm].
-        touching: (n, H, W) bool.
-        tap: (n,) index of the sequence.
+    The newest tap is pressing, the earlier ones are at their ends.
     """
 
     force_n: tuple[float, float]

@@ -42,12 +42,9 @@ _RIDGE: Final = 0.1
 
 
 class Played(NamedTuple):
-    """Output of the runtime for the scans of one grip that are under load.
+    """Output of the runtime for the scans of one grip that are under load: zeroed counts without a hidden taxel.
 
-    Attributes:
-        zeroed: (n, 3, rows, cols) counts over the baseline, without a hidden taxel.
-        patterns: (n, H, W) in [mm]; NaN where there was no pattern.
-        believed: (n,) True unless the pattern was not believed, by any reason.
+    Patterns are (n, H, W) in [mm], NaN where there was none; believed (n,) unless any reason spoke against it.
     """
 
     zeroed: NDArray[np.float32]

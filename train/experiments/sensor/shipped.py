@@ -135,13 +135,9 @@ _LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
 
 @dataclass(frozen=True, slots=True)
 class Verdicts:
-    """Verdicts on m contacts of several sensors.
+    """Verdicts on m contacts of several sensors: the reason is empty where believed, too light ones are not checked.
 
-    Attributes:
-        sensor: (m,) number of the sensor.
-        reason: (m,) why the pattern is not to be believed, empty if it is.
-        checked: (m,) False for contacts that are too light to tell.
-        suspected: for each number of AFTER, whether each sensor with more contacts than that was suspected.
+    `suspected` tells for each number of AFTER whether each sensor with more contacts than that was suspected.
     """
 
     sensor: NDArray[np.int64]
@@ -170,13 +166,9 @@ class Verdicts:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Contacts of n sensors, one each, which the runtime checked.
+    """Contacts of n sensors, one each, which the runtime checked, at an index (n,) among the presses.
 
-    Attributes:
-        index: (n,) places among the presses.
-        off: (n,) RMS error of the pattern over the RMS of the truth.
-        believed: (n,).
-        light: (n,) summed z between the counts that end a contact and those that begin one.
+    `off` is the RMS error over the RMS of the truth; `light` are those between the counts that end and begin a contact.
     """
 
     index: NDArray[np.int64]

@@ -144,12 +144,11 @@ class Workbench:
         self,
         split: Split,
         surfaces: Sequence[str] = SURFACES,
-        nuisances: Nuisances | None = None,
         scale: int = 10,
         angle_step_deg: float = ANGLE_STEP_DEG,
     ) -> FrozenSet:
-        """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or angle."""
-        frozen = freeze(self.held_out(split, surfaces, angle_step_deg), nuisances or Nuisances(), SEED, scale=scale)
+        """Return a frozen set made like the bundled one, with other surfaces, scale or angle."""
+        frozen = freeze(self.held_out(split, surfaces, angle_step_deg), Nuisances(), SEED, scale=scale)
         return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
 
 
@@ -196,7 +195,7 @@ def parameters_count(net: nn.Module) -> int:
     return sum(parameter.numel() for parameter in net.parameters())
 
 
-def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
+def macs(net: PatternNet) -> int:
     """Count multiply-accumulates of one window in convolutions and linear layers, without norms and interpolation."""
     counted: list[int] = []
 
@@ -209,7 +208,7 @@ def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
     like, training = next(net.parameters()), net.training
     try:
         with torch.inference_mode():
-            net.eval()(torch.zeros(1, 3 * net.taps, rows, cols, device=like.device, dtype=like.dtype))
+            net.eval()(torch.zeros(1, 3 * net.taps, USPA44.rows, USPA44.cols, device=like.device, dtype=like.dtype))
     finally:
         for hook in hooks:
             hook.remove()
