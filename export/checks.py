@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from edge.errors import EdgeError
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
-from export.graphs.reference import contract_in
+from export.graphs.graph import contract_in
 from firmware_bridge.in_place import write_in_place
 
 _SAME = ("pad_inputs", "takes_gains", "counts_per_unit", "output_full_scale", "sensor")

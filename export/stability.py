@@ -42,8 +42,6 @@ INDENTATION_MM: Final = 0.3
 FAR_MM: Final = 1e3
 """Depth outside the shape, in [mm]."""
 RESIDUAL: Final = 1e-3
-DOUBLE: Final = 1e-4
-"""Largest difference of the force between float32 and float64, as a share."""
 WIDE: Final = 24
 """Factor of a grid whose copies are farther away than any thickness requires."""
 INT8_PRESS, INT8_BEYOND = 0.25, 0.75
@@ -53,6 +51,7 @@ SAME: Final = 1e-5
 """Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
 steps."""
 TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
+NO_TOUCH: Final = ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
 QUIET: Final = 1e-3
 """The difference of int8 where nothing touches, as a share of full scale."""
 MOST_MM: Final = 5.0
@@ -68,15 +67,9 @@ FREE_SCANS, TOUCHED_SCANS, KEPT_SCANS = 30, 40, 10
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One row of the table.
+    """One row of the table: a stiff or extreme input, the measured quantity and its upper bound.
 
-    Attributes:
-        name: of the stiff or extreme input, with its unit.
-        what: measured quantity.
-        value: its value, or None where the case must be refused.
-        most: upper bound.
-        note: the error that refuses the case, or the states of the records.
-        model: of which the case is, or "".
+    Where the case must be refused the value is None, and `note` the error; else it may hold the states of the records.
     """
 
     name: str
@@ -139,18 +132,18 @@ def pad_cases() -> Iterator[Case]:
 
 def punch(radius_mm: float = 4.0, middle_mm: float = 0.0) -> NDArray[np.float64]:
     """Return the depth image of a flat round punch, (size, size) in [mm]; with a radius below 0 nothing touches."""
-    return np.where(_off_mm(SIZE, middle_mm) <= radius_mm, 0.0, FAR_MM)
+    return np.where(_off_mm(middle_mm) <= radius_mm, 0.0, FAR_MM)
 
 
 def ball(radius_mm: float) -> NDArray[np.float64]:
     """Return the depth image of a ball, (size, size) in [mm], without cancellation."""
-    square = np.minimum(np.square(_off_mm(SIZE, 0.0)), radius_mm**2)
+    square = np.minimum(np.square(_off_mm(0.0)), radius_mm**2)
     return square / (radius_mm + np.sqrt(radius_mm**2 - square))
 
 
-def _off_mm(size: int, middle_mm: float) -> NDArray[np.float64]:
-    """Return the distance of each cell to a point on the diagonal, (size, size) in [mm]."""
-    along_mm = (np.arange(size) - (size - 1) / 2) * CELL_MM - middle_mm
+def _off_mm(middle_mm: float) -> NDArray[np.float64]:
+    """Return the distance of each cell to a point on the diagonal, (SIZE, SIZE) in [mm]."""
+    along_mm = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM - middle_mm
     return np.hypot(along_mm, along_mm[:, None])
 
 
@@ -162,14 +155,12 @@ def _pressed(name: str, layer: Layer, depth_mm: NDArray[np.float64]) -> Iterator
     note = f"{single.steps} steps"
     yield Case(name, "residual, share of the indentation", float(single.residual[0]), RESIDUAL, note)
     apart = abs(float(single.force_n[0] / double.force_n[0]) - 1)
-    yield Case(name, "force, float32 to float64", apart, DOUBLE)
+    yield Case(name, "force, float32 to float64", apart, 1e-4)
 
 
 def against_a_wide_grid(layer: Layer, name: str) -> Case:
     """Return the case of the periodic grid of the pad's response, whose copies must have no effect."""
-    wide = np.full((WIDE * SIZE, WIDE * SIZE), FAR_MM)
-    middle = slice((WIDE - 1) * SIZE // 2, (WIDE + 1) * SIZE // 2)
-    wide[middle, middle] = punch()
+    wide = np.pad(punch(), (WIDE - 1) * SIZE // 2, constant_values=FAR_MM)
     narrow_n, wide_n = (
         float(ContactSolver(layer, len(depth), CELL_MM, torch.float64).solve(depth[None], INDENTATION_MM).force_n[0])
         for depth in (punch(), wide)
@@ -183,17 +174,19 @@ def graph_cases() -> Iterator[Case]:
         one, several = ModelSession(path), ModelSession(path, threads=THREADS)
         in_float = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
         peer = ModelSession(in_float) if in_float != path and in_float.exists() else None
-        for name, window in windows(one.contract).items():
+        given = windows(one.contract)
+        for name, window in given.items():
             yield from _graph(name, window, one, several, peer)
         for name, pad in pads(one.contract).items():
-            row = one.contract.pad_row(pad)
-            window = windows(one.contract)["press"]
-            yield Case(name, "largest, mm", largest(one, window, row), MOST_MM, model=path.stem)
+            size_mm = largest(one, given["press"], one.contract.pad_row(pad))
+            yield Case(name, "largest, mm", size_mm, MOST_MM, model=path.stem)
     for model in (DEFAULT_MODEL, POSED_MODEL):
         session = ModelSession(find_model(model))
         good = windows(session.contract)["press"]
         for bad in (np.nan, np.inf, -np.inf):
-            yield refused(f"{bad} in one place", partial(session.run, _with(good, bad)), WindowError, model)
+            spoiled = good.copy()
+            spoiled[0, 2, 1, 1] = bad
+            yield refused(f"{bad} in one place", partial(session.run, spoiled), WindowError, model)
 
 
 def windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
@@ -220,11 +213,7 @@ def pads(contract: Contract) -> Mapping[str, Pad]:
 
 
 def _graph(
-    name: str,
-    window: NDArray[np.float32],
-    one: ModelSession,
-    several: ModelSession,
-    peer: ModelSession | None,
+    name: str, window: NDArray[np.float32], one: ModelSession, several: ModelSession, peer: ModelSession | None
 ) -> Iterator[Case]:
     pattern = one.run(window).copy()
     size, full_scale = float(np.abs(pattern).max()), one.contract.output_full_scale
@@ -239,29 +228,22 @@ def _graph(
     yield Case(name, what, spread / max(size, full_scale), most, model=one.name)
     if peer is not None and (touch or name in extreme_windows(one.contract)):
         apart = float(np.abs(peer.run(window) - pattern).max())
-        quiet = name in ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
-        share = apart / full_scale if quiet else apart / max(size, full_scale)
-        most = QUIET if quiet else INT8_PRESS if touch else INT8_BEYOND
+        share, most = apart / max(size, full_scale), INT8_PRESS if touch else INT8_BEYOND
+        if name in NO_TOUCH:
+            share, most = apart / full_scale, QUIET
         yield Case(name, "int8 to float32", share, most, model=one.name)
 
 
 def largest(session: ModelSession, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> float:
     """Return the largest value of pattern and deviation; NaN unless all are finite and every deviation is above 0."""
-    pattern = session.run(window, pad)
-    maps = [pattern] if session.deviation is None else [pattern, session.deviation]
-    return largest_of(maps, session.deviation)
+    return largest_of(session.run(window, pad), session.deviation)
 
 
-def largest_of(maps: list[NDArray[np.float32]], deviation: NDArray[np.float32] | None) -> float:
-    """Return the largest value of maps; NaN unless all are finite and every deviation is above 0."""
+def largest_of(pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None) -> float:
+    """Return the largest value of both; NaN unless all are finite and every deviation is above 0."""
+    maps = [pattern] if deviation is None else [pattern, deviation]
     sure = all(np.isfinite(one).all() for one in maps) and (deviation is None or bool((deviation > 0).all()))
     return max(float(np.abs(one).max()) for one in maps) if sure else float("nan")
-
-
-def _with(window: NDArray[np.float32], value: float) -> NDArray[np.float32]:
-    changed = window.copy()
-    changed[0, 2, 1, 1] = value
-    return changed
 
 
 def program_cases() -> Iterator[Case]:
@@ -297,14 +279,11 @@ def played(name: str, model: ModelSession, raw: NDArray[np.int32], patterns: boo
     noise = np.arange(TOUCHED_SCANS)[:, None, None, None] % 2  # a taxel without noise is stuck
     touched = np.where((raw <= 0) | (raw == LARGEST), raw, raw + noise)  # a saturated one has none, nor an absent one
     results = infer(model, np.concatenate([_free(FREE_SCANS), touched]), _free(FREE_SCANS))[FREE_SCANS:]
-    made = [result for result in results[KEPT_SCANS:] if result.pattern is not None]
+    made = [(result.pattern, result.deviation) for result in results[KEPT_SCANS:] if result.pattern is not None]
     states = ", ".join(dict.fromkeys(result.state for result in results))
     if not patterns:
         return Case(name, "patterns made of it", float(len(made)), 0.0, states, model.name)
-    sizes = [
-        largest_of([one for one in (result.pattern, result.deviation) if one is not None], result.deviation)
-        for result in made
-    ]
+    sizes = [largest_of(pattern, deviation) for pattern, deviation in made]
     return Case(name, "largest in a record, mm", float(np.max(sizes, initial=0.0)), MOST_MM, states, model.name)
 
 
@@ -335,11 +314,9 @@ PARTS: Final[Mapping[str, Callable[[], Iterator[Case]]]] = {
 
 def worst(cases: list[Case]) -> list[Case]:
     """Return, of rows that differ in the model alone, those that are broken, or else the one nearest to its bound."""
-    alike: dict[tuple[str, str, float], list[Case]] = {}
-    for case in cases:
-        alike.setdefault((case.name, case.what, case.most), []).append(case)
     kept: list[Case] = []
-    for same in alike.values():
+    for key in dict.fromkeys((case.name, case.what, case.most) for case in cases):
+        same = [case for case in cases if (case.name, case.what, case.most) == key]
         kept += [case for case in same if not case.holds] or [max(same, key=lambda case: case.value or 0.0)]
     return kept
 

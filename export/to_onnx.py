@@ -29,7 +29,7 @@ from export.graphs.intervals import IntervalData
 from export.graphs.parity import check_parity, extreme_windows
 from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
 from train.data.paper_taps import paper_taps
@@ -54,15 +54,13 @@ MOST_COVERAGE_CHANGE: Final = 0.02
 _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
-def contract_of(
-    net: PatternNet, report: dict[str, Any], frozen: FrozenSet, geometry: SensorGeometry, batch: int | str = 1
-) -> Contract:
+def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batch: int | str) -> Contract:
     """Return the contract of a network's graph, with its error still empty.
 
     Raises:
         CheckpointError: the report of the weights lacks a key; the error names it.
     """
-    example = torch.zeros(1, 3 * net.taps, geometry.rows, geometry.cols)
+    example = torch.zeros(1, 3 * net.taps, USPA44.rows, USPA44.cols)
     given = outputs(net, example)
     known = known_width(net)
     try:
@@ -80,10 +78,10 @@ def contract_of(
         output_unit=OUTPUT_UNIT,
         output_full_scale=frozen.full_scale_mm,
         contact_level=contact_level,
-        sensor=geometry.name,
-        rows=geometry.rows,
-        cols=geometry.cols,
-        pitch_mm=geometry.pitch_mm,
+        sensor=USPA44.name,
+        rows=USPA44.rows,
+        cols=USPA44.cols,
+        pitch_mm=USPA44.pitch_mm,
         arithmetic="float32",
         interval_factor=float(half_width_mm(1.0)) if len(given) > 1 else None,
         confidence={},
@@ -92,7 +90,7 @@ def contract_of(
         test_error={},
         pad_inputs=tuple(input_scale()) if known else (),
         takes_gains=bool(known),
-        traction_scale=given[2].shape[-1] // geometry.cols if len(given) > 2 else None,
+        traction_scale=given[2].shape[-1] // USPA44.cols if len(given) > 2 else None,
         takes_poses=net.takes_poses,
         reach_mm=REACH_MM if net.takes_poses else 0.0,
     )
@@ -102,11 +100,9 @@ def export(
     checkpoint: Path,
     folder: Path,
     frozen: FrozenSet,
-    geometry: SensorGeometry = USPA44,
+    *,
     batch: int | str = 1,
     calibration: PressSet | None = None,
-    *,
-    every: bool = False,
     validation: Sequence[FrozenSet] = (),
     trust: TrustFit | None = None,
     intervals: IntervalData | None = None,
@@ -118,21 +114,18 @@ def export(
 
     Args:
         checkpoint: NAME.pt of train.fit.
-        folder: folder of the model.
+        folder: of the model.
         frozen: the test set.
-        geometry: of the sensor.
         batch: windows in one run, or ANY_BATCH.
         calibration: training taps from which int8 ranges are measured; None for float32.
-        every: quantise all convolutions, not only the expensive ones.
-        validation: sets apart from test and training, on which confidence is fitted; without them, the contract's
-            confidence stays empty.
+        validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
         trust: forward model and checks for the contract; None for none.
         intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
         one_tap: name of the model in `folder` by which one that takes poses infers single taps; None for its own.
     """
     net, report = load_network(checkpoint)
     write_out(net)
-    contract = contract_of(net, report, frozen, geometry, batch)
+    contract = contract_of(net, report, frozen, batch)
     level = contract.contact_level
     if intervals is not None and contract.interval_factor is not None:
         report = {**report, "options": {**report["options"], "intervals": True}}
@@ -143,22 +136,22 @@ def export(
         found = intervals.corrected(net, level)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
     traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
-    single = to_model(net, geometry, traced)
+    single = to_model(net, traced)
     parity = check_parity(net, single, frozen, contract)
     if calibration is None:
-        model = single if batch == traced else to_model(net, geometry, batch)
+        model = single if batch == traced else to_model(net, batch)
         if model is not single:
             check_parity(net, model, frozen, contract)
         return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
 
     beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
-    quantise = partial(quantised, seen=calibration_batch(calibration, contract), every=every, beyond=beyond)
+    quantise = partial(quantised, seen=calibration_batch(calibration, contract), beyond=beyond)
     integers = quantise(single)
     if intervals is not None:
         found = intervals.conformed(net, integers)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        integers = quantise(to_model(net, geometry, traced))
-    model = integers if batch == traced else quantise(to_model(net, geometry, batch))
+        integers = quantise(to_model(net, traced))
+    model = integers if batch == traced else quantise(to_model(net, batch))
     integer, convs = convolutions(model)
     float_error = writer.error(single, contract)
     contract = replace(contract, arithmetic="int8", test_error={}, confidence={})
@@ -187,36 +180,21 @@ def _batch(text: str) -> int | str:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.to_onnx", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
-    parser.add_argument(
-        "--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them"
-    )
-    parser.add_argument(
-        "--intervals", type=Path, nargs="+", metavar="DATA", help="training presses on which intervals are fitted"
-    )
-    parser.add_argument(
-        "--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust"
-    )
-    parser.add_argument(
-        "--one-tap",
-        metavar="NAME",
-        help="model in --out by which networks that take poses infer single taps (default: the network itself)",
-    )
-    parser.add_argument(
-        "--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training"
-    )
-    parser.add_argument(
-        "--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx too, with ranges from these taps"
-    )
-    parser.add_argument(
-        "--all-integers", action="store_true", help="with --int8: quantise all convolutions, not only the large ones"
-    )
+    add = parser.add_argument
+    add("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
+    add("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
+    add("--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them")
+    help_of_intervals = "training presses on which intervals are fitted"
+    add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
+    add("--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust")
+    help_of_one_tap = "model in --out by which networks that take poses infer single taps (default: the network itself)"
+    add("--one-tap", metavar="NAME", help=help_of_one_tap)
+    add("--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training")
+    help_of_int8 = "write NAME-int8.onnx too, with ranges from these taps"
+    add("--int8", type=Path, nargs="+", metavar="DATA", help=help_of_int8)
     options = parser.parse_args(arguments)
     if options.trust is not None and options.validation is None:
         parser.error("--trust needs --validation, on which limits are set")
-    if options.int8 is None and options.all_integers:
-        parser.error("--all-integers needs --int8")
     if options.intervals is not None and options.validation is None:
         parser.error("--intervals needs --validation")
     lines: list[str] = []
@@ -241,7 +219,6 @@ def main(arguments: list[str] | None = None) -> None:
                 frozen,
                 batch=options.batch,
                 calibration=taps,
-                every=options.all_integers,
                 validation=validation,
                 trust=trust,
                 intervals=intervals,

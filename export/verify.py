@@ -29,7 +29,7 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
-from export.graphs.graph import outputs
+from export.graphs.graph import ONE_TAP, contract_in, in_float, network_of, origin_of, outputs
 from export.graphs.joined import branches
 from export.graphs.parity import (
     EXTREME_TOLERANCE,
@@ -42,7 +42,6 @@ from export.graphs.parity import (
     extreme_windows,
     read_windows,
 )
-from export.graphs.reference import ONE_TAP, contract_in, in_float, network_of, origin_of
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
@@ -53,13 +52,11 @@ from train.networks.fusion import OneOrMoreNet
 
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
-INT8_READ: Final = 0.25
-"""Largest relative difference of int8 from its network on readings, in any pixel.
+BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 0.75)}
+"""Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch.
 
-Measured: .10 on the test set, .17 on recordings.
+Measured in int8: .10 on the test set, .17 on recordings; beyond any touch .57, a bound against nonsense alone.
 """
-INT8_EXTREME: Final = 0.75
-"""On windows beyond any touch: against nonsense, not an accuracy; measured: .57 at ten times the range."""
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "one tap", "recordings")
 PASSES: Final = 1 + len(LEVELS)
@@ -68,16 +65,7 @@ PASSES: Final = 1 + len(LEVELS)
 
 @dataclass(frozen=True, slots=True)
 class Parity:
-    """Comparison of one graph at one level on some windows.
-
-    Attributes:
-        model: its name.
-        level: of optimisation.
-        windows: name of the windows.
-        differences: by output; empty if the outputs could not be compared.
-        psnr_change_db: PSNR of the graph over the network's, if there is a truth.
-        broken: description of the broken bound, or "".
-    """
+    """Comparison of one graph at one level on some windows: differences by output, and which bound is broken, or ""."""
 
     model: str
     level: str
@@ -88,8 +76,8 @@ class Parity:
 
     def cells(self) -> list[str]:
         """Return the comparison as cells of a table."""
-        largest = " ".join(f"{difference.largest:.1e}" for difference in self.differences) or "-"
-        relative = " ".join(f"{difference.relative:.1e}" for difference in self.differences) or "-"
+        largest = " ".join(f"{one.largest:.1e}" for one in self.differences) or "-"
+        relative = " ".join(f"{one.relative:.1e}" for one in self.differences) or "-"
         change = "-" if self.psnr_change_db is None else f"{self.psnr_change_db:+.4f}"
         return [self.model, self.level, self.windows, largest, relative, change, self.broken or "holds"]
 
@@ -105,14 +93,10 @@ def verify(
     *,
     on_pass: Callable[[], object] = lambda: None,
 ) -> Iterator[Parity]:
-    """Compare one model with its network at every level, on every kind of windows.
+    """Compare one model with its network at every level, on every kind of windows; `on_pass` is called PASSES times.
 
-    Args:
-        path: NAME.onnx or NAME-int8.onnx; the latter needs NAME.onnx in the same folder, or NAME.pt in `checkpoints`.
-        frozen: the test set; a model of another scale is compared with its network, but not evaluated.
-        checkpoints: folder of NAME.pt; None to restore networks from the float32 graphs.
-        recordings: folder of TRIAL/xela_SENSOR.csv; None for no recordings.
-        on_pass: called PASSES times, each time after all windows were run.
+    Without `checkpoints`, the folder of NAME.pt, the network is restored from NAME.onnx, that of NAME-int8.onnx too.
+    A model of another scale than the test set's is compared with its network, but not evaluated.
 
     Raises:
         ModelError: no model, or an invalid contract.
@@ -121,12 +105,9 @@ def verify(
     model = _load(path)
     try:
         contract = contract_in(model)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
-    try:
         net = _network(path, model, contract, checkpoints)
-    except ExportError as error:
-        raise ExportError(f"{path}: {error}") from error
+    except (ModelError, ExportError) as error:
+        raise type(error)(f"{path}: {error}") from error
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
     if recordings is not None:
         groups["recordings"] = recorded_windows(recordings, contract)
@@ -139,8 +120,14 @@ def verify(
     for level in LEVELS:
         run = GraphRun(model, level)
         for name, windows in groups.items():
-            given = run(windows)
-            yield _judge(path.stem, level, name, contract, expected[name], given, truth if name == "test set" else None)
+            found, change_db, broken = (), None, ""
+            try:
+                found, change_db, broken = _judge(
+                    name, contract, expected[name], run(windows), truth if name == "test set" else None
+                )
+            except ParityError as error:
+                broken = str(error)
+            yield Parity(path.stem, level, name, found, change_db, broken)
         on_pass()
 
 
@@ -159,25 +146,20 @@ def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
 
 
 def _judge(
-    model: str,
-    level: str,
     windows: str,
     contract: Contract,
     expected: list[NDArray[np.float32]],
     given: list[NDArray[np.float32]],
     truth: NDArray[np.float32] | None,
-) -> Parity:
+) -> tuple[tuple[Difference, ...], float | None, str]:
+    """Return the differences, the graph's PSNR over the network's if there is a truth, and the broken bound or ""."""
     full_scale = contract.output_full_scale
-    try:
-        found = tuple(differences(list(contract.output_shapes), expected, given, full_scale))
-    except ParityError as error:
-        return Parity(model, level, windows, (), None, str(error))
+    found = tuple(differences(list(contract.output_shapes), expected, given, full_scale))
     change_db = None
     if truth is not None:
         change_db = float((psnr_db(given[0], truth, full_scale) - psnr_db(expected[0], truth, full_scale)).mean())
-    bound = TOLERANCE if windows in READINGS else EXTREME_TOLERANCE
-    if contract.arithmetic == "int8":
-        bound = INT8_READ if windows in READINGS else INT8_EXTREME
+    read_bound, extreme_bound = BOUNDS[contract.arithmetic]
+    bound = read_bound if windows in READINGS else extreme_bound
     broken, largest = "", max(found, key=lambda one: one.relative / accepted(one.output, bound))
     if not largest.relative <= (most := accepted(largest.output, bound)):
         broken = f"{largest.output} differs by {largest.relative:.1e}, more than {most:g}"
@@ -185,7 +167,7 @@ def _judge(
         broken = f"{-change_db:.3f} dB lost, more than {MOST_LOSS_DB}"
     if len(given) > 1 and not (given[1] > 0).all():
         broken = "a deviation is not above zero"
-    return Parity(model, level, windows, found, change_db, broken)
+    return found, change_db, broken
 
 
 def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints: Path | None) -> PatternNet:
@@ -243,12 +225,12 @@ def _worst(rows: list[Parity]) -> list[Parity]:
     """Return all rows of readings; of extreme windows those that break a bound, or else the largest difference."""
     shown: dict[tuple[str, str, str], list[Parity]] = {}
     for row in rows:
-        read = row.windows in READINGS
-        shown.setdefault((row.model, row.level, row.windows if read else ""), []).append(row)
+        shown.setdefault((row.model, row.level, row.windows if row.windows in READINGS else ""), []).append(row)
     kept: list[Parity] = []
     for same in shown.values():
-        broken = [row for row in same if row.broken]
-        kept += broken or [max(same, key=lambda row: max(difference.relative for difference in row.differences))]
+        kept += [row for row in same if row.broken] or [
+            max(same, key=lambda row: max(d.relative for d in row.differences))
+        ]
     return kept
 
 

@@ -38,12 +38,10 @@ TAPS: Final = 4
 FORCE_N: Final = 5.0
 SCALE: Final = 10
 RATE_HZ: Final = 100.0
-REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES = 150, 20, 24, 12, 24
+REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 150, 20, 24, 12, 24, 30
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
-MAGNET_FRAMES: Final = 80
-"""Frames in which the magnet comes near, and in which it leaves."""
-MAGNET_ALONE_FRAMES: Final = 30
-"""Frames for which it stays before the pad is tapped."""
+MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30
+"""Frames in which the magnet comes near, and in which it leaves, and for which it stays before the pad is tapped."""
 MAGNET_MM: Final = (150.0, 45.0)
 """Distance at which it begins and ends, and at which it stays, in [mm]."""
 MAGNET_COUNTS: Final = 900.0
@@ -55,22 +53,15 @@ OPTIONS_MM: Final = HALF_PITCH_MM * np.array(
     [(x, y) for y in range(1 - TAPS, TAPS) for x in range(1 - TAPS, TAPS)], dtype=np.float64
 )
 """Places of the options in the first tap's axes: each tap may be proposed half a pitch from the one before."""
-LETTER: Final = "S"
-LETTER_WIDTH_MM: Final = 14.0
-"""Width of the long letter, which one lane of the pad covers."""
-LETTER_Y_MM: Final = 60.0
-"""Place of the long letter in the object's plane, so that it does not lie under the taps."""
-LETTER_PX_PER_MM: Final = 4.0
-STILL_FRAMES: Final = 30
+LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
+"""Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps."""
 SPEED_MM_S: Final = 20.0
 FIGURE_MM: Final = 50.0
 """Longest side of the long letter."""
 HALF_LENGTH_MM: Final = 30.0
-_SLIDE_SEED: Final = 500
 _RASTER_MM: Final = 0.05
 _DRAG_MM: Final = 0.3
 """Movement of the object against the pad's face that friction carries while it slides, in [mm]."""
-_FRICTION: Final = (0.2, 0.8)
 _INDENTATION_MM: Final = (0.15, 0.4)
 _AT_ONCE: Final = 50
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
@@ -94,11 +85,11 @@ def demo_recording() -> dict[str, NDArray]:
     magnet = _magnet()
     magnet[MAGNET_FRAMES + MAGNET_ALONE_FRAMES :][:TAP_FRAMES] += later[2]
     rng = np.random.default_rng([SEED, 2])
-    still = np.rint(rng.normal(0, Nuisances().noise_counts, (REST_FRAMES, *USPA44.scan_shape)))
+    still = _noise(rng, REST_FRAMES).round()
     rest = draw_rest(rng, USPA44).round()
-    magnet += rng.normal(0, Nuisances().noise_counts, magnet.shape)
+    magnet += _noise(rng, len(magnet))
     slid, way, letter = _slide(pad)
-    after = np.rint(rng.normal(0, Nuisances().noise_counts, (STILL_FRAMES, *USPA44.scan_shape)))
+    after = _noise(rng, STILL_FRAMES).round()
     parts = [still, *pressed, later[0], later[1], magnet.round(), slid, after]
     counts = rest + np.concatenate(parts)
     scenes = [-1] * (1 + TAPS) + [FOREIGN_SCENE] * 2 + [MAGNET_SCENE, SLIDE_SCENE, -1]
@@ -106,12 +97,10 @@ def demo_recording() -> dict[str, NDArray]:
     scene = np.repeat(scenes, lengths)
     begins = np.cumsum([0, *lengths])
     scene[begins[-3] - GAP_FRAMES : begins[-3]] = -1
-    shares = np.tile(_course(), (TAPS, 1))
     end_mm = taps.indentation_mm[:, -1]
-    share = np.zeros(len(counts))
-    share[REST_FRAMES : REST_FRAMES + shares.size] = shares.ravel()
-    tap = np.zeros(len(counts), dtype=int)
-    tap[REST_FRAMES : REST_FRAMES + shares.size] = np.repeat(np.arange(TAPS), TAP_FRAMES)
+    share, tap = np.zeros(len(counts)), np.zeros(len(counts), dtype=int)
+    scored = slice(REST_FRAMES, REST_FRAMES + TAPS * TAP_FRAMES)
+    share[scored], tap[scored] = np.tile(_course(), TAPS), np.repeat(np.arange(TAPS), TAP_FRAMES)
     tapped = [_stated(0, 0, angles_deg[0] - angle) for angle in (*angles_deg, *later_deg[:3])]
     return {
         "format": np.array(NPZ_FORMAT),
@@ -134,6 +123,10 @@ def demo_recording() -> dict[str, NDArray]:
         "letter_px_per_mm": np.array(LETTER_PX_PER_MM),
         "letter_centre_mm": np.array((0.0, LETTER_Y_MM)),
     }
+
+
+def _noise(rng: np.random.Generator, frames: int) -> NDArray[np.float64]:
+    return rng.normal(0, Nuisances().noise_counts, (frames, *USPA44.scan_shape))
 
 
 def _stated(x_mm: float, y_mm: float, turn_deg: float) -> tuple[float, ...]:
@@ -180,7 +173,7 @@ def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], N
 
     The robot's error of pose is drawn once: that of a mounting by hand does not average out.
     """
-    lying = affinity.rotate(figure(LETTER), 90, origin=(0, 0))
+    lying = affinity.rotate(figure("S"), 90, origin=(0, 0))
     left, low, right, high = lying.bounds
     flat = LETTER_WIDTH_MM / FIGURE_MM * (right - left) / (high - low)
     outline = affinity.scale(affinity.scale(lying, 1, flat, origin=(0, 0)), 1, -1, origin=(0, 0))
@@ -188,9 +181,9 @@ def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], N
     x_mm, y_mm, factor = (left + right) / 2, (low + high) / 2, FIGURE_MM / max(right - left, high - low)
     outline = affinity.translate(affinity.scale(outline, factor, factor, origin=(x_mm, y_mm)), -x_mm, -y_mm)
 
-    rng = np.random.default_rng([_SLIDE_SEED, 18])
+    rng = np.random.default_rng([500, 18])
     length = round(2 * HALF_LENGTH_MM / SPEED_MM_S * RATE_HZ)
-    friction, turn_deg = rng.uniform(*_FRICTION), float(rng.uniform(-10, 10))
+    friction, turn_deg = rng.uniform(0.2, 0.8), float(rng.uniform(-10, 10))
     place = np.stack([np.linspace(-HALF_LENGTH_MM, HALF_LENGTH_MM, length)] + [np.zeros(length)] * 2, axis=1)
     place[:, 2] = turn_deg
     wave = np.sin(2 * np.pi * (np.arange(length) / length * rng.uniform(1, 3) + rng.random()))
@@ -249,7 +242,7 @@ def _course() -> NDArray[np.float64]:
     """Return the share of the press in each frame of a tap."""
     down, hold = np.linspace(0, 1, PRESS_FRAMES + 1)[1:], np.ones(HOLD_FRAMES)
     course = np.concatenate([down, hold, np.linspace(1, 0, LIFT_FRAMES + GAP_FRAMES)])
-    course[PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES :] = 0
+    course[-GAP_FRAMES:] = 0
     return course
 
 

@@ -1,11 +1,4 @@
-"""Errors of training.
-
-TrainError
-+-- SurfaceError (ValueError)  unknown name of a surface
-+-- MeshError (ValueError)     a mesh file that cannot be tapped
-+-- CheckpointError (ValueError)  weights that cannot be used
-+-- DatasetError (ValueError)  a file of taps that cannot be read or written
-"""
+"""Errors of training: TrainError is the root of all others."""
 
 
 class TrainError(Exception):

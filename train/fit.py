@@ -38,12 +38,8 @@ _COMPACT: Final = ("compact-", "small-", "fusion-")
 BUNDLED: Final = (
     Training("stsr", "compact-stsr", Recipe(steps=24_000, learning_rate=3e-3), options=_KNOWN),
     Training("stsr-small", "small-stsr", Recipe(steps=8000, learning_rate=3e-3), options=_KNOWN),
-    Training(
-        "mtsr4", "compact-mtsr4", Recipe(steps=3000, learning_rate=7e-4, given=GIVEN[4]), start="stsr", options=_KNOWN
-    ),
-    Training(
-        "mtsr2", "compact-mtsr2", Recipe(steps=1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN
-    ),
+    Training("mtsr4", "compact-mtsr4", Recipe(3000, learning_rate=7e-4, given=GIVEN[4]), start="stsr", options=_KNOWN),
+    Training("mtsr2", "compact-mtsr2", Recipe(1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN),
     Training("mtsr7-wide", "fusion-mtsr7", Recipe(steps=56_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
 )
 
@@ -52,8 +48,7 @@ def given_taps(taps: int) -> tuple[float, ...]:
     """Return the shares of windows with 1, 2, ... K taps: about half of them whole, most of the rest with one tap."""
     if taps in GIVEN:
         return GIVEN[taps]
-    shares = [0.3, *[0.25 / (taps - 2)] * (taps - 2), 0.45]
-    return tuple(shares)
+    return (0.3, *[0.25 / (taps - 2)] * (taps - 2), 0.45)
 
 
 def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
@@ -69,15 +64,11 @@ def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int
             "one network with --network"
         )
     frozen = freeze_presses(validation, SEED).as_frozen_set()
+    if shorten < 1:
+        raise ValueError(f"--shorten is {shorten}, expected 1 or more")
     for training in BUNDLED:
-        _say(_line(fit_network(_shortened(training, shorten), data, frozen, folder)))
-
-
-def _shortened(training: Training, divisor: int) -> Training:
-    if divisor < 1:
-        raise ValueError(f"--shorten is {divisor}, expected 1 or more")
-    steps = max(training.recipe.steps // divisor, 1)
-    return replace(training, recipe=replace(training.recipe, steps=steps))
+        recipe = replace(training.recipe, steps=max(training.recipe.steps // shorten, 1))
+        _say(_line(fit_network(replace(training, recipe=recipe), data, frozen, folder)))
 
 
 def _line(report: dict[str, Any]) -> str:
@@ -131,45 +122,30 @@ def _training(options: argparse.Namespace) -> Training:
         minutes=options.minutes,
     )
     compact = options.network.startswith(_COMPACT)
-    return Training(
-        options.name or _name(options.network),
-        options.network,
-        recipe,
-        options.scale,
-        options.start_from,
-        seed=options.seed,
-        options=_KNOWN if compact else {},
-        keep=options.keep,
-    )
-
-
-def _name(network: str) -> str:
-    """Return a checkpoint's name that differs from a bundled one's, which a network of the paper must not overwrite."""
-    return network if network.startswith(_COMPACT) else f"seed-{network}"
+    # A network of the paper must not overwrite a bundled one.
+    name = options.name or (options.network if compact else f"seed-{options.network}")
+    known, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
+    return Training(name, options.network, recipe, options.scale, start, options.seed, known, keep)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m train.fit", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="folder for the checkpoints")
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
-    parser.add_argument("--validation", type=Path, help="presses of the validation set, not used for training")
-    parser.add_argument("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
-    one = parser.add_argument_group("one network instead of the bundled ones")
-    one.add_argument("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
-    one.add_argument(
-        "--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)"
-    )
-    one.add_argument("--start-from", metavar="NAME", help="checkpoint in the same folder to start from")
-    one.add_argument(
-        "--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)"
-    )
-    one.add_argument("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
-    one.add_argument("--steps", type=int, default=9000)
-    one.add_argument("--minutes", type=float, help="end after this time, if the steps take longer")
-    one.add_argument("--batch", type=int, default=64, help="windows in a batch, shared by all devices")
-    one.add_argument("--learning-rate", type=float, default=2e-3)
-    one.add_argument("--bf16", action="store_true", help="multiply in bfloat16")
-    one.add_argument("--seed", type=int, default=1)
+    add, one = parser.add_argument, parser.add_argument_group("one network instead of the bundled ones").add_argument
+    add("folder", type=Path, help="folder for the checkpoints")
+    add("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
+    add("--validation", type=Path, help="presses of the validation set, not used for training")
+    add("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
+    one("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
+    one("--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)")
+    one("--start-from", metavar="NAME", help="checkpoint in the same folder to start from")
+    one("--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)")
+    one("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
+    one("--steps", type=int, default=9000)
+    one("--minutes", type=float, help="end after this time, if the steps take longer")
+    one("--batch", type=int, default=64, help="windows in a batch, shared by all devices")
+    one("--learning-rate", type=float, default=2e-3)
+    one("--bf16", action="store_true", help="multiply in bfloat16")
+    one("--seed", type=int, default=1)
     return parser
 
 

@@ -105,13 +105,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Write classical.npz, taxels.npz, demo.npz, and frozen.npz where it does not exist."""
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="folder for frozen.npz, classical.npz, taxels.npz and demo.npz")
-    parser.add_argument(
-        "--data",
-        type=Path,
-        nargs="+",
-        required=True,
-        help="taps to fit the classical methods and the taxels' covariance on",
-    )
+    help_of_data = "taps to fit the classical methods and the taxels' covariance on"
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help=help_of_data)
     options = parser.parse_args(arguments)
     folder: Path = options.folder
     try:

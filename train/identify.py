@@ -32,7 +32,6 @@ from train.physics.pad_draws import RANGES
 
 _APART: Final = 0.1
 """Least difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
-_PREFIX: Final = "xela_"
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -77,16 +76,12 @@ def table(sensor: str, contacts: int, pad: Pad) -> str:
         f"{sensor}: {contacts} distinct contacts",
         f"{'constant':18} {'prior':>18} {'estimate':>10}  90 % interval",
     ]
-    for name, (low, high) in ((name, RANGES[name]) for name in CONSTANTS if name in PAD_RANGES):
-        known = (
-            f"{pad.constants[name]:10.4g}  {pad.intervals[name][0]:.4g} .. {pad.intervals[name][1]:.4g}"
-            if (name in pad.constants)
-            else f"{'-':>10}  not determined by these contacts"
-        )
-        lines.append(f"{name:18} {f'{low:.4g} .. {high:.4g}':>18} {known}")
-    gains, width = (
-        np.asarray(values).reshape(len(AXES), USPA44.rows, USPA44.cols) for values in (pad.gains, pad.gain_half_widths)
-    )
+    for name in (name for name in CONSTANTS if name in PAD_RANGES):
+        known = f"{'-':>10}  not determined by these contacts"
+        if name in pad.constants:
+            known = f"{pad.constants[name]:10.4g}  " + "{:.4g} .. {:.4g}".format(*pad.intervals[name])
+        lines.append(f"{name:18} {'{:.4g} .. {:.4g}'.format(*RANGES[name]):>18} {known}")
+    gains, width = (np.asarray(values).reshape(USPA44.scan_shape) for values in (pad.gains, pad.gain_half_widths))
     for axis, plane, half in zip(AXES, gains, width, strict=True):
         lines.append(f"gains of {axis}, each within {100 * half.min():.0f} to {100 * half.max():.0f} % of:")
         lines += ["  " + "  ".join(f"{gain:.3f}" for gain in row) for row in plane]
@@ -95,14 +90,17 @@ def table(sensor: str, contacts: int, pad: Pad) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when done, 1 on an error of the user."""
-    options = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
+    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
+    options = parser.parse_args(arguments)
     try:
         contacts = recorded_contacts(options.recordings)
         model = load_contact_model(CONTACTS)
         pads = {}
         for sensor, counts in contacts.items():
             learner = learned(counts, model)
-            name = sensor.removeprefix(_PREFIX)
+            name = sensor.removeprefix("xela_")
             pads[name] = learner.pad()
             sys.stdout.write(table(name, learner.contacts, pads[name]) + "\n")
         if options.out is not None:
@@ -113,13 +111,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"train.identify: {error}\n")
         return 1
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
-    parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
-    return parser
 
 
 if __name__ == "__main__":

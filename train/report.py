@@ -20,26 +20,20 @@ Cell = str | int | float | None
 Row = dict[str, Cell]
 
 _RESAMPLES: Final = 2000
-_LEVEL: Final = 0.95
-_DPI: Final = 110
 
 
 class Report:
     """Collector of an experiment's results, written as NAME.csv, NAME.md and NAME.png.
 
-    Args:
-        name: of the experiment, and of its files.
-        folder: where they go; made if absent.
-        sources: file or files of the experiment, for the head of the page.
-        models: files of models and frozen sets that it uses, looked at when the page is written.
-        quick: the run was cut short for a test: said at the top of the page.
+    The head of the page names the experiment's source, and the models and frozen sets that it has used by then. A quick
+    run was cut short for a test: said at the top of the page.
     """
 
     def __init__(
-        self, name: str, folder: Path, sources: str | Sequence[str], models: Iterable[Path] = (), *, quick: bool = False
+        self, name: str, folder: Path, source: str, models: Iterable[Path] = (), *, quick: bool = False
     ) -> None:
         self._path = folder / name
-        self._sources = [sources] if isinstance(sources, str) else sources
+        self._source = source
         self._models = models
         self._quick = quick
         self._parts: list[str] = []
@@ -51,11 +45,7 @@ class Report:
 
     def table(self, rows: Sequence[Row], caption: str, part: str = "") -> None:
         """Add a table to the page, and write it as NAME.csv or NAME-PART.csv."""
-        self.keep(rows, part)
         self.show(rows, caption)
-
-    def keep(self, rows: Sequence[Row], part: str = "") -> None:
-        """Write rows as NAME.csv or NAME-PART.csv."""
         with self._file(".csv", part).open("w", newline="") as file:
             writer = csv.DictWriter(file, _columns(rows), lineterminator="\n")
             writer.writeheader()
@@ -75,12 +65,12 @@ class Report:
         FigureCanvasAgg(figure)
         yield figure
         path = self._file(".png", part)
-        figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+        figure.savefig(path, dpi=110, metadata={"Software": None})
         self._parts.append(f"![{path.stem}]({path.name})")
 
     def write(self) -> Path:
         """Write the page, and say where it lies."""
-        head = [f"# {self._path.name}", str(provenance(_command(), self._sources, self._models, SEED))]
+        head = [f"# {self._path.name}", str(provenance(_command(), [self._source], self._models, SEED))]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")
         page = self._file(".md", "")
@@ -98,8 +88,14 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     counts = np.bincount(start, minlength=len(order))
     drawn = np.random.default_rng(seed).integers(len(order), size=(_RESAMPLES, len(order)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    low, high = np.quantile(means, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
+
+
+def band(series: Iterable[tuple[NDArray[np.floating], NDArray[np.integer]]]) -> tuple[NDArray, NDArray]:
+    """Return the means of m series of values and taps, (m,), and their intervals' reach to both sides, (2, m)."""
+    mean, bounds = zip(*((values.mean(), bootstrap_interval(values, taps)) for values, taps in series), strict=True)
+    return np.array(mean), np.abs(np.transpose(bounds) - np.array(mean))
 
 
 def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:

@@ -9,7 +9,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +19,6 @@ from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
 from train.learning.tap_checks import fit_posed_tap_network, fit_tap_network
 from train.learning.trust_limits import fit_forward_model
-
-NAME: Final = "trust.json"
-"""File in the folder of the checkpoints."""
-_CONTACT_STEPS: Final = 40_000
-_TAP_STEPS: Final = 20_000
 
 
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
@@ -39,10 +34,10 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
         raise DatasetError("no sequences of turned taps: add a file of 'make_presses --taps 4 --schedule turns'")
     most = int(np.bincount(taps).argmax())  # sequences of one length, of which there are the most
     turned = turned.pick(np.flatnonzero(taps == most)).with_taps(most)
-    steps = max(_TAP_STEPS // shorten, 1)
+    steps = max(20_000 // shorten, 1)
     return {
         "forward": fit_forward_model(presses).to_json(),
-        "contact": fit_contact_network(presses, seed, max(_CONTACT_STEPS // shorten, 1)).to_json(),
+        "contact": fit_contact_network(presses, seed, max(40_000 // shorten, 1)).to_json(),
         "tap": fit_tap_network(turned, seed, steps).to_json(),
         "posed_tap": fit_posed_tap_network(several, seed, steps).to_json(),
         "data_sha256": presses.sha256(),
@@ -52,7 +47,7 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m train.trust", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path, metavar="OUT.json", help=f"{NAME} in the folder of the checkpoints")
+    parser.add_argument("out", type=Path, metavar="OUT.json", help="trust.json in the folder of the checkpoints")
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     parser.add_argument("--shorten", type=int, default=1, help="divide the steps, to try things out (1)")
     parser.add_argument("--seed", type=int, default=1)

@@ -36,14 +36,16 @@ def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
         FrozenSetError: the model takes more taps than the test set has.
     """
 
-    def row(given: int, patterns: NDArray[np.floating], errors: dict[str, NDArray[np.float64]]) -> ErrorRow:
+    def row(
+        given: int, patterns: NDArray[np.floating], level: float, half_width_mm: NDArray[np.floating] | None = None
+    ) -> ErrorRow:
+        error = mean_error(judge(patterns, frozen, level, half_width_mm))
         force_percent = round(force_error_percent(patterns, frozen), 4)
-        return ErrorRow(subject.name, given, mean_error(errors) | {"force_percent": force_percent})
+        return ErrorRow(subject.name, given, error | {"force_percent": force_percent})
 
     if subject.path is None:
-        newest = frozen.newest.astype(np.float32)
-        patterns = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name](newest)
-        yield row(1, patterns, judge(patterns, frozen, CONTACT_LEVEL))
+        method = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name]
+        yield row(1, method(frozen.newest.astype(np.float32)), CONTACT_LEVEL)
         return
     session = ModelSession(Path(subject.path))
     contract = session.contract
@@ -51,7 +53,7 @@ def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
         raise ModelError(f"{subject.path}: contract key 'scale' is {contract.scale}, the test set's is {frozen.scale}")
     for given in sorted({1, contract.taps}):
         patterns, half_width_mm = infer_with_intervals(session, frozen, given)
-        yield row(given, patterns, judge(patterns, frozen, contract.contact_level, half_width_mm))
+        yield row(given, patterns, contract.contact_level, half_width_mm)
 
 
 def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:

@@ -2,26 +2,35 @@
 
 import argparse
 import csv
+import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TextIO
+
+import numpy as np
 
 from edge.bench import contenders
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
 from edge.bench.contenders import Subject
 from edge.bench.errors import BenchError
 from edge.bench.live_report import Page, line
-from edge.bench.processes import measured, start_up
 from edge.bench.provenance import provenance, this_machine, with_head
 from edge.bench.system import show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
+STARTS: Final = 5
+"""Number of starts whose median is the start-up."""
 INTERRUPTED: Final = 130
 """Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
 FULL_TICKS: Final = 3000
 """Fewest ticks for which p99.9 rests on more than the longest few."""
+_BLAS: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
 _ERROR_COLUMNS: Final = (
     *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),
     "force error %",
@@ -136,6 +145,44 @@ def _run_times(
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
         about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
         lines.append(about | figures)
+
+
+def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
+    """Return a child's result of a job of `edge.bench.timing`.
+
+    Raises:
+        BenchError: the child failed; its last line is in the message.
+    """
+    # The child imports the same modules as this process, however they were located.
+    script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
+    variables = {f"{library}_THREADS": str(threads) for library in _BLAS}
+    command, pipe = [sys.executable, "-c", script], subprocess.PIPE
+    environment = os.environ | variables
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as child:
+        try:
+            output, complaint = child.communicate(json.dumps(job))
+        finally:
+            child.kill()  # after a Ctrl-C, Popen itself would leave it running
+    if child.returncode != 0:
+        last = (complaint.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+        raise BenchError(f"{job['do']} of {job.get('subject', {}).get('name', 'the machine')} failed: {last}")
+    return json.loads(output)
+
+
+def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
+    """Return the median time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
+
+    The memory is the most resident until then, median, in [MB]; None where the system does not show it.
+    """
+    took_ms: list[float] = []
+    resident_mb: list[float] = []
+    for _ in range(STARTS):
+        spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
+        answer = measured(job, threads)
+        took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)
+        if answer["resident_mb"] is not None:
+            resident_mb.append(answer["resident_mb"])
+    return float(np.median(took_ms)), float(np.median(resident_mb)) if resident_mb else None
 
 
 def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,17 +33,10 @@ _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MU
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Provenance of a report.
+    """Provenance of a report: how it was made, and the hash, or UNKNOWN, of each model or set and each source it is of.
 
-    Attributes:
-        command: that makes it.
-        date: ISO 8601, UTC.
-        commit: checked out meanwhile, or UNKNOWN.
-        tree: "clean", "changed" since that commit, or a note on the origin of the commit's id.
-        machine: as of `this_machine`.
-        seed: of all chance, or None where each source has its own.
-        models: file below ROOT -> hash, or UNKNOWN, of each model or set that it used.
-        sources: the same of the files and folders that make it.
+    The tree is "clean" or "changed" since the commit, or a note on the origin of its id; the seed is None where each
+    source has its own.
     """
 
     command: str
@@ -121,14 +115,10 @@ def this_machine() -> str:
 
 def _cpu() -> str:
     """Return the model name of the processor; on ARM, where /proc/cpuinfo has none, the board's name."""
-    for path, start in (("/proc/cpuinfo", "model name"), ("/proc/device-tree/model", "")):
-        try:
-            lines = Path(path).read_text(errors="replace").replace("\0", "").splitlines()
-        except OSError:
-            continue
-        for line in lines:
-            if line.startswith(start) and line:
-                return line.partition(":")[2].strip() if start else line
+    for path, pattern in (("/proc/cpuinfo", r"^model name\s*:\s*(.+)$"), ("/proc/device-tree/model", r"^([^\0]+)")):
+        with suppress(OSError):
+            if found := re.search(pattern, Path(path).read_text(errors="replace"), re.MULTILINE):
+                return found[1].strip()
     return platform.processor() or "unknown CPU"
 
 

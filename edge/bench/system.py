@@ -154,7 +154,7 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
     for one in stamps.splitlines():
         sensor, _, time_ns = one.partition(" ")
         times_ns[sensor].append(int(time_ns))
-    first, last = _newest_counters(settled), _newest_counters([*settled, *records])
+    first, last = (_newest_counters(some) for some in (settled, [*settled, *records]))
     lost = sum(last.get(name, 0) - first.get(name, 0) for name in LOST)
     if not records or any(last.get(name, 0) for name in UNMATCHED):
         return Cost(cpu_percent, None, None, lost, resident_mb)
@@ -182,13 +182,8 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     command += ["--stamps", str(folder / "stamps.txt"), *map(str, played)]
     program = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
     program += ["--sink", "status"] if part == "at rest" else ["--sink", "jsonl:-", "--every-scan"]
-    with subprocess.Popen(
-        [sys.executable, *command],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env=environment(ROOT),
-        start_new_session=True,
-    ) as emulators:
+    pipe, null = subprocess.PIPE, subprocess.DEVNULL
+    with _started(command, ROOT, stdin=pipe, stdout=pipe) as emulators:
         try:
             ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
             if not all(ports):
@@ -197,14 +192,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 program += ["--source", f"{prefix.replace('/', '=')}slcan:{port}"]
             with (
                 uncollected(),  # or a pause of our own collector would count as the program's
-                subprocess.Popen(
-                    [sys.executable, *program],
-                    stdin=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    env=environment(tree),
-                    start_new_session=True,
-                ) as process,
+                _started(program, tree, stdin=null, stderr=null, stdout=pipe) as process,
             ):
                 try:
                     yield Program(process, silent=part == "at rest")
@@ -215,10 +203,11 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 emulators.stdin.close()
 
 
-def environment(tree: Path) -> dict[str, str]:
-    """Return the environment for a process of a tree; its bytecode is kept, as that of an installed program is."""
+def _started(arguments: Sequence[str], tree: Path, **pipes: Any) -> subprocess.Popen[bytes]:
+    """Start Python in the tree; its bytecode is kept, as that of an installed program is."""
     paths = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
-    return os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
+    variables = os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
+    return subprocess.Popen([sys.executable, *arguments], env=variables, start_new_session=True, **pipes)
 
 
 def write_recording(path: Path, number: int, *, pressed: bool) -> Path:

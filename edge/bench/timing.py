@@ -17,10 +17,6 @@ from edge.bench.contenders import FROZEN_FILE, Subject, opened
 from edge.errors import EdgeError
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
-_BUDGET_NS: Final = 2_000_000_000
-_LEAST_RUNS: Final = 90
-"""Fewest runs of a measurement, however long one takes."""
-
 Run = Callable[[int], object]
 """One inference; its argument is a number that selects the input."""
 
@@ -38,13 +34,9 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Run times at a rate.
+    """Run times at a rate; missed are ticks whose run was not done, or not begun, when the next was due.
 
-    Attributes:
-        times: of all runs.
-        ticks: number of ticks.
-        missed: ticks whose run was not done, or not even begun, when the next one was due.
-        cpu_percent: of the whole process, in [% of one core].
+    The CPU is of the whole process, in [% of one core].
     """
 
     times: Times
@@ -73,7 +65,7 @@ def _timed(run: Run, numbers: Sequence[int], clock: Clock) -> list[int]:
 def back_to_back(run: Run, most_runs: int, clock: Clock = time.perf_counter_ns) -> Times:
     """Time as many runs as fit into two seconds, 90 at least and `most_runs` at most, one right after the other."""
     estimate_ns = max(1, min(_timed(run, range(5), clock)))
-    runs = min(most_runs, max(_LEAST_RUNS, _BUDGET_NS // estimate_ns))
+    runs = min(most_runs, max(90, 2_000_000_000 // estimate_ns))
     return summary(_timed(run, range(runs), clock))
 
 

@@ -13,18 +13,15 @@ from firmware_bridge.recording.npz_reader import read_npz
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""
 
-_CUBIC_A: Final = -0.5
 _MOST_BYTES: Final = 1 << 28
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
 
 def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
-    """Return the methods by name, with the parameters fitted on training taps.
+    """Return the methods by name, with the parameters fitted on training taps, at a scale in pixels per taxel pitch.
 
-    Args:
-        path: npz of bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels).
-        scale: pattern pixels per taxel pitch.
+    The npz holds bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels).
 
     Raises:
         EdgeError: the file cannot be read.
@@ -84,20 +81,13 @@ def bicubic(taxel_values: NDArray[np.floating], scale: int) -> NDArray[np.float6
 def _cubic_weights(taxels: int, scale: int) -> NDArray[np.float64]:
     """Return the interpolation matrix (taxels*scale, taxels) along one axis, over the two taxels on either side."""
     position = (np.arange(taxels * scale) + 0.5) / scale - 0.5
-    matrix = np.zeros((taxels * scale, taxels))
+    matrix, a = np.zeros((taxels * scale, taxels)), -0.5
     for offset in (-1, 0, 1, 2):
         neighbour = np.floor(position).astype(int) + offset
-        weight = _cubic_kernel(np.abs(position - neighbour))
-        np.add.at(matrix, (np.arange(taxels * scale), np.clip(neighbour, 0, taxels - 1)), weight)
+        x = np.abs(position - neighbour)  # in pitches, 0 to 2
+        near, far = (a + 2) * x**3 - (a + 3) * x**2 + 1, a * (x**3 - 5 * x**2 + 8 * x - 4)
+        np.add.at(matrix, (np.arange(len(matrix)), np.clip(neighbour, 0, taxels - 1)), np.where(x <= 1, near, far))
     return matrix
-
-
-def _cubic_kernel(distance: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the weight of a taxel at a distance of 0 to 2 pitches."""
-    a, x = _CUBIC_A, distance
-    near = (a + 2) * x**3 - (a + 3) * x**2 + 1
-    far = a * (x**3 - 5 * x**2 + 8 * x - 4)
-    return np.where(x <= 1, near, far)
 
 
 def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
@@ -109,12 +99,9 @@ def fit_gain(interpolated: NDArray[np.floating], truth: NDArray[np.floating]) ->
 def fit_linear_map(
     readings: NDArray[np.floating], patterns: NDArray[np.floating], ridge: float = 1e-4
 ) -> NDArray[np.float32]:
-    """Return the least-squares matrix (features, pixels) with readings @ matrix ~ patterns.
+    """Return the least-squares matrix (features, pixels) with readings (n, features) @ matrix ~ patterns (n, pixels).
 
-    Args:
-        readings: (n, features).
-        patterns: (n, pixels).
-        ridge: weight of the penalty on the matrix, as a share of the mean feature energy.
+    The ridge is the weight of the penalty on the matrix, as a share of the mean feature energy.
     """
     x, y = np.asarray(readings, dtype=np.float64), np.asarray(patterns, dtype=np.float64)
     gram = x.T @ x

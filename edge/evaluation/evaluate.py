@@ -1,7 +1,5 @@
 """Evaluation of patterns on the frozen test set, for the figures in contracts, benches and tests."""
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,27 +62,13 @@ def infer_with_intervals(
     The intervals are None if the model gives no deviations.
     """
     contract = model.contract
+    patterns: list[NDArray[np.float32]] = []
     half_widths_mm: list[NDArray[np.float32]] = []
-
-    def run(window: NDArray[np.float32]) -> NDArray[np.float32]:
-        pattern = model.run(window)
+    for window in windows_of(frozen, contract, given):
+        patterns.append(model.run(contract.scale_window(window)).copy())
         if model.deviation is not None and contract.interval_factor is not None:
             half_widths_mm.append(contract.interval_factor * model.deviation)
-        return pattern
-
-    patterns = infer_all(run, contract, frozen, given)
-    return patterns, np.stack(half_widths_mm) if half_widths_mm else None
-
-
-def mean_error(errors: dict[str, NDArray[np.float64]]) -> dict[str, float]:
-    """Return the mean of each metric over all frames, rounded to the resolution of the test set."""
-    return {name: round(float(values.mean()), 4) for name, values in errors.items()}
-
-
-def by_surface(values: NDArray[np.float64], frozen: FrozenSet) -> dict[str, float]:
-    """Return the mean of one metric, (n,), for each surface."""
-    surface = frozen.surface[frozen.tap]
-    return {str(name): float(values[surface == name].mean()) for name in dict.fromkeys(frozen.surface.tolist())}
+    return np.stack(patterns), np.stack(half_widths_mm) if half_widths_mm else None
 
 
 def windows_of(frozen: FrozenSet, contract: Contract, given: int | None = None) -> NDArray[np.float32]:
@@ -95,12 +79,6 @@ def windows_of(frozen: FrozenSet, contract: Contract, given: int | None = None) 
     return frozen.windows(given if contract.takes_poses and given is not None else contract.taps, given)
 
 
-def infer_all(
-    run: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-    contract: Contract,
-    frozen: FrozenSet,
-    given: int | None = None,
-) -> NDArray[np.float32]:
-    """Return the patterns (n, H, W) for every frame, of which `run` makes one of a window in network input units."""
-    windows = windows_of(frozen, contract, given)
-    return np.stack([run(contract.scale_window(window)).copy() for window in windows])
+def mean_error(errors: dict[str, NDArray[np.float64]]) -> dict[str, float]:
+    """Return the mean of each metric over all frames, rounded to the resolution of the test set."""
+    return {name: round(float(values.mean()), 4) for name, values in errors.items()}

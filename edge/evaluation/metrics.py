@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge.perception.contact_patch import touched
 
-_K1: Final = 0.01
-_K2: Final = 0.03
 _WINDOW_SIGMA_PX: Final = 1.5
 _WINDOW_RADIUS_PX: Final = 5
 
@@ -78,13 +76,13 @@ def boundary_distance_mm(
     one is, they are the map's diagonal apart.
     """
     found = _touched(pattern, touching, level)
-    ours, theirs = _outlines(found), _outlines(touching)
     distance_px = np.zeros(len(found))
-    for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
-        if one.any() and other.any():
-            between = _pixels_apart(one, other)
+    for i, outlines in enumerate(zip(_outlines(found), _outlines(touching), strict=True)):
+        one, other = (np.argwhere(pixels).astype(np.float32) for pixels in outlines)
+        if len(one) and len(other):
+            between = np.hypot(*(one[:, None] - other[None]).transpose(2, 0, 1))
             distance_px[i] = (between.min(axis=0).mean() + between.min(axis=1).mean()) / 2
-        elif one.any() or other.any():
+        elif len(one) or len(other):
             distance_px[i] = np.hypot(*found.shape[1:])
     return distance_px * pixel_mm
 
@@ -101,12 +99,6 @@ def _outlines(touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
     around = np.pad(touching, ((0, 0), (1, 1), (1, 1)))
     inside = around[:, :-2, 1:-1] & around[:, 2:, 1:-1] & around[:, 1:-1, :-2] & around[:, 1:-1, 2:]
     return touching & ~inside
-
-
-def _pixels_apart(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the distance of every set pixel of a map from every one of another, in pixels."""
-    here, there = (np.argwhere(pixels).astype(np.float32) for pixels in (one, other))
-    return np.hypot(*(here[:, None] - there[None]).transpose(2, 0, 1))
 
 
 def volume_mm3(patterns: ArrayLike, pixel_mm: float) -> NDArray[np.floating]:
@@ -146,7 +138,7 @@ def _similarity(
         sampled * (mean(one * other) - at_one * at_other)
         for one, other, at_one, at_other in ((a, a, mean_a, mean_a), (b, b, mean_b, mean_b), (a, b, mean_a, mean_b))
     )
-    c1, c2 = (_K1 * full_scale) ** 2, (_K2 * full_scale) ** 2
+    c1, c2 = (0.01 * full_scale) ** 2, (0.03 * full_scale) ** 2
     return ((2 * mean_a * mean_b + c1) * (2 * covariance + c2)) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -103,14 +103,14 @@ class FrozenSet:
     def sha256(self) -> str:
         """Return a hash over all arrays, independent of the file that holds them."""
         digest = hashlib.sha256()
-        for field in fields(self):
-            digest.update(field.name.encode())
-            digest.update(np.ascontiguousarray(getattr(self, field.name)).tobytes())
+        for name in _AXES:
+            digest.update(name.encode())
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
         """Write the set as a compressed npz, in place."""
-        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays = {name: getattr(self, name) for name in _AXES}
         write_in_place(path, lambda draft: np.savez_compressed(draft, **arrays), load_frozen_set)
 
 
@@ -121,7 +121,7 @@ def load_frozen_set(path: Path) -> FrozenSet:
         FrozenSetError: the file is missing, or an array is missing or of another type or shape; the message names it.
     """
     try:
-        arrays = read_npz(path, (field.name for field in fields(FrozenSet)), _MOST_BYTES)
+        arrays = read_npz(path, _AXES, _MOST_BYTES)
         _check_axes(arrays)
     except (OSError, ValueError) as error:
         raise FrozenSetError(

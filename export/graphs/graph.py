@@ -1,13 +1,23 @@
-"""Networks to ONNX graphs: fixed shapes except for the batch, one file, without traces of the machine."""
+"""Networks to ONNX graphs and back: fixed shapes except for the batch, one file, without traces of the machine.
 
+A float32 graph has the weights under the network's own names, and next to its contract the name of the network, so that
+parity can be checked without the checkpoint. Networks whose batch normalisation was folded into the weights, those of
+the paper, need their checkpoint.
+"""
+
+import json
 import logging
 import warnings
-from typing import Final
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
 
 import onnx
 import torch
+from onnx import numpy_helper
 from torch import Tensor, nn
 
+from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import (
     ANY_TAPS,
     DEVIATION_NAME,
@@ -16,11 +26,16 @@ from edge.inference.contract import (
     PAD_NAME,
     POSES_NAME,
     TRACTION_NAME,
+    Contract,
 )
 from edge.inference.pose_input import POSE_WIDTH
 from export.errors import ExportError
-from firmware_bridge.pad_geometry import SensorGeometry
+from export.graphs.joined import branches
+from firmware_bridge.pad_geometry import USPA44
 from train.networks.blocks import PatternNet
+from train.networks.fusion import OneOrMoreNet
+from train.networks.registry import build
+from train.networks.symmetric import write_out
 
 OPSET: Final = 18
 _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
@@ -28,16 +43,15 @@ _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
 _TRACED: Final = 2
 """Windows with which a graph of any batch is traced: with one window, the tracer would take the size 1 as fixed."""
 
+ORIGIN_KEY: Final = "tactile.origin"
+ONE_TAP: Final = "one_tap"
+"""Key of the origin of a graph's branch for a single tap, with the name of that model."""
 
-def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) -> onnx.ModelProto:
-    """Return the network as a checked ONNX graph without a contract.
+
+def to_model(net: PatternNet, batch: int | str = 1) -> onnx.ModelProto:
+    """Return the network as a checked ONNX graph of `batch` windows a run, or ANY_BATCH, without a contract.
 
     The exporter folds batch normalisation into the convolutions before it.
-
-    Args:
-        net: in evaluation mode.
-        geometry: of the sensor.
-        batch: windows in one run, or ANY_BATCH, which is equally fast in onnxruntime.
 
     Raises:
         ExportError: the batch is not positive, or torch returns no graph.
@@ -45,7 +59,7 @@ def to_model(net: PatternNet, geometry: SensorGeometry, batch: int | str = 1) ->
     if not isinstance(batch, str) and batch < 1:
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
     traced = _TRACED if isinstance(batch, str) else batch
-    example = torch.zeros(traced, 3 * net.taps, geometry.rows, geometry.cols)
+    example = torch.zeros(traced, 3 * net.taps, USPA44.rows, USPA44.cols)
     width, free = known_width(net), {0: torch.export.Dim(batch)} if isinstance(batch, str) else {}
     inputs, dims = {INPUT_NAME: example}, {INPUT_NAME: free}
     if net.takes_poses:
@@ -103,3 +117,65 @@ def outputs(
     with torch.inference_mode():
         given = net(windows, **{name: one for name, one in known.items() if one is not None})
     return given if isinstance(given, tuple) else (given,)
+
+
+def contract_in(model: onnx.ModelProto) -> Contract:
+    """Return the contract of a graph."""
+    return Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+
+
+def in_float(path: Path) -> Path:
+    """Return the path of the float32 graph of NAME-int8.onnx; for NAME.onnx its own."""
+    return path.with_name(path.stem.removesuffix(INT8_SUFFIX) + path.suffix)
+
+
+def origin(report: Mapping[str, Any]) -> dict[str, str]:
+    """Return the metadata that identify a graph's network, from a checkpoint's report.
+
+    Fine-tuning for int8 changes the weights, and so makes another network.
+    """
+    stated = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
+    stated |= {ONE_TAP: report[ONE_TAP]} if ONE_TAP in report else {}
+    return {ORIGIN_KEY: json.dumps(stated, sort_keys=True)}
+
+
+def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
+    """Return the metadata that identify a graph's network.
+
+    Raises:
+        ExportError: the metadata are missing.
+    """
+    stated = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
+    if stated is None:
+        raise ExportError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
+    return json.loads(stated)
+
+
+def network_of(model: onnx.ModelProto) -> PatternNet:
+    """Return the network of a float32 graph, in evaluation mode.
+
+    Raises:
+        ExportError: the graph does not identify its network, or lacks its weights.
+    """
+    made, parts = origin_of(model), branches(model)
+    if parts is None:
+        return _restored(made, model.graph)
+    if ONE_TAP not in made:
+        raise ExportError(
+            f"the graph has a branch for a single tap, but '{ORIGIN_KEY}' no '{ONE_TAP}': export it again"
+        )
+    one, more = parts
+    return OneOrMoreNet(_restored(made[ONE_TAP], one), _restored(made, more)).eval()
+
+
+def _restored(made: Mapping[str, Any], graph: onnx.GraphProto) -> PatternNet:
+    net = build(made["network"], made["scale"], **made["options"])
+    write_out(net)
+    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in graph.initializer}
+    lacking = [name for name in net.state_dict() if name not in held]
+    if lacking:
+        raise ExportError(
+            f"the graph does not hold {lacking[0]} and {len(lacking) - 1} more weights: name its checkpoint"
+        )
+    net.load_state_dict({name: held[name].reshape(value.shape) for name, value in net.state_dict().items()})
+    return net.eval()

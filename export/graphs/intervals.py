@@ -21,12 +21,7 @@ _AT_ONCE: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Corrected:
-    """Network whose intervals hold, and its factors at several levels; as it was if it gives no deviations.
-
-    Attributes:
-        net: with a correction.
-        interval_levels: key of the contract.
-    """
+    """Network whose intervals hold, and its factors at several levels; as it was if it gives no deviations."""
 
     net: PatternNet
     interval_levels: dict[str, list[float]]
@@ -34,12 +29,7 @@ class Corrected:
 
 @dataclass(frozen=True, slots=True)
 class IntervalData:
-    """Presses that intervals are made of.
-
-    Attributes:
-        validation: that nothing was trained on.
-        training: on which the correction by window is fitted; None for one by region and number of taps alone.
-    """
+    """Presses that make intervals; without those of training, corrections are by region and number of taps alone."""
 
     validation: PressSet
     training: PressSet | None = None

@@ -1,6 +1,6 @@
 """Parity between a graph and its network at every optimisation level of onnxruntime, with extreme windows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -62,18 +62,23 @@ PARITY_WINDOWS: Final = 100
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference between outputs of a graph and its network over some windows.
+    """Largest difference in an output over some windows: in its unit, and as a share.
 
-    Attributes:
-        output: its name.
-        largest: in the output's unit.
-        relative: as a share of full scale (deviations have none) or, if that is larger, of the network's largest value
-            for the same window: a pattern that is cut at zero may be small where all values before it are large.
+    The share is of full scale (deviations have none) or, if that is larger, of the network's largest value for the
+    same window: a pattern that is cut at zero may be small where all values before it are large.
     """
 
     output: str
     largest: float
     relative: float
+
+
+def batches(inputs: Mapping[str, NDArray[np.float32]], batch: int) -> Iterator[dict[str, NDArray[np.float32]]]:
+    """Yield inputs, (n, ...) each, in batches of one size; the last one is filled with the first windows."""
+    count = len(inputs[INPUT_NAME])
+    places = np.arange(count + -count % batch) % count
+    for first in range(0, len(places), batch):
+        yield {name: given[places[first : first + batch]] for name, given in inputs.items()}
 
 
 class GraphRun:
@@ -102,12 +107,9 @@ class GraphRun:
         pads: NDArray[np.float32] | None = None,
         poses: NDArray[np.float32] | None = None,
     ) -> list[NDArray[np.float32]]:
-        """Return each output (n, ...) of windows (n, 3K, rows, cols); the last batch is padded with zeros.
+        """Return each output (n, ...) of windows (n, 3K, rows, cols) in network units, of pads (n, width) and poses.
 
-        Args:
-            windows: in network units.
-            pads: (n, width), inputs of the pads; None for no constants.
-            poses: (n, K, 5) of the taps, for a graph that takes them; None for the paper's schedule.
+        Without pads no constants are stated, without poses they are the paper's schedule; the last batch is filled.
         """
         count = len(windows)
         inputs = {INPUT_NAME: windows}
@@ -118,14 +120,7 @@ class GraphRun:
             inputs[POSES_NAME] = scheduled if poses is None else poses
         if self._pad_width:
             inputs[PAD_NAME] = np.zeros((count, self._pad_width), np.float32) if pads is None else pads
-        filled = {
-            name: np.concatenate([given, np.zeros((-count % self._batch, *given.shape[1:]), given.dtype)])
-            for name, given in inputs.items()
-        }
-        runs = [
-            self._session.run(None, {name: given[first : first + self._batch] for name, given in filled.items()})
-            for first in range(0, len(filled[INPUT_NAME]), self._batch)
-        ]
+        runs = [self._session.run(None, given) for given in batches(inputs, self._batch)]
         return [np.concatenate(maps)[:count] for maps in zip(*runs, strict=True)]
 
 
@@ -144,36 +139,25 @@ def differences(
     if shapes[0] != shapes[1]:
         raise ParityError(f"outputs of shape {shapes[1]}, expected {shapes[0]}")
     found = []
-    for name, true in zip(names, expected, strict=True):
+    sizes = {name: np.abs(maps).reshape(len(maps), -1).max(axis=1) for name, maps in zip(names, expected, strict=True)}
+    for name, true, mine in zip(names, expected, got, strict=True):
         if not np.isfinite(true).all():
             raise ParityError(f"torch gives a {name} that is not finite")
-    for name, true, mine in zip(names, expected, got, strict=True):
         if not np.isfinite(mine).all():
             raise ParityError(f"the {name} is not finite")
-        same_unit = [
-            maps
-            for other, maps in zip(names, expected, strict=True)
-            if (other == TRACTION_NAME) == (name == TRACTION_NAME)
-        ]
-        size = np.max([_largest(maps) for maps in same_unit], axis=0)
+        same_unit = [size for other, size in sizes.items() if (other == TRACTION_NAME) == (name == TRACTION_NAME)]
         unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: FULL_TRACTION_KPA}.get(name, 0.0)
-        apart = _nearly_largest(mine - true) if name == DEVIATION_NAME else _largest(mine - true)
-        found.append(Difference(name, float(apart.max()), float((apart / np.maximum(unit, size)).max())))
+        apart = np.abs(mine - true).reshape(len(true), -1)
+        # Around a pixel that changes regions a deviation is another one: one pixel in ten may be so.
+        apart = np.quantile(apart, 0.9, axis=1, method="higher") if name == DEVIATION_NAME else apart.max(axis=1)
+        relative = apart / np.maximum(unit, np.max(same_unit, axis=0))
+        found.append(Difference(name, float(apart.max()), float(relative.max())))
     return found
 
 
 def accepted(output: str, tolerance: float) -> float:
     """Return the largest accepted difference in an output, where it is `tolerance` in a pattern."""
     return max(tolerance, DEVIATION_TOLERANCE) if output == DEVIATION_NAME else tolerance
-
-
-def _largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.abs(maps).reshape(len(maps), -1).max(axis=1)
-
-
-def _nearly_largest(maps: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the difference that one pixel in ten exceeds: those around a pixel that changes regions have another."""
-    return np.quantile(np.abs(maps).reshape(len(maps), -1), 0.9, axis=1, method="higher")
 
 
 def example_pads(count: int, width: int) -> NDArray[np.float32]:
@@ -187,7 +171,7 @@ def example_pads(count: int, width: int) -> NDArray[np.float32]:
     values = rng.uniform(-1, 1, (count, constants)) * flags
     pads = np.concatenate([values, flags, rng.uniform(0, 1, (count, width % 2))], axis=1).astype(np.float32)
     pads[::3] = 0
-    return pads.astype(np.float32)
+    return pads
 
 
 def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:

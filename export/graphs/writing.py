@@ -16,8 +16,8 @@ from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
+from export.graphs.graph import ONE_TAP, contract_in, origin, origin_of
 from export.graphs.joined import joined, with_one_tap
-from export.graphs.reference import ONE_TAP, contract_in, origin, origin_of
 from firmware_bridge.in_place import write_in_place
 from train.learning.expected_error_table import fit_confidence
 from train.learning.trust_limits import TrustFit
@@ -25,19 +25,10 @@ from train.learning.trust_limits import TrustFit
 
 @dataclass(frozen=True, slots=True)
 class Writer:
-    """Writer for all models of a checkpoint.
+    """Writer for all models of a checkpoint; the attributes are those of `export.to_onnx.export`.
 
     Errors are those of a batch of one, in the runtime's own session; a model of another scale than the frozen set's is
     not evaluated.
-
-    Attributes:
-        folder: folder of the models.
-        frozen: the test set.
-        validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
-        report: of the checkpoint.
-        trust: forward model and checks, for models of the pad that they were fitted for; None for none.
-        one_tap: name of the model in `folder` that infers single taps for one that takes poses; None for the network
-            itself.
     """
 
     folder: Path

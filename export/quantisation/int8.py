@@ -27,6 +27,7 @@ from edge.inference.onnx_session import LOG_FATAL_ONLY
 from edge.inference.pose_input import scheduled_rows
 from export.errors import ExportError
 from export.graphs.joined import branches
+from export.graphs.parity import batches
 from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import Batch
@@ -68,34 +69,24 @@ def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
 
 class _Inputs(CalibrationDataReader):
     def __init__(self, inputs: dict[str, NDArray[np.float32]], batch: int) -> None:
-        filled = {
-            name: np.concatenate([given, np.resize(given, (-len(given) % batch, *given.shape[1:]))])
-            for name, given in inputs.items()
-        }
-        count = len(filled[INPUT_NAME])
-        self._left = iter(
-            {name: given[first : first + batch] for name, given in filled.items()} for first in range(0, count, batch)
-        )
+        self._left = batches(inputs, batch)
 
     def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         return next(self._left, None)
 
 
-def quantised(
-    model: onnx.ModelProto, seen: Batch, *, every: bool = False, beyond: NDArray[np.float32] | None = None
-) -> onnx.ModelProto:
+def quantised(model: onnx.ModelProto, seen: Batch, *, beyond: NDArray[np.float32] | None = None) -> onnx.ModelProto:
     """Return the graph with quantise and dequantise nodes around all nodes that may be quantised.
 
     Args:
         model: in float.
         seen: batch from which the ranges are measured, light contacts included.
-        every: quantise all convolutions, not only the expensive ones.
         beyond: windows (n, 3K, rows, cols) that widen the ranges to their own; None for none.
 
     Raises:
         ExportError: no node of the graph may be quantised.
     """
-    nodes, batch = integer_nodes(model, every=every), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
+    nodes, batch = integer_nodes(model), model.graph.input[0].type.tensor_type.shape.dim[0].dim_value or 1
     if not nodes:
         raise ExportError("no convolution of the graph may be quantised: export it without --int8")
     touches = _Inputs(_inputs(model, seen), batch)

@@ -7,7 +7,6 @@ its time with four taps, except for the convolutions of the inputs. Those that r
 their range is a factor.
 """
 
-from collections.abc import Iterable
 from typing import Final
 
 import onnx
@@ -25,8 +24,8 @@ def takes_poses(model: onnx.ModelProto) -> bool:
     return any(given.name == POSES_NAME for given in model.graph.input)
 
 
-def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
-    """Return the names of the nodes to quantise, in the graph's order; `every`: with all convolutions."""
+def integer_nodes(model: onnx.ModelProto) -> list[str]:
+    """Return the names of the nodes to quantise, in the graph's order."""
     shapes = _shapes(model)
     made_by = {name: node for node in model.graph.node for name in node.output}
     convs = [node for node in model.graph.node if node.op_type == "Conv"]
@@ -37,10 +36,10 @@ def integer_nodes(model: onnx.ModelProto, *, every: bool = False) -> list[str]:
         windows = _runs(shapes, convs[0])  # the newest taps enter first, one a window
         costly |= {node.name for node in convs if _runs(shapes, node) != windows}
         kept |= _first_convolutions(model) | {node.name for node in convs if _reads_logarithms(node, made_by)}
-    chosen = {node.name for node in convs if every or node.name in costly - kept}
+    chosen = {node.name for node in convs if node.name in costly - kept}
     for node in model.graph.node:  # every node comes after those of its inputs
         takes = [made_by[name].name for name in node.input if name in made_by]
-        if takes and PASSING_ON.get(node.op_type, _never)(name in chosen for name in takes):
+        if takes and node.op_type in PASSING_ON and PASSING_ON[node.op_type](name in chosen for name in takes):
             chosen.add(node.name)
     return [node.name for node in model.graph.node if node.name in chosen]
 
@@ -51,10 +50,6 @@ def newest_values(model: onnx.ModelProto) -> set[str]:
     windows = _runs(shapes, next(node for node in model.graph.node if node.op_type == "Conv"))
     layers = [node for node in model.graph.node if node.op_type in ("Conv", "Relu")]
     return {name for node in layers if _runs(shapes, node) == windows for name in node.output}
-
-
-def _never(_: Iterable[bool]) -> bool:
-    return False
 
 
 def _first_convolutions(model: onnx.ModelProto) -> set[str]:

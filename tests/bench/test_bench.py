@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from edge_samples import ROOT, make_contract, write_model
 
-from edge.bench import processes
+from edge.bench import command
 from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
 from edge.bench.contenders import Subject, subjects
 from edge.bench.errors import BenchError
@@ -38,7 +38,7 @@ def bench(tmp_path_factory):
     (mine / "broken.onnx").write_text("no model")
     arguments = ["--rate-hz", "1000", "--ticks", "30", "--threads", "1", "--models", str(mine)]
     arguments += ["--only", "mine/tiny", "mine/coarse", "bilinear", "--out", str(folder / "out")]
-    script = "import sys; from edge.bench import processes; processes.STARTS = 1; from edge.cli.main import main; "
+    script = "import sys; from edge.bench import command; command.STARTS = 1; from edge.cli.main import main; "
     done = subprocess.run(
         [sys.executable, "-c", f"{script}sys.exit(main(['bench', *sys.argv[1:]]))", *arguments],
         cwd=ROOT,
@@ -126,7 +126,7 @@ def test_what_cannot_be_used_is_said_in_a_line_before_anything_is_measured(argum
 def test_a_child_that_fails_is_named_with_its_reason():
     subject = {"name": "lost", "path": "/nowhere.onnx"}
     with pytest.raises(BenchError, match=r"first of lost failed: /nowhere.onnx: cannot be read"):
-        processes.measured({"do": "first", "subject": subject, "threads": 1, "window": []})
+        command.measured({"do": "first", "subject": subject, "threads": 1, "window": []})
 
 
 def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):

@@ -34,37 +34,22 @@ def pace(clock, run, ticks, rate_hz=100.0):
     return paced(run, rate_hz, ticks, clock, clock.sleep, cpu_clock=lambda: clock.now_ns // 4)
 
 
-def test_a_quick_run_is_done_at_every_tick_and_misses_none():
+@pytest.mark.parametrize(
+    ("took_ms", "ticks", "done", "missed"),
+    [
+        ((2,), 20, range(1, 21), 0),
+        ((2, 12, 2), 10, range(1, 11), 1),  # not done when the next is due
+        ((2, 35, 2), 10, [1, 2, 5, 6, 7, 8, 9, 10], 3),  # due at 20 ms, done at 55: 3 and 4 have passed, 5 begins late
+        ((60,), 30, [1, 7, 13, 19, 25], 30),
+    ],
+)
+def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, missed):
     clock = Clock()
-    run, numbers = clock.work(2)
-    found = pace(clock, run, 20)
-    assert numbers == list(range(1, 21))
-    assert (found.missed, found.ticks, found.times.runs) == (0, 20, 20)
-    assert (found.times.p50_us, found.times.max_us) == (2000, 2000)
+    run, numbers = clock.work(*took_ms)
+    found = pace(clock, run, ticks)
+    assert (numbers, found.missed, found.ticks, found.times.runs) == ([*done], missed, ticks, len(numbers))
     assert found.cpu_percent == pytest.approx(25)
-
-
-def test_ticks_that_pass_during_a_long_run_are_missed_too():
-    clock = Clock()
-    run, numbers = clock.work(2, 35, 2)  # due at 20 ms, done at 55: ticks 2, 3, 4 have passed, 5 is begun late
-    found = pace(clock, run, 10)
-    assert numbers == [1, 2, 5, 6, 7, 8, 9, 10]
-    assert found.missed == 3
-
-
-def test_a_run_longer_than_a_period_misses_every_tick():
-    clock = Clock()
-    run, numbers = clock.work(60)
-    found = pace(clock, run, 30)
-    assert found.missed == 30
-    assert len(numbers) == found.times.runs == 5
-
-
-def test_a_run_that_is_not_done_when_the_next_is_due_is_missed():
-    clock = Clock()
-    run, numbers = clock.work(2, 12, 2)
-    assert pace(clock, run, 10).missed == 1
-    assert numbers == list(range(1, 11))
+    assert found.times.max_us == 1e3 * max(took_ms)
 
 
 def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():

@@ -19,17 +19,15 @@ from export_samples import (
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.evaluation.evaluate import infer_all, judge, mean_error
+from edge.evaluation.evaluate import infer_with_intervals, judge, mean_error
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
 from export.errors import ExportError, ParityError
-from export.graphs.graph import to_model
+from export.graphs.graph import network_of, origin_of, to_model
 from export.graphs.parity import GraphRun, differences, read_windows
-from export.graphs.reference import network_of, origin_of
 from export.to_onnx import export, main
-from firmware_bridge.pad_geometry import USPA44
 from train.errors import CheckpointError
 from train.learning.checkpoint import infer, load_network
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
@@ -57,7 +55,7 @@ def session(folder):
 def traced(folder, monkeypatch):
     """The exported graph in place of one that is traced again, which takes seconds."""
 
-    def to_model(net, geometry, batch=1):
+    def to_model(net, batch=1):
         model = onnx.load(folder / "plain" / "sure.onnx")
         del model.metadata_props[:]
         return model
@@ -132,7 +130,7 @@ def test_the_network_of_the_graph_has_the_correction_which_leaves_patterns_as_th
     for window, expected in zip(windows, deviations, strict=True):
         corrected.run(window)
         np.testing.assert_allclose(corrected.deviation, expected, rtol=1e-4)
-    patterns = [infer_all(one.run, one.contract, frozen) for one in (corrected, session)]
+    patterns = [infer_with_intervals(one, frozen)[0] for one in (corrected, session)]
     np.testing.assert_allclose(*patterns, atol=1e-7)
 
 
@@ -169,7 +167,7 @@ def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * np.float32(factor), weight.name))
-    monkeypatch.setattr(to_onnx, "to_model", lambda net, geometry, batch=1: model)
+    monkeypatch.setattr(to_onnx, "to_model", lambda net, batch=1: model)
     output = {"leave": "pattern", "uncertainty": "deviation", "traction": "traction"}[head]
     with pytest.raises(ParityError, match=f"differ by .* in the {output}"):
         export(folder / "sure.pt", tmp_path, frozen)
@@ -195,7 +193,7 @@ def test_a_fixed_batch_is_filled_and_cut(folder, session, frozen, tmp_path):
 
 def test_a_batch_of_none_is_refused(folder):
     with pytest.raises(ExportError, match="a batch of 0 asked for"):
-        to_model(write_out(load_network(folder / "sure.pt")[0]), USPA44, batch=0)
+        to_model(write_out(load_network(folder / "sure.pt")[0]), batch=0)
 
 
 def test_a_published_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path_factory):
@@ -254,7 +252,7 @@ def test_the_command_writes_integers_and_says_what_they_cost(folder, frozen, tmp
         main([str(tmp_path / "none.pt"), "--out", str(tmp_path)])
 
 
-@pytest.mark.parametrize("option", [["--all-integers"], ["--trust", "x"], ["--intervals", "x"]])
+@pytest.mark.parametrize("option", [["--trust", "x"], ["--intervals", "x"]])
 def test_options_that_do_not_fit_are_a_usage_error(option):
     with pytest.raises(SystemExit) as end:
         main(["one.pt", *option])

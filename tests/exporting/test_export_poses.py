@@ -12,9 +12,9 @@ from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
+from export.graphs.graph import contract_in, network_of
 from export.graphs.joined import branches, with_one_tap
 from export.graphs.parity import TOLERANCE
-from export.graphs.reference import contract_in, network_of
 from export.quantisation.int8 import convolutions
 from export.to_onnx import export
 from export.verify import verify

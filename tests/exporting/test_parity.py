@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import numpy_helper
 
 from edge.errors import ModelError
@@ -18,9 +17,8 @@ from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import scheduled_rows
 from export import verify as verify_module
 from export.errors import ExportError, ParityError
-from export.graphs.graph import outputs
+from export.graphs.graph import network_of
 from export.graphs.parity import (
-    FULL_TRACTION_KPA,
     LEVELS,
     GraphRun,
     accepted,
@@ -28,7 +26,6 @@ from export.graphs.parity import (
     extreme_windows,
     read_windows,
 )
-from export.graphs.reference import network_of
 from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
@@ -204,10 +201,17 @@ def test_integers_that_say_something_else_break_the_bound(monkeypatch, pattern_f
     assert any(said in row.broken for row in verify(find_model("stsr-small-int8"), frozen().thinned(30)))
 
 
-def test_a_network_of_another_training_is_refused(tmp_path):
-    for name, source in (("stsr-int8.onnx", "stsr-int8"), ("stsr.onnx", "mtsr2")):
+@pytest.mark.parametrize(
+    ("beside", "complaint"),
+    [
+        ({"stsr.onnx": "mtsr2"}, r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"),
+        ({}, r"the float32 model stsr\.onnx is not in the folder of its int8 model"),
+    ],
+)
+def test_integers_without_the_network_that_they_are_of_are_refused(tmp_path, beside, complaint):
+    for name, source in {"stsr-int8.onnx": "stsr-int8", **beside}.items():
         (tmp_path / name).write_bytes(find_model(source).read_bytes())
-    with pytest.raises(SystemExit, match=r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"):
+    with pytest.raises(SystemExit, match=complaint):
         main([str(tmp_path / "stsr-int8.onnx")])
 
 
@@ -245,15 +249,6 @@ def test_windows_are_of_every_force_and_stiff_ones_beside():
     assert not stiff["rest to full load in one scan"][:, 3:].any()
 
 
-def test_a_batch_that_is_not_full_is_filled_and_cut():
-    model, contract = graph_of("stsr")
-    windows = read_windows(frozen(), contract)[:5]
-    net = network_of(model)
-    given = zip(GraphRun(model)(windows), outputs(net, torch.from_numpy(windows)), strict=True)
-    for (mine, true), unit in zip(given, (1, 1, FULL_TRACTION_KPA), strict=True):
-        np.testing.assert_allclose(mine, true.numpy(), atol=1e-6 * unit)
-
-
 def test_the_table_shows_of_extreme_windows_the_worst():
     row = Parity(
         "one", "all", "zeros", differences(["pattern"], *[[np.ones((1, 2, 2), np.float32)]] * 2, 0.5), None, ""
@@ -261,13 +256,6 @@ def test_the_table_shows_of_extreme_windows_the_worst():
     other = replace(row, windows="full range", differences=(replace(row.differences[0], relative=1e-6),))
     lines = table([row, replace(row, windows="test set", psnr_change_db=-0.01), other]).splitlines()
     assert len(lines) == 4 and "-0.0100" in lines[3] and "full range" in lines[2] and "zeros" not in "".join(lines)
-
-
-def test_integers_alone_ask_for_what_they_are_of(tmp_path):
-    path = tmp_path / "stsr-int8.onnx"
-    path.write_bytes(find_model("stsr-int8").read_bytes())
-    with pytest.raises(SystemExit, match=r"the float32 model stsr\.onnx is not in the folder of its int8 model"):
-        main([str(path)])
 
 
 @pytest.mark.parametrize(

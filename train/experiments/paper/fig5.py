@@ -19,7 +19,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import heights_of
 from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
-from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
+from train.physics.gripped import FINE_SCALE, FRAMES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
 from train.report import Report, Row
@@ -27,15 +27,16 @@ from train.surfaces.poses import random_poses
 
 SURFACES: Final = ("large circle", "small circle")
 """Surfaces of the experiment; the first has four times the area of the second."""
-_FORCE_N: Final = 5.0
-_SCALE: Final = 10
 _BINS: Final = 8
 
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Tap, train, and write table and plot."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
-    names, taps = _tap(poses)
+    names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
+    places = random_poses(np.random.default_rng(5), len(names))
+    heights = [heights_of(name, pose, pad) for name, pose in zip(names, places, strict=True)]
+    taps = pad.tap(np.stack(heights), 5.0)
     held_out = np.arange(len(names)) // len(SURFACES) % 3 == 0
     counts, depth = _scans(taps, ~held_out)
     net = PsfNet()
@@ -91,18 +92,10 @@ def run(bench: Workbench, folder: Path) -> Path:
     return report.write()
 
 
-def _tap(poses: int) -> tuple[list[str], Taps]:
-    """Tap both surfaces at random poses, alternating."""
-    names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
-    places = random_poses(np.random.default_rng(5), len(names))
-    heights = [heights_of(name, pose, pad) for name, pose in zip(names, places, strict=True)]
-    return names, pad.tap(np.stack(heights), _FORCE_N)
-
-
 def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return all frames of some taps: counts (n, 3, rows, cols), and depth images (n, H, W) in 0..1."""
     counts = taps.counts[which]
-    depth = resample(taps.touching[which], FINE_SCALE, _SCALE)
+    depth = resample(taps.touching[which], FINE_SCALE, SCALE)
     return counts.reshape(-1, *USPA44.scan_shape), np.repeat(depth, counts.shape[1], axis=0)
 
 
@@ -127,21 +120,18 @@ def _by_force(
 ) -> list[Row]:
     edges = np.linspace(0, force_n[where].max(), _BINS + 1)
     bin_of = np.clip(np.digitize(force_n, edges) - 1, 0, _BINS - 1)
-    rows: list[Row] = []
-    for number in range(_BINS):
-        inside = where & (bin_of == number)
-        if inside.any():
-            rows.append(
-                {
-                    "surface": name,
-                    "force N": float(force_n[inside].mean()),
-                    "alpha mm/mm2": float(seen["alpha"][inside].mean()),
-                    "beta mm": float(seen["beta"][inside].mean()),
-                    "beta by search mm": float(np.median(seen["beta by search"][inside])),
-                    "scans": int(inside.sum()),
-                }
-            )
-    return rows
+    return [
+        {
+            "surface": name,
+            "force N": float(force_n[inside].mean()),
+            "alpha mm/mm2": float(seen["alpha"][inside].mean()),
+            "beta mm": float(seen["beta"][inside].mean()),
+            "beta by search mm": float(np.median(seen["beta by search"][inside])),
+            "scans": int(inside.sum()),
+        }
+        for number in range(_BINS)
+        if (inside := where & (bin_of == number)).any()
+    ]
 
 
 def _line(name: str, key: str, force_n: NDArray[np.floating], value: NDArray[np.floating]) -> Row:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter
+from timeit import repeat
 from typing import Final
 
 import numpy as np
@@ -36,7 +36,6 @@ _QUICK_MESHES: Final = (Mesh(4, 2), Mesh(3, 2))
 _PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
 _PAD_PX: Final = 42
 _ON_TOP_MM: Final = 1e-3
-_TIMED_RUNS: Final = 5
 
 Maps = NDArray[np.float32]
 """Maps (surfaces, steps, 40, 40) in [mm]."""
@@ -44,27 +43,26 @@ Maps = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Method that computes patterns.
+    """Method that computes maps of all surfaces and steps, and the time for one surface's steps, of the fastest run.
 
-    Attributes:
-        name: as shown in tables.
-        maps: of all surfaces and steps, in the method's own unit if `scaled`.
-        time_s: of one surface's steps together, the fastest of a few runs, in [s].
-        scaled: True where one factor for all maps brings them to [mm], by least squares against the truth.
-        note: parameters that were selected for it.
+    Where `scaled`, maps are in its own unit: one factor brings all to [mm], by least squares against the truth.
     """
 
     name: str
     maps: Maps
     time_s: float
     scaled: bool = False
-    note: str = ""
 
     def against(self, truth: Maps) -> Maps:
         """Return the maps in [mm], scaled to a truth where they have no scale of their own."""
-        if not self.scaled:
-            return self.maps
-        return self.maps * np.float32((self.maps * truth).sum() / (self.maps**2).sum())
+        return self.maps * np.float32((self.maps * truth).sum() / (self.maps**2).sum()) if self.scaled else self.maps
+
+    def rms_mm(self, truth: Maps, *, heaps: bool = False) -> NDArray[np.float64]:
+        """Return the error of each map, (surfaces, steps) in [mm]; `heaps` includes heights around the contact."""
+        if heaps:
+            return rmse_percent(self.against(truth), truth, 100.0)
+        pressed = np.maximum(truth, 0)
+        return rmse_percent(np.maximum(self.against(pressed), 0), pressed, 100.0)
 
 
 def run(bench: Workbench, folder: Path) -> Path:
@@ -86,7 +84,11 @@ def run(bench: Workbench, folder: Path) -> Path:
     finest = verdicts[meshes[0]]
     truth = np.stack([verdict.patterns_mm for verdict in finest])
     force_n = np.stack([verdict.force_n for verdict in finest])
-    methods = _with_best_psf(_methods(surfaces, indentation_mm, force_n), truth)
+    methods = _methods(surfaces, indentation_mm, force_n)
+    psfs = [method for method in methods if method.name.startswith("PSF")]
+    best = min(psfs, key=lambda method: float(method.rms_mm(truth).mean()))
+    methods = [method for method in methods if method is best or method not in psfs]
+    methods[methods.index(best)] = replace(best, name="PSF")
     layer = next(method for method in methods if method.name == "layer")
     methods += [
         Method(f"FEM {mesh}", np.stack([verdict.patterns_mm for verdict in found]), _time_s(found))
@@ -94,8 +96,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     ]
 
     report = Report("fig7", folder, __file__, bench.used, quick=bench.quick)
-    psf = next(method for method in methods if method.name == "PSF")
-    report.say(_how(len(surfaces), steps, psf.note))
+    report.say(_how(len(surfaces), steps, best.name.removeprefix("PSF, ")))
     report.table(
         [_row(method, truth, layer.maps, indentation_mm) for method in methods],
         f"RMS error over the 40 x 40 window, in % of the indentation; truth is FEM at {meshes[0]}. Mean over "
@@ -103,11 +104,19 @@ def run(bench: Workbench, folder: Path) -> Path:
         "as no PSF pulls, except in the column that is named so.",
     )
     report.table(_by_step(methods, truth, indentation_mm, force_n), "RMS error by step, in [um].", "steps")
-    report.table(_convergence(verdicts), "The finite elements.", "fem")
+    fem: list[Row] = [
+        {
+            "mesh": str(mesh),
+            "force, % of the finest's": float(100 * (np.stack([one.force_n for one in found]) / force_n).mean()),
+            "s a surface": _time_s(found),
+        }
+        for mesh, found in verdicts.items()
+    ]
+    report.table(fem, "The finite elements.", "fem")
     with report.figure(size=(11, 4.5)) as figure:
         left, right = figure.subplots(1, 2)
         for method in methods:
-            errors = _rms_mm(method, truth)
+            errors = method.rms_mm(truth)
             if errors.any():
                 left.plot(indentation_mm, 1e3 * errors.mean(axis=0), ".-", label=method.name)
                 percent = float((100 * errors / indentation_mm).mean())
@@ -159,44 +168,17 @@ def _methods(
     ]
 
 
-def _with_best_psf(methods: list[Method], truth: Maps) -> list[Method]:
-    """Keep only the PSF nearest to the truth, under the name PSF."""
-    psfs = [method for method in methods if method.name.startswith("PSF")]
-    best = min(psfs, key=lambda method: float(_rms_mm(method, truth).mean()))
-    named = replace(best, name="PSF", note=best.name.removeprefix("PSF, "))
-    return [named if method is best else method for method in methods if method is best or method not in psfs]
-
-
 def _made(name: str, make: Callable[[int], Maps], surfaces: int, scaled: bool = False) -> Method:
     maps = np.stack([make(i) for i in range(surfaces)])
-    times = []
-    for _ in range(_TIMED_RUNS):
-        start = perf_counter()
-        make(0)
-        times.append(perf_counter() - start)
-    return Method(name, maps, min(times), scaled)
+    return Method(name, maps, min(repeat(partial(make, 0), number=1)), scaled)
 
 
 def _time_s(found: list[Verdict]) -> float:
     return float(np.mean([verdict.run_s.sum() for verdict in found]))
 
 
-def _rms_mm(method: Method, truth: Maps, heaps: bool = False) -> NDArray[np.float64]:
-    """Return the error of each map, (surfaces, steps) in [mm]; `heaps` includes heights around the contact."""
-    if heaps:
-        return rmse_percent(method.against(truth), truth, 100.0)
-    pressed = np.maximum(truth, 0)
-    return rmse_percent(np.maximum(method.against(pressed), 0), pressed, 100.0)
-
-
-def _percent(
-    method: Method, truth: Maps, indentation_mm: NDArray[np.floating], heaps: bool = False
-) -> NDArray[np.float64]:
-    return 100 * _rms_mm(method, truth, heaps) / indentation_mm
-
-
 def _row(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.floating]) -> Row:
-    percent = _percent(method, truth, indentation_mm)
+    percent = 100 * method.rms_mm(truth) / indentation_mm
     by_surface = percent.mean(axis=1)
     pressed = np.maximum(truth, 0)
     psnr = psnr_db(np.maximum(method.against(pressed), 0), pressed, MAX_INDENTATION_MM)
@@ -204,8 +186,8 @@ def _row(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.fl
         "method": method.name,
         "error %": f"{percent.mean():.2f} ({by_surface.min():.2f}..{by_surface.max():.2f})",
         "PSNR dB": float(psnr.mean()) if percent.any() else None,
-        "error %, heaps too": float(_percent(method, truth, indentation_mm, heaps=True).mean()),
-        "error % to the layer": float(_percent(method, layer, indentation_mm).mean()),
+        "error %, heaps too": float((100 * method.rms_mm(truth, heaps=True) / indentation_mm).mean()),
+        "error % to the layer": float((100 * method.rms_mm(layer) / indentation_mm).mean()),
         "ms a pattern": 1e3 * method.time_s / len(indentation_mm),
     }
 
@@ -213,7 +195,7 @@ def _row(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.fl
 def _by_step(
     methods: list[Method], truth: Maps, indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
 ) -> list[Row]:
-    errors = {method.name: 1e3 * _rms_mm(method, truth).mean(axis=0) for method in methods}
+    errors = {method.name: 1e3 * method.rms_mm(truth).mean(axis=0) for method in methods}
     return [
         {
             "indentation mm": float(depth_mm),
@@ -221,19 +203,6 @@ def _by_step(
             **{name: float(error[step]) for name, error in errors.items() if error.any()},
         }
         for step, depth_mm in enumerate(indentation_mm)
-    ]
-
-
-def _convergence(verdicts: dict[Mesh, list[Verdict]]) -> list[Row]:
-    finest = next(iter(verdicts.values()))
-    force_n = np.stack([verdict.force_n for verdict in finest])
-    return [
-        {
-            "mesh": str(mesh),
-            "force, % of the finest's": float(100 * (np.stack([v.force_n for v in found]) / force_n).mean()),
-            "s a surface": _time_s(found),
-        }
-        for mesh, found in verdicts.items()
     ]
 
 

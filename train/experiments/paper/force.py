@@ -14,22 +14,20 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
 from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, windows
-from train.experiments.paper.protocol import Method, classical_methods, compact_methods, mixed
-from train.experiments.support.workbench import Figures, Workbench
+from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
+from train.experiments.support.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances
-from train.report import Report, Row, bootstrap_interval, with_interval
+from train.report import Report, Row, band, with_interval
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
-_DRAWS: Final = 4
 _NETWORKS: Final = ("stsr", "mtsr2", "mtsr4")
 _CLASSICAL: Final = ("linear map", "bilinear")
 _REACHED: Final = 0.99
@@ -38,14 +36,9 @@ _REACHED: Final = 0.99
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Scans of one range of forces.
+    """Scans of one range of forces: windows (n, K, 3, rows, cols) in zeroed counts, truth (n, H, W), sequences (n,).
 
-    Attributes:
-        force_n: bounds of the range, in [N].
-        windows: (n, K, 3, rows, cols) in zeroed counts: the newest tap while pressing, the earlier ones at their ends.
-        patterns: (n, H, W), truth, in [mm].
-        touching: (n, H, W) bool.
-        tap: (n,) index of the sequence.
+    The newest tap is pressing, the earlier ones are at their ends.
     """
 
     force_n: tuple[float, float]
@@ -60,7 +53,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     data = mixed(bench)
     methods = [*compact_methods(bench, data, _NETWORKS), *classical_methods(bench, data, _CLASSICAL)]
     sequences = bench.held_out("test").at_scale(SCALE)
-    draws = 1 if bench.quick else _DRAWS
+    draws = 1 if bench.quick else 4
     bins = [
         scans
         for number, bounds in enumerate(pairwise(EDGES_N))
@@ -82,8 +75,21 @@ def run(bench: Workbench, folder: Path) -> Path:
         [_row(method, scans, figures[method.name][i]) for i, scans in enumerate(bins) for method in methods],
         "Errors by contact force, with 95 % intervals by tap.",
     )
+    middle_n = [float(np.sqrt(np.prod(scans.force_n))) for scans in bins]
+    shown = {"psnr_db": "PSNR [dB]", "ssim_own": "SSIM at own scale", "relative_percent": "relative error [%]"}
     with report.figure(size=(13, 4.5)) as figure:
-        _draw(figure, bins, figures)
+        axes = figure.subplots(1, len(shown))
+        for place, (key, label) in zip(axes, shown.items(), strict=True):
+            for name, found in figures.items():
+                mean, (below, above) = band((one[key], scans.tap) for one, scans in zip(found, bins, strict=True))
+                (line,) = place.plot(middle_n, mean, "o-", label=name)
+                place.fill_between(
+                    middle_n, mean - below, mean + above, color=line.get_color(), alpha=0.15, linewidth=0
+                )
+            place.set(xscale="log", xlabel="force [N]", ylabel=label)
+            place.set_xticks(EDGES_N, [f"{edge:g}" for edge in EDGES_N])
+            place.minorticks_off()
+        axes[0].legend()
     return report.write()
 
 
@@ -118,7 +124,7 @@ def errors(method: Method, scans: Bin) -> Figures:
 
 def _row(method: Method, scans: Bin, found: Figures) -> Row:
     return {
-        "force N": _label(scans),
+        "force N": "{:g}..{:g}".format(*scans.force_n),
         "scans": len(scans.tap),
         "taps": len(np.unique(scans.tap)),
         "model": method.name,
@@ -129,24 +135,3 @@ def _row(method: Method, scans: Bin, found: Figures) -> Row:
         "IoU": round(float(found["contact_iou"].mean()), 4),
         **method.cost,
     }
-
-
-def _draw(figure: Figure, bins: list[Bin], figures: dict[str, list[Figures]]) -> None:
-    """Plot three metrics against the force, with bands for the intervals."""
-    middle_n = [float(np.sqrt(scans.force_n[0] * scans.force_n[1])) for scans in bins]
-    shown = {"psnr_db": "PSNR [dB]", "ssim_own": "SSIM at own scale", "relative_percent": "relative error [%]"}
-    axes = figure.subplots(1, len(shown))
-    for place, (key, label) in zip(axes, shown.items(), strict=True):
-        for name, found in figures.items():
-            band = [bootstrap_interval(values[key], scans.tap) for values, scans in zip(found, bins, strict=True)]
-            (line,) = place.plot(middle_n, [float(values[key].mean()) for values in found], "o-", label=name)
-            place.fill_between(middle_n, *np.transpose(band), color=line.get_color(), alpha=0.15, linewidth=0)
-        place.set(xscale="log", xlabel="force [N]", ylabel=label)
-        place.set_xticks(EDGES_N, [f"{edge:g}" for edge in EDGES_N])
-        place.minorticks_off()
-    axes[0].legend()
-
-
-def _label(scans: Bin) -> str:
-    low_n, high_n = scans.force_n
-    return f"{low_n:g}..{high_n:g}"

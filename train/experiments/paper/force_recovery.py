@@ -7,12 +7,11 @@ Source: Wu and Liu 2024, Fig. 15.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.evaluation import metrics
@@ -25,8 +24,8 @@ from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, between_frames
 from train.data.press_batches import read_presses
 from train.data.presses import PressSet
-from train.experiments.paper.protocol import Method, compact_methods, mixed
-from train.experiments.support.workbench import Workbench
+from train.experiments.paper.protocol import compact_methods, mixed
+from train.experiments.support.workbench import Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
 from train.report import Report, Row, with_interval
@@ -39,24 +38,13 @@ CLAIM_N: Final = 0.02 * RANGE_N
 """Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
 
 
-@dataclass(frozen=True, slots=True)
 class Course:
-    """Course of one press; the pad is free at 0 s.
+    """Times (t,) in [s] of the scans of one press, at a rate, and the share of its set force at each; free at 0 s."""
 
-    Attributes:
-        rate_hz: scan rate, in [Hz].
-        time_s: time of each scan, (t,), in [s]; the first is one step after 0.
-        share: share of the press at each scan, (t,); 1 at its set force.
-    """
-
-    rate_hz: float
-    time_s: NDArray[np.float64] = field(init=False)
-    share: NDArray[np.float64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        time_s = np.arange(1, round(_ENDS_S[-1] * self.rate_hz) + 1) / self.rate_hz
-        object.__setattr__(self, "time_s", time_s)
-        object.__setattr__(self, "share", np.interp(time_s, [0, *_ENDS_S], [0, 1, 1, 0, 0]))
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self.time_s: NDArray[np.float64] = np.arange(1, round(_ENDS_S[-1] * rate_hz) + 1) / rate_hz
+        self.share: NDArray[np.float64] = np.interp(self.time_s, [0, *_ENDS_S], [0, 1, 1, 0, 0])
 
     def phase(self, number: int) -> NDArray[np.bool_]:
         """Return the scans of the press (0), hold (1), release (2) or rest (3), each with its end but not its start."""
@@ -65,13 +53,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class Scans:
-    """Scans with their true force and volume.
-
-    Attributes:
-        windows: (n, K, 3, rows, cols) in zeroed counts.
-        force_n: (n,) in [N].
-        volume_mm3: (n,) sum of the true pattern over its area, in [mm3].
-    """
+    """Windows (n, K, 3, rows, cols) in zeroed counts, with their true forces and volumes of patterns, (n,)."""
 
     windows: NDArray[np.float32]
     force_n: NDArray[np.floating]
@@ -113,14 +95,14 @@ def errors(
     """Return the figures of one press, in [% of RANGE_N] or in [% of scans]."""
     resting, loaded = course.phase(3), ~course.phase(3)
     return {
-        "error": _rms_percent(found_n - true_n),
-        "own": _rms_percent(fit_gain(found_n, true_n) * found_n - true_n),
-        "gated": _rms_percent(np.where(gate, found_n, 0) - true_n),
-        "loop": loop_percent(true_n, found_n, course),
-        "rest": 100 * float(np.abs(found_n[resting]).mean()) / RANGE_N,
-        "false": 100 * float((found_n[resting] > CLAIM_N).mean()),
-        "false gated": 100 * float(gate[resting].mean()),
-        "missed": 100 * float((~gate[loaded]).mean()),
+        "error %": _rms_percent(found_n - true_n),
+        "with its own factor %": _rms_percent(fit_gain(found_n, true_n) * found_n - true_n),
+        "above the threshold %": _rms_percent(np.where(gate, found_n, 0) - true_n),
+        "loop %": loop_percent(true_n, found_n, course),
+        "at no load %": 100 * float(np.abs(found_n[resting]).mean()) / RANGE_N,
+        "false contact, % of scans": 100 * float((found_n[resting] > CLAIM_N).mean()),
+        "past the threshold, % of scans": 100 * float(gate[resting].mean()),
+        "loaded but missed, % of scans": 100 * float((~gate[loaded]).mean()),
     }
 
 
@@ -147,28 +129,26 @@ def _rms_percent(error_n: NDArray[np.floating]) -> float:
     return 100 * float(np.sqrt(np.mean(error_n**2))) / RANGE_N
 
 
-_RATE_HZ: Final = 100.0
-_QUICK_RATE_HZ: Final = 20.0
 _TAPS: Final = 4
 _ANGLE: Final = 1
 """Index of the test angle at which each surface is pressed: 30 degrees, the paper's target."""
-_FIT_PRESSES: Final = 600
 _ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
 CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
 
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Quantity that rises with the force, and its factor to newtons."""
+    """Quantity that rises with the force, (n,), with its factor to newtons: least squares, on `known` scans."""
 
     name: str
     measure: Callable[[Scans], NDArray[np.floating]]
     cost: Row
-    newtons_per_unit: float = 1.0
+    newtons_per_unit: float
 
-    def fitted(self, scans: Scans) -> "Gauge":
+    @classmethod
+    def fitted(cls, name: str, measure: Callable[[Scans], NDArray[np.floating]], cost: Row, known: Scans) -> "Gauge":
         """Return the gauge with the least-squares factor to these scans' forces."""
-        return Gauge(self.name, self.measure, self.cost, fit_gain(self.measure(scans), scans.force_n))
+        return cls(name, measure, cost, fit_gain(measure(known), known.force_n))
 
     def force_n(self, scans: Scans) -> NDArray[np.floating]:
         """Return forces (n,) in [N]."""
@@ -178,9 +158,14 @@ class Gauge:
 def run(bench: Workbench, folder: Path) -> Path:
     """Write the report `force-recovery`; the full run takes some minutes once the networks are there."""
     data = mixed(bench)
-    course = Course(_QUICK_RATE_HZ if bench.quick else _RATE_HZ)
-    known = training_presses(data, 50 if bench.quick else _FIT_PRESSES)
-    gauges = [gauge.fitted(known) for gauge in _gauges(compact_methods(bench, data, ("stsr", "mtsr4")))]
+    course = Course(20.0 if bench.quick else 100.0)
+    known = training_presses(data, 50 if bench.quick else 600)
+    quantities: list[tuple[str, Callable[[Scans], NDArray[np.floating]], Row]] = [
+        ("summed z", lambda scans: scans.windows[:, 0, 2].sum(axis=(1, 2)), {"parameters": 1, "MMAC": 0.0}),
+        *((one.name, _volume_of(one), one.cost) for one in compact_methods(bench, data, ("stsr", "mtsr4"))),
+        ("true pattern", lambda scans: scans.volume_mm3, {}),
+    ]
+    gauges = [Gauge.fitted(name, measure, cost, known) for name, measure, cost in quantities]
     sequences = bench.held_out("test").newest(_TAPS)
     sequences = sequences.pick(np.arange(_ANGLE, len(sequences), len(TARGET_ANGLES_DEG)))
 
@@ -196,9 +181,14 @@ def run(bench: Workbench, folder: Path) -> Path:
             for gauge, force_n in zip(gauges, found_n, strict=True):
                 figures[gauge.name].append(errors(scans.force_n, force_n, gate, course))
             shown.setdefault(condition, (scans, found_n))
-        rows += [_row(condition, gauge, figures[gauge.name]) for gauge in gauges]
+        for gauge in gauges:
+            row: Row = {"nuisances": condition, "model": gauge.name}
+            for label in figures[gauge.name][0]:
+                values = np.array([press[label] for press in figures[gauge.name]])
+                row[label] = with_interval(values, np.arange(len(values)))
+            rows.append(row | {"N per unit": gauge.newtons_per_unit} | gauge.cost)
         for i, name in enumerate(sequences.surfaces):
-            cells: Row = {f"{gauge.name} error %": round(figures[gauge.name][i]["error"], 2) for gauge in gauges}
+            cells: Row = {f"{gauge.name} error %": round(figures[gauge.name][i]["error %"], 2) for gauge in gauges}
             by_surface.append({"nuisances": condition, "surface": str(name)} | cells)
 
     report = Report("force-recovery", folder, __file__, bench.used, quick=bench.quick)
@@ -220,7 +210,17 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(rows, "Force recovery, means over presses with 95 % intervals.")
     report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
     with report.figure(size=(13, 8)) as figure:
-        _draw(figure, course, shown, gauges, str(sequences.surfaces[0]))
+        axes = figure.subplots(len(shown), 2, width_ratios=(3, 2), squeeze=False)
+        for (over_time, loop), (condition, (scans, found_n)) in zip(axes, shown.items(), strict=True):
+            over_time.plot(course.time_s, scans.force_n, "k", label="true")
+            loop.plot([0, scans.force_n.max()], [0, scans.force_n.max()], "k", linewidth=0.8)
+            for gauge, force_n in zip(gauges, found_n, strict=True):
+                over_time.plot(course.time_s, force_n, linewidth=1, label=gauge.name)
+                loop.plot(scans.force_n, force_n, linewidth=1)
+            title = f"{sequences.surfaces[0]}, {condition}"
+            over_time.set(title=title, xlabel="time [s]", ylabel="force [N]")
+            loop.set(xlabel="true force [N]", ylabel="force found [N]")
+        axes[0, 0].legend()
     return report.write()
 
 
@@ -231,55 +231,5 @@ def training_presses(data: PressSet, presses: int) -> Scans:
     return Scans(readings, picked.force_n[:, 2], volume_mm3(picked.patterns.astype(np.float32), data.scale))
 
 
-def _gauges(networks: list[Method]) -> list[Gauge]:
-    def summed(network: Method) -> Callable[[Scans], NDArray[np.floating]]:
-        return lambda scans: volume_mm3(network.patterns(scans.windows), SCALE)
-
-    return [
-        Gauge("summed z", lambda scans: scans.windows[:, 0, 2].sum(axis=(1, 2)), {"parameters": 1, "MMAC": 0.0}),
-        *(Gauge(network.name, summed(network), network.cost) for network in networks),
-        Gauge("true pattern", lambda scans: scans.volume_mm3, {}),
-    ]
-
-
-_COLUMNS: Final = {
-    "error": "error %",
-    "own": "with its own factor %",
-    "gated": "above the threshold %",
-    "loop": "loop %",
-    "rest": "at no load %",
-    "false": "false contact, % of scans",
-    "false gated": "past the threshold, % of scans",
-    "missed": "loaded but missed, % of scans",
-}
-
-
-def _row(condition: str, gauge: Gauge, presses: list[dict[str, float]]) -> Row:
-    means = {label: np.array([press[key] for press in presses]) for key, label in _COLUMNS.items()}
-    return {
-        "nuisances": condition,
-        "model": gauge.name,
-        **{label: with_interval(values, np.arange(len(presses))) for label, values in means.items()},
-        "N per unit": gauge.newtons_per_unit,
-        **gauge.cost,
-    }
-
-
-def _draw(
-    figure: Figure,
-    course: Course,
-    shown: dict[str, tuple[Scans, list[NDArray[np.floating]]]],
-    gauges: list[Gauge],
-    surface: str,
-) -> None:
-    """Plot force against time, and estimated against true force, of one press under each condition."""
-    axes = figure.subplots(len(shown), 2, width_ratios=(3, 2), squeeze=False)
-    for (over_time, loop), (condition, (scans, found_n)) in zip(axes, shown.items(), strict=True):
-        over_time.plot(course.time_s, scans.force_n, "k", label="true")
-        loop.plot([0, scans.force_n.max()], [0, scans.force_n.max()], "k", linewidth=0.8)
-        for gauge, force_n in zip(gauges, found_n, strict=True):
-            over_time.plot(course.time_s, force_n, linewidth=1, label=gauge.name)
-            loop.plot(scans.force_n, force_n, linewidth=1)
-        over_time.set(title=f"{surface}, {condition}", xlabel="time [s]", ylabel="force [N]")
-        loop.set(xlabel="true force [N]", ylabel="force found [N]")
-    axes[0, 0].legend()
+def _volume_of(network: Method) -> Callable[[Scans], NDArray[np.floating]]:
+    return lambda scans: volume_mm3(network.patterns(scans.windows), SCALE)

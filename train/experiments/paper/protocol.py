@@ -1,9 +1,9 @@
 """The paper's protocol: its data, the networks that are trained on them, and the methods that are compared."""
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,12 @@ from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World
 from train.errors import CheckpointError
-from train.experiments.support.workbench import Workbench, cost_cells, median_ms
+from train.experiments.support.workbench import Figures, Method, Workbench, error_cells, median_ms
 from train.fit import given_taps
 from train.freeze import CLASSICAL_WINDOWS, fit_classical
-from train.learning.checkpoint import Training, infer
+from train.learning.checkpoint import Training
 from train.learning.interval_fit import LEVEL, half_width_mm
 from train.learning.training_loop import Recipe
-from train.networks.blocks import PatternNet
 from train.physics.gripped import FINE_SCALE, SCALE
 from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
@@ -43,15 +42,9 @@ _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
 _SEED_MINUTES_MORE: Final = 4.0
 """Training time of every MTSR-K on top of the STSR, in [min]. All networks take two hours on two cores."""
 SEED_BATCH: Final = 16
-_SEED_RATE: Final = 5e-4
-_SEED_DECAY: Final = 1e-2
 _ENDLESS: Final = 1_000_000
 BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
 """Compact STSR trained on the paper's figures and random ones, without pad constants."""
-_STAGE_STEPS: Final = 2000
-_STAGE_RATE: Final = 1e-3
-_SCALE_STEPS: Final = 2500
-_ANGLE_STEPS: Final = 1500
 
 
 def presses(bench: Workbench, name: str) -> PressSet:
@@ -76,33 +69,28 @@ def by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
 
 def compact(name: str) -> Training:
     """Return the training of a compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
-    if name == "stsr":
-        return BASE
-    taps = int(name.removeprefix("mtsr"))
-    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE, given=given_taps(taps))
-    return Training(f"taps-{name}", f"compact-{name}", recipe, start=BASE.name, seed=1 + taps)
+    return BASE if name == "stsr" else _from_base(name, int(name.removeprefix("mtsr")), 2000)
 
 
 def at_scale(scale: int) -> Training:
     """Return the training of the compact STSR at another scale: the base's trunk with new output layers."""
-    if scale == BASE.scale:
-        return BASE
-    recipe = Recipe(steps=_SCALE_STEPS, learning_rate=1e-3)
-    return Training(f"taps-stsr-x{scale}", "compact-stsr", recipe, scale=scale, start=BASE.name)
+    return BASE if scale == BASE.scale else _from_base(f"stsr-x{scale}", 1, 2500, scale)
 
 
 def at_angle(angle_step_deg: float) -> Training:
-    """Return the training of the compact MTSR-2 for taps turned by an angle, started from the STSR."""
-    recipe = Recipe(steps=_ANGLE_STEPS, learning_rate=1e-3, given=given_taps(2))
-    return Training(f"taps-mtsr2-{angle_step_deg:g}-deg", "compact-mtsr2", recipe, start=BASE.name, seed=3)
+    """Return the training of the compact MTSR-2 for taps turned by an angle."""
+    return _from_base(f"mtsr2-{angle_step_deg:g}-deg", 2, 1500)
 
 
 def alike(name: str) -> Training:
     """Return a compact network's training from the base, equally long for every name."""
-    if name != "stsr":
-        return compact(name)
-    recipe = Recipe(steps=_STAGE_STEPS, learning_rate=_STAGE_RATE)
-    return replace(BASE, name=f"{BASE.name}-alike", recipe=recipe, start=BASE.name)
+    return _from_base("stsr-alike", 1, 2000) if name == "stsr" else compact(name)
+
+
+def _from_base(name: str, taps: int, steps: int, scale: int = SCALE) -> Training:
+    recipe = Recipe(steps=steps, learning_rate=1e-3, given=given_taps(taps))
+    network, seed = ("compact-stsr", 1) if taps == 1 else (f"compact-mtsr{taps}", 1 + taps)
+    return Training(f"taps-{name}", network, recipe, scale, BASE.name, seed)
 
 
 def seed_size(network: str) -> Training:
@@ -111,8 +99,8 @@ def seed_size(network: str) -> Training:
     recipe = Recipe(
         steps=_ENDLESS,
         batch=SEED_BATCH,
-        learning_rate=_SEED_RATE,
-        weight_decay=_SEED_DECAY,
+        learning_rate=5e-4,
+        weight_decay=1e-2,
         given=given_taps(int(network.removeprefix("mtsr")) if starts else 1),
         bf16=True,
         minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
@@ -128,91 +116,55 @@ SEED_STSR_LONGER: Final = replace(
     start="seed-stsr",
 )
 """STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
+_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
 
 
-def trained(
-    bench: Workbench, training: Training, data: PressSet, validation: FrozenSet
-) -> tuple[PatternNet, dict[str, Any]]:
-    """Return a trained network and its report; the network that it starts from is trained first."""
+def trained(bench: Workbench, training: Training, data: PressSet, validation: FrozenSet) -> Method:
+    """Return a trained network; the network that it starts from is trained first."""
     if training.start:
         trained(bench, _STARTS[training.start], data, validation)
     return bench.network(training, data, validation)
 
 
-_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
-
-
-@dataclass(frozen=True, slots=True)
-class Method:
-    """Method from windows to patterns.
-
-    Attributes:
-        name: as shown in tables.
-        taps: taps of a window that the method uses.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        cost: parameters, multiply-accumulates and run time, as cells of a row.
-        run: windows (n, taps, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
-    """
-
-    name: str
-    taps: int
-    contact_level: float
-    cost: Row
-    run: Callable[[NDArray[np.float32]], NDArray[np.floating]]
-
-    def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
-        return self.run(windows[:, : self.taps])
-
-
-def compact_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
+def compact_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
     """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
     validation = bench.frozen("validation")
-    methods: list[Method] = []
-    for name in names:
-        net, facts = trained(bench, compact(name), data, validation)
-        methods.append(
-            Method(
-                name, net.taps, facts["contact_level"], cost_cells(net), lambda windows, net=net: infer(net, windows)[0]
-            )
-        )
-    return methods
+    return [replace(trained(bench, compact(name), data, validation), name=name) for name in names]
 
 
-def classical_methods(bench: Workbench, data: PressSet, names: tuple[str, ...]) -> list[Method]:
+def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
     """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
     if not path.exists():
         fitted = fit_classical(data, _QUICK_WINDOWS if bench.quick else CLASSICAL_WINDOWS)
         np.savez_compressed(path, allow_pickle=False, **fitted)
-    by_name = fitted_methods(path, SCALE)
-    methods: list[Method] = []
-    scan = np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
-    for name in names:
-        run = by_name[name]
-        cost: Row = {
-            "parameters": 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1,
-            "MMAC": round(method_macs(name, SCALE) / 1e6, 3),
-            "run time ms": median_ms(partial(run, scan)),
-        }
-        methods.append(Method(name, 1, CONTACT_LEVEL, cost, lambda windows, run=run: run(windows[:, 0])))
-    return methods
+    fits, scan = fitted_methods(path, SCALE), np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
+
+    def method(name: str) -> Method:
+        def cost() -> Row:
+            parameters = 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1
+            mega_macs, run_time_ms = round(method_macs(name, SCALE) / 1e6, 3), median_ms(partial(fits[name], scan))
+            return {"parameters": parameters, "MMAC": mega_macs, "run time ms": run_time_ms}
+
+        return Method(name, 1, CONTACT_LEVEL, lambda windows: (fits[name](windows[:, 0]), None), cost)
+
+    return [method(name) for name in names]
+
+
+def judged(method: Method, sets: Mapping[str, FrozenSet], given: int | None = None) -> tuple[Row, Figures]:
+    """Return errors on each set as cells of a row, and every metric of every frame of the last set."""
+    figures = {split: method.judged(frozen, given) for split, frozen in sets.items()}
+    cells = [error_cells(figures[split], frozen, split) for split, frozen in sets.items()]
+    return {name: cell for row in cells for name, cell in row.items()}, [*figures.values()][-1]
 
 
 @dataclass(frozen=True, slots=True)
 class Intervals:
-    """Patterns and deviations predicted for the n frames of a frozen set, with the truth.
-
-    Attributes:
-        frozen: the frames.
-        truth: (n, H, W) in [mm].
-        pattern: (n, H, W) in [mm].
-        deviation: (n, H, W) above 0, in [mm].
-    """
+    """Patterns and deviations predicted for the n frames of a frozen set, with the truth, (n, H, W) in [mm] each."""
 
     frozen: FrozenSet
     truth: NDArray[np.float32]
-    pattern: NDArray[np.float32]
+    pattern: NDArray[np.floating]
     deviation: NDArray[np.float32]
 
     def covered(self, level: float = LEVEL) -> NDArray[np.bool_]:
@@ -231,13 +183,13 @@ class Intervals:
         }
 
 
-def intervals(net: PatternNet, frozen: FrozenSet, given: int | None = None) -> Intervals:
+def intervals(method: Method, frozen: FrozenSet, given: int | None = None) -> Intervals:
     """Run a network on every frame, with the newest `given` taps or all that it takes.
 
     Raises:
         CheckpointError: the network predicts no deviations.
     """
-    pattern, deviation = infer(net, frozen.windows(net.taps, given))
+    pattern, deviation = method.run(frozen.windows(method.taps, given))
     if deviation is None:
-        raise CheckpointError(f"{type(net).__name__} gives no deviations: take a compact network")
+        raise CheckpointError(f"{method.name} gives no deviations: take a compact network")
     return Intervals(frozen, frozen.patterns(), pattern, deviation)

@@ -9,9 +9,10 @@ Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,11 @@ from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.data.presses import PressSet, join_presses
 from train.experiments.paper.protocol import HELD_OUT, KNOWN, SETS, intervals, presses
-from train.experiments.support.workbench import Workbench, cost_cells, error_cells
+from train.experiments.support.workbench import Method, Workbench, error_cells
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.training_loop import Recipe
-from train.networks.blocks import PatternNet
-from train.report import Report, Row, bootstrap_interval, with_interval
+from train.report import Report, Row, band, with_interval
 
 TEST_SEED: Final = 999_000_000
 TEST_FIGURES: Final = 24
@@ -54,11 +54,9 @@ TRAININGS: Final[Mapping[str, Training]] = {
     _ALL_BOTH: BASE,
 }
 """Trainings by training set."""
-_SHOWN_OF: Final = {_NEW: 3, _GLYPHS: 2, _POLYGONS: 1}
 
 
-@dataclass(frozen=True, slots=True)
-class Score:
+class Score(NamedTuple):
     """Score of one network on one frozen set: (n,) PSNR in [dB], tap of each frame, mean width in [%]."""
 
     psnr_db: NDArray[np.float64]
@@ -66,27 +64,25 @@ class Score:
     width_percent: float
 
 
-_Scores = dict[tuple[str, str, int], Score]
+_Scores = Mapping[tuple[str, str, int], Score]
 """Scores by training set, test set and number of taps."""
 
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Train absent networks, evaluate them, and write the report `unseen`."""
     tests = test_sets(bench)
-    nets = _networks(bench)
+    networks = _networks(bench)
     rows: list[Row] = []
-    scores: _Scores = {}
-    for trained, (net, made) in tracked(nets.items(), "judging", "network"):
-        cost = cost_cells(net) | bench.training_cells(made)
-        for tested, frozen in tests.items():
-            for given in GIVEN:
-                found = intervals(net, frozen, given)
-                figures = judge(found.pattern, frozen, made["contact_level"])
-                scores[trained, tested, given] = Score(
-                    figures["psnr_db"], frozen.tap, float(found.width_percent().mean())
-                )
-                name: Row = {"trained on": trained, "tested on": tested, "taps": given}
-                rows.append(name | error_cells(figures, frozen, "test") | found.cells() | cost)
+    scores: dict[tuple[str, str, int], Score] = {}
+    for trained, method in tracked(networks.items(), "judging", "network"):
+        for (tested, frozen), given in product(tests.items(), GIVEN):
+            found = intervals(method, frozen, given)
+            figures = judge(found.pattern, frozen, method.contact_level)
+            width_percent = float(found.width_percent().mean())
+            scores[trained, tested, given] = Score(figures["psnr_db"], frozen.tap, width_percent)
+            row: Row = {"trained on": trained, "tested on": tested, "taps": given}
+            row |= error_cells(figures, frozen, "test") | found.cells()
+            rows.append(row | method.cost | method.training)
 
     report = Report("unseen", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -100,7 +96,6 @@ def run(bench: Workbench, folder: Path) -> Path:
     report.table(verdict, "What figures added to the 15 surfaces change, frame by frame.", "verdict")
     report.table(rows, "`covered` and `width` are of the 90 % interval, the width in % of the frame's indentation.")
     _plot_errors(report, scores)
-    _plot_shapes(report, nets, tests)
     return report.write()
 
 
@@ -125,12 +120,14 @@ def training_sets(bench: Workbench) -> dict[str, PressSet]:
     }
 
 
-def verdict_rows(scores: Mapping[tuple[str, str, int], Score], given: int, mixed: str, alone: str) -> list[Row]:
+def verdict_rows(scores: _Scores, given: int, mixed: str, alone: str) -> list[Row]:
     """Return the PSNR change by random figures on each test set, against surfaces alone, with its bound."""
     rows: list[Row] = []
     for tested in (*_UNSEEN, _ALL_UNSEEN, _OLD):
-        lift_db, tap = _lift_db(scores, tested, given, mixed, alone)
-        wider = float(np.mean([scores[mixed, one, given].width_percent for one in _parts(tested)]))
+        pairs = [(scores[mixed, one, given], scores[alone, one, given]) for one in _parts(tested)]
+        lift_db = np.concatenate([ours.psnr_db - theirs.psnr_db for ours, theirs in pairs])
+        tap = np.concatenate([1000 * part + ours.tap.astype(int) for part, (ours, _) in enumerate(pairs)])
+        wider = float(np.mean([ours.width_percent for ours, _ in pairs]))
         least_db = -MOST_LOSS_DB if tested == _OLD else LEAST_LIFT_DB
         rows.append(
             {
@@ -151,25 +148,12 @@ def _parts(tested: str) -> tuple[str, ...]:
     return _UNSEEN if tested == _ALL_UNSEEN else (tested,)
 
 
-def _lift_db(
-    scores: Mapping[tuple[str, str, int], Score], tested: str, given: int, mixed: str, alone: str
-) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
-    """Return the PSNR change of every frame, and each frame's tap; taps of all unseen surfaces are numbered apart."""
-    lifts, taps, first = [], [], 0
-    for kind in _parts(tested):
-        lifts.append(scores[mixed, kind, given].psnr_db - scores[alone, kind, given].psnr_db)
-        taps.append(scores[alone, kind, given].tap + first)
-        first += int(taps[-1].max()) + 1
-    return np.concatenate(lifts), np.concatenate(taps)
-
-
-def _networks(bench: Workbench) -> dict[str, tuple[PatternNet, dict[str, Any]]]:
+def _networks(bench: Workbench) -> dict[str, Method]:
     known, every = bench.frozen("validation", KNOWN), bench.frozen("validation")
-    nets = {}
-    for trained, data in training_sets(bench).items():
-        training = TRAININGS[trained]
-        nets[trained] = bench.network(training, data, every if training == BASE else known)
-    return nets
+    return {
+        trained: bench.network(TRAININGS[trained], data, every if trained == _ALL_BOTH else known)
+        for trained, data in training_sets(bench).items()
+    }
 
 
 def _plot_errors(report: Report, scores: _Scores) -> None:
@@ -177,45 +161,16 @@ def _plot_errors(report: Report, scores: _Scores) -> None:
     tested_on = list(dict.fromkeys(tested for _, tested, _ in scores))
     with report.figure(size=(9, 4.5)) as figure:
         axes = figure.subplots()
-        for number, trained in enumerate(trained_on):
-            for given in GIVEN:
-                mine = [scores[trained, tested, given] for tested in tested_on]
-                means = np.array([score.psnr_db.mean() for score in mine])
-                bounds = np.array([bootstrap_interval(score.psnr_db, score.tap) for score in mine]).T
-                axes.errorbar(
-                    np.arange(len(tested_on)) + 0.12 * (number - (len(trained_on) - 1) / 2) + 0.03 * (given > 1),
-                    means,
-                    yerr=np.abs(bounds - means),
-                    fmt="o" if given > 1 else "_",
-                    color=f"C{number}",
-                    label=f"{trained}, {given} tap{'s' * (given > 1)}",
-                    capsize=2,
-                )
+        for (number, trained), given in product(enumerate(trained_on), GIVEN):
+            mean_db, around_db = band(scores[trained, tested, given][:2] for tested in tested_on)
+            axes.errorbar(
+                np.arange(len(tested_on)) + 0.12 * (number - (len(trained_on) - 1) / 2) + 0.03 * (given > 1),
+                mean_db,
+                yerr=around_db,
+                fmt="o" if given > 1 else "_",
+                color=f"C{number}",
+                label=f"{trained}, {given} tap{'s' * (given > 1)}",
+                capsize=2,
+            )
         axes.set(xticks=range(len(tested_on)), xticklabels=tested_on, xlabel="tested on", ylabel="PSNR [dB]")
         axes.legend(title="trained on", fontsize=7, ncols=2)
-
-
-def _plot_shapes(
-    report: Report, nets: Mapping[str, tuple[PatternNet, dict[str, Any]]], tests: Mapping[str, FrozenSet]
-) -> None:
-    """Plot some surfaces that were not trained on, each at the end of its first tap."""
-    columns: list[tuple[str, list[NDArray[np.float32]]]] = []
-    for tested, most in _SHOWN_OF.items():
-        frozen = tests[tested]
-        names, first_tap = np.unique(frozen.surface, return_index=True)
-        ends = [int(np.flatnonzero(frozen.tap == tap)[-1]) for tap in first_tap[:most]]
-        alone, both = (intervals(nets[trained][0], frozen, GIVEN[-1]) for trained in (_ALONE, _BOTH))
-        for name, end in zip(names[:most], ends, strict=True):
-            maps = [alone.truth[end], alone.pattern[end], both.pattern[end], both.deviation[end]]
-            columns.append((str(name).partition(":")[0], maps))
-    titles = ("truth", f"trained on {_ALONE}", f"on {_BOTH}", "its deviation")
-    with report.figure("shapes", size=(1.6 * len(columns), 6.6)) as figure:
-        grid = figure.subplots(len(titles), len(columns), squeeze=False)
-        for column, (name, maps) in enumerate(columns):
-            grid[0, column].set_title(name, fontsize=8)
-            for row, pattern in enumerate(maps):
-                most_mm = float(maps[0].max()) * (0.3 if row == len(maps) - 1 else 1.0)
-                grid[row, column].imshow(pattern, vmin=0, vmax=most_mm)
-                grid[row, column].set(xticks=[], yticks=[])
-        for row, title in enumerate(titles):
-            grid[row, 0].set_ylabel(title, fontsize=8)

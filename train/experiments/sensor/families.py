@@ -6,9 +6,8 @@ settled on training and validation presses, on other pads.
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from train.data.generation_config import SEED
 from train.data.press_batches import COUNTS_PER_UNIT, read_presses
 from train.data.presses import PressSet
 from train.data.world import World
-from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses, pattern_cells
+from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses
 from train.experiments.support.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.learning.checkpoint import best_contact_level
@@ -43,24 +42,15 @@ _TIMED_SCANS: Final = 100
 _AT_ONCE: Final = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
+class Found(NamedTuple):
     """Errors of one method on the wide test set, and its run time."""
 
     figures: Figures
     run_time_us: float
 
 
-@dataclass(frozen=True, slots=True)
-class Baseline:
-    """Method from the newest tap to a pattern.
-
-    Attributes:
-        name: as shown in tables.
-        run: newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm].
-        contact_level: share of a pattern's maximum from which a pixel counts as touched, chosen on validation.
-        validation_db: mean PSNR on validation, in [dB].
-    """
+class Baseline(NamedTuple):
+    """Method from the newest tap, with the level of contact that suits validation best, and its mean PSNR there."""
 
     name: str
     run: Method
@@ -103,8 +93,15 @@ def run(bench: Workbench, folder: Path) -> Path:
     )
     truth, pads = wide.patterns(), wide.presses.pad
     rows: list[Row] = [
-        {"method": name} | pattern_cells(one.figures, pads) | {"run time us": round(one.run_time_us)}
-        for name, one in found.items()
+        {
+            "method": name,
+            "PSNR dB": with_interval(figures["psnr_db"], pads),
+            "IoU": round(float(figures["contact_iou"].mean()), 3),
+            "edge mm": round(float(figures["boundary_mm"].mean()), 3),
+            "RMSE %": round(float(figures["rmse_percent"].mean()), 2),
+            "run time us": round(run_time_us),
+        }
+        for name, (figures, run_time_us) in found.items()
     ]
     report.table(rows, "All families.", "methods")
     report.table(family_rows(found, best, wide), f"PSNR in dB by family; `over` is over {best}, press by press.")
@@ -147,11 +144,7 @@ def nearest_presses(
 ) -> NDArray[np.float32]:
     """Return the mean pattern of the `count` known presses with the nearest readings, compared in network units.
 
-    Args:
-        some: (n, 3, rows, cols) in zeroed counts.
-        known: (m, 3, rows, cols) in zeroed counts.
-        patterns: (m, H, W) in [mm] of the known presses.
-        count: presses that are averaged for a pattern.
+    Readings are (n, 3, rows, cols) and (m, 3, rows, cols) in zeroed counts, patterns (m, H, W) in [mm].
     """
     per_unit = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
     asked, held = ((one / per_unit).reshape(len(one), -1).astype(np.float32) for one in (some, known))

@@ -18,7 +18,6 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
-from train.data.make_presses import make_presses
 from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.data.world import World
@@ -38,8 +37,6 @@ PAPER: Final = World(
 
 Source: Wu and Liu 2024, Fig. 13."""
 _WAYS: Final = ((DEFAULT_MODEL, 1), ("mtsr4-int8", 4), (POSED_MODEL, 4), (POSED_MODEL, MAX_TAPS))
-_COUNT: Final = 420
-_SEED: Final = 2_000_003
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
 """Errors of poses, in [mm] and [deg], where a robot states none."""
 _OFF: Final = ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0))
@@ -89,58 +86,42 @@ def run(bench: Workbench, folder: Path) -> Path:
 
 def paper_rows(models: dict[str, ModelSession], frozen: FrozenPresses) -> list[Row]:
     """Return a row for each model and number of taps, with its gain over the default with one tap."""
-    each, alone, rows = np.arange(len(frozen)), None, list[Row]()
+    each, rows = np.arange(len(frozen)), list[Row]()
+    alone, _ = _psnr(models[DEFAULT_MODEL], frozen, 1, NOTHING)
     for name, taps in _WAYS:
-        done = infer(models[name], frozen.windows(taps), [None] * len(frozen))
-        found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
-        alone = found if alone is None else alone
+        found, run_time_us = _psnr(models[name], frozen, taps, NOTHING)
         row: Row = {"model": name, "taps": taps, "PSNR dB": with_interval(found, each)}
         row["over one tap"] = with_interval(found - alone, each) if taps > 1 else None
-        rows.append(row | {"run time us": round(done.run_time_us)})
+        rows.append(row | {"run time us": run_time_us})
     return rows
 
 
 def presses_of(bench: Workbench, schedule: str, *, figures: bool) -> PressSet:
     """Return the presses of a schedule, of unseen figures or of every family, that these reports evaluate on."""
     families = dict.fromkeys(FIGURES[1:] if figures else SHARES, 1.0)
-    world = World(
-        count=_COUNT,
-        taps=MAX_TAPS,
-        schedule=schedule,
-        begun=0.0,
-        per_pad=10,
-        families=families,
-        seed=_SEED + (not figures),
-    )
-    name = f"test-{schedule}"
-    if bench.quick:
-        name, world = f"quick-{name}", replace(world, count=8, per_pad=4)
-    bench.data_folder.mkdir(parents=True, exist_ok=True)
-    return make_presses(world, bench.data_folder / f"{name}.npz")
+    seed = 2_000_003 if figures else 2_000_004
+    world = replace(PAPER, count=420, schedule=schedule, per_pad=10, families=families, spread=1.0, seed=seed)
+    return bench.presses(f"test-{schedule}", world, quick_taps=MAX_TAPS)
 
 
 def _rows(
-    model: ModelSession,
-    schedule: str,
-    frozen: FrozenPresses,
-    known: str,
-    numbers: tuple[int, ...] = _SHOWN,
+    model: ModelSession, schedule: str, frozen: FrozenPresses, known: str, numbers: tuple[int, ...] = _SHOWN
 ) -> list[Row]:
     """Return a row for each number of taps."""
     poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, USUAL)
-    each, alone = np.arange(len(frozen)), _psnr(model, frozen, poses[:, :1], known)[0]
-    rows: list[Row] = []
+    each, rows = np.arange(len(frozen)), list[Row]()
+    alone, _ = _psnr(model, frozen, 1, known, poses)
     for taps in numbers:
-        found, run_time_us = _psnr(model, frozen, poses[:, :taps], known)
+        found, run_time_us = _psnr(model, frozen, taps, known, poses)
         row: Row = {"schedule": schedule, "taps": taps, "model dB": with_interval(found, each)}
-        row["over one tap"] = None if taps == 1 else with_interval(found - alone, each)
-        rows.append(row | {"run time us": round(run_time_us)})
+        row["over one tap"] = with_interval(found - alone, each) if taps > 1 else None
+        rows.append(row | {"run time us": run_time_us})
     return rows
 
 
 def _wrong(model: ModelSession, frozen: FrozenPresses) -> list[Row]:
     true, each = frozen.presses.poses[:, :_WINDOW], np.arange(len(frozen))
-    alone = _psnr(model, frozen, stated_poses(np.random.default_rng(SEED), true[:, :1], (0, 0)), NOTHING)[0]
+    alone, _ = _psnr(model, frozen, 1, NOTHING, stated_poses(np.random.default_rng(SEED), true[:, :1], (0, 0)))
     rows: list[Row] = []
     for error_mm, error_deg in _OFF:
         row: Row = {"off mm": error_mm, "off deg": error_deg}
@@ -179,8 +160,9 @@ def _off(true: NDArray[np.float32], error: tuple[float, float], stated: tuple[fl
 
 
 def _psnr(
-    model: ModelSession, frozen: FrozenPresses, poses: NDArray[np.float32], known: str
-) -> tuple[NDArray[np.float64], float]:
-    """Return the PSNR (n,) of the newest taps with these poses, and the run time of one."""
-    done = infer(model, frozen.windows(poses.shape[1]), known_pads(frozen, known), poses)
-    return psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM), done.run_time_us
+    model: ModelSession, frozen: FrozenPresses, taps: int, known: str, poses: NDArray[np.float32] | None = None
+) -> tuple[NDArray[np.float64], int]:
+    """Return the PSNR (n,) with so many taps, at these poses or by the paper's schedule, and the run time in [us]."""
+    given = None if poses is None else poses[:, :taps]
+    done = infer(model, frozen.windows(taps), known_pads(frozen, known), given)
+    return psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM), round(done.run_time_us)

@@ -12,9 +12,8 @@ Source: Wu and Liu 2024, Eq. 7-8 (degradation).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,7 @@ from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
-from train.data.presses import PressSet, load_presses
+from train.data.presses import load_presses
 from train.data.real_grips import Grip, loaded, neighbours_mean, recorded_grips, recordings_folder, z_of
 from train.data.world import World, solve_pad
 from train.experiments.support.workbench import Workbench
@@ -38,20 +37,14 @@ from train.report import Report, Row, bootstrap_interval
 
 _SCAN_NS: Final = 16_750_000
 _TAXELS: Final = USPA44.taxel_count
-_FITTED_ON: Final = 8000
-_QUICK_FITTED_ON: Final = 100
 _RIDGE: Final = 0.1
 """Ridge of the operator that leaves the least of z on validation presses."""
 
 
-@dataclass(frozen=True, slots=True)
-class Played:
-    """Output of the runtime for the scans of one grip that are under load.
+class Played(NamedTuple):
+    """Output of the runtime for the scans of one grip that are under load: zeroed counts without a hidden taxel.
 
-    Attributes:
-        zeroed: (n, 3, rows, cols) counts over the baseline, without a hidden taxel.
-        patterns: (n, H, W) in [mm]; NaN where there was no pattern.
-        believed: (n,) True unless the pattern was not believed, by any reason.
+    Patterns are (n, H, W) in [mm], NaN where there was none; believed (n,) unless any reason spoke against it.
     """
 
     zeroed: NDArray[np.float32]
@@ -105,23 +98,22 @@ def run(bench: Workbench, folder: Path) -> Path:
     grips = recorded_grips(recordings_folder())
     bench.use(TAXELS)
     model = ModelSession(bench.use(find_model(DEFAULT_MODEL)))
-    readings, truth = drawn(_presses(bench), _QUICK_FITTED_ON if bench.quick else _FITTED_ON)
+    if bench.quick:
+        readings, truth = drawn(solve_pad(World(count=24, per_pad=24, seed=3), 0), 100)
+    else:
+        readings, truth = drawn(load_presses(bench.data_folder / "gripped.npz"), 8000)
     operator = fit_linear_map(truth.reshape(len(truth), -1), z_of(readings), _RIDGE)
 
-    whole = [play(grip, model) for grip in tracked(grips, "whole", "recording")]
-    grips = [grip for grip, one in zip(grips, whole, strict=True) if len(one.zeroed)]
-    whole = [one for one in whole if len(one.zeroed)]
+    played = [(grip, play(grip, model)) for grip in tracked(grips, "whole", "recording")]
+    grips, whole = zip(*((grip, one) for grip, one in played if len(one.zeroed)), strict=True)
     z = [z_of(one.zeroed) for one in whole]
     hidden = [np.full_like(one, np.nan) for one in z]
     for taxel in tracked(range(_TAXELS), "hidden", "taxel"):
         for grip, estimates in zip(grips, hidden, strict=True):
             patterns = play(grip, model, taxel).patterns
             estimates[:, taxel] = patterns.reshape(len(patterns), -1) @ operator[:, taxel]
-    classical = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
-    methods = {
-        model.name: ([one.patterns for one in whole], hidden),
-        "bilinear": ([classical["bilinear"](one.zeroed) for one in whole], [neighbours_mean(one) for one in z]),
-    }
+    bilinear = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)["bilinear"]
+    neighbours = [neighbours_mean(one) for one in z]
     report = Report("real", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{sum(map(len, z))} scans of {len(whole)} recordings in which some taxel is pressed, z RMS "
@@ -133,24 +125,19 @@ def run(bench: Workbench, folder: Path) -> Path:
         "95 %, are by trial and sensor."
     )
     rows: list[Row] = [
-        {"method": name} | _cells(patterns, estimates, z) for name, (patterns, estimates) in methods.items()
+        {"method": model.name} | _cells([one.patterns for one in whole], hidden, z),
+        {"method": "bilinear"} | _cells([bilinear(one.zeroed) for one in whole], neighbours, z),
     ]
     report.table(rows, "Over all trials and both fingers.")
     rows = [
         {"trial": grip.trial, "sensor": grip.free.sensor, "scans": len(one.zeroed)}
         | _cells([one.patterns], [estimates], [mine], interval=False)
-        | {"bilinear, hidden taxel counts": _rms([neighbours_mean(mine)], [mine], interval=False)}
-        for grip, one, estimates, mine in zip(grips, whole, hidden, z, strict=True)
+        | {"bilinear, hidden taxel counts": _rms([around], [mine], interval=False)}
+        for grip, one, estimates, around, mine in zip(grips, whole, hidden, neighbours, z, strict=True)
     ]
     report.table(rows, f"{model.name} by trial and sensor.", "trials")
     _draw(report, grips, whole)
     return report.write()
-
-
-def _presses(bench: Workbench) -> PressSet:
-    if bench.quick:
-        return solve_pad(World(count=24, per_pad=24, seed=3), 0)
-    return load_presses(bench.data_folder / "gripped.npz")
 
 
 def _cells(

@@ -1,7 +1,6 @@
 """Faults of one sensor, the same in all of its contacts: fields near the pad, wrong places and axes, wrong gains."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -19,12 +18,7 @@ Field = Callable[[np.random.Generator], Counts]
 """Counts (3, rows, cols) that something near the pad adds to each reading."""
 
 _FIELD_COUNTS: Final = (150.0, 1500.0)
-_PLATE_GAP_MM: Final = (1.0, 8.0)
-_MAGNET_MM: Final = 2.5
-_CHIP_MM: Final = 0.5
-_PAD_TOP_MM: Final = 4.5
-_SLOPE: Final = 0.2
-_WRONG_GAINS: Final = 0.25
+_MAGNET_MM, _CHIP_MM, _PAD_TOP_MM = 2.5, 0.5, 4.5
 _MOVES: Final = (
     *("turned by 90 degrees", "turned by 180 degrees", "turned by 270 degrees"),
     *("mirrored", "mirrored and turned by 90", "mirrored and turned by 180", "mirrored and turned by 270"),
@@ -39,9 +33,9 @@ def steel_field(rng: np.random.Generator) -> NDArray[np.float32]:
     """
     across_mm = (np.arange(USPA44.cols) - (USPA44.cols - 1) / 2) * USPA44.pitch_mm
     x_mm, y_mm = (part.ravel() for part in np.meshgrid(across_mm, across_mm))
-    slope = rng.uniform(-_SLOPE, _SLOPE, 2)
+    slope = rng.uniform(-0.2, 0.2, 2)
     lean_mm = slope[0] * x_mm + slope[1] * y_mm
-    gap_mm = rng.uniform(*_PLATE_GAP_MM) + lean_mm - lean_mm.min()
+    gap_mm = rng.uniform(1.0, 8.0) + lean_mm - lean_mm.min()
     image_mm = 2 * (_PAD_TOP_MM + gap_mm) - _MAGNET_MM
     away = np.stack(
         [x_mm[:, None] - x_mm, y_mm[:, None] - y_mm, np.broadcast_to(_CHIP_MM - image_mm, (16, 16))]
@@ -53,37 +47,33 @@ def steel_field(rng: np.random.Generator) -> NDArray[np.float32]:
     return (total / np.abs(total).max() * rng.uniform(*_FIELD_COUNTS)).astype(np.float32)
 
 
-def _added(field: Field, rng: np.random.Generator, counts: Counts) -> Counts:
-    return counts + field(rng)
+def _added(field: Field) -> Fault:
+    return lambda rng, counts: counts + field(rng)
 
 
-def _moved(number: int, rng: np.random.Generator, counts: Counts) -> Counts:
-    return np.ascontiguousarray(symmetries("p4m")[number](counts), dtype=np.float32)
+def _moved(number: int) -> Fault:
+    return lambda rng, counts: np.ascontiguousarray(symmetries("p4m")[number](counts), dtype=np.float32)
 
 
-def _places(order: NDArray[np.integer], rng: np.random.Generator, counts: Counts) -> Counts:
-    flat = counts.reshape(*counts.shape[:2], -1)
-    return flat[:, :, order].reshape(counts.shape)
+def _places(order: Callable[[np.random.Generator], NDArray[np.integer]]) -> Fault:
+    """Return the fault by which taxels are at other places, the same for all axes."""
+    return lambda rng, counts: counts.reshape(*counts.shape[:2], -1)[:, :, order(rng)].reshape(counts.shape)
 
 
-def _shuffled(rng: np.random.Generator, counts: Counts) -> Counts:
-    return _places(rng.permutation(USPA44.taxel_count), rng, counts)
-
-
-def _neighbours(rng: np.random.Generator, counts: Counts) -> Counts:
+def _neighbours(rng: np.random.Generator) -> NDArray[np.integer]:
     order = np.arange(USPA44.taxel_count)
     row, col = rng.integers(USPA44.rows), rng.integers(USPA44.cols - 1)
     one = row * USPA44.cols + col
     order[[one, one + 1]] = one + 1, one
-    return _places(order, rng, counts)
+    return order
 
 
-def _axes(order: tuple[int, int, int], signs: tuple[int, int, int], rng: np.random.Generator, counts: Counts) -> Counts:
-    return counts[:, order] * np.array(signs, dtype=np.float32)[:, None, None]
+def _axes(order: tuple[int, int, int], signs: tuple[int, int, int] = (1, 1, 1)) -> Fault:
+    return lambda rng, counts: counts[:, order] * np.array(signs, dtype=np.float32)[:, None, None]
 
 
 def _gains(rng: np.random.Generator, counts: Counts) -> Counts:
-    return counts * (1 + _WRONG_GAINS * rng.standard_normal(counts.shape[1:])).astype(np.float32)
+    return counts * (1 + 0.25 * rng.standard_normal(counts.shape[1:])).astype(np.float32)
 
 
 _GRID: Final = np.arange(USPA44.taxel_count).reshape(USPA44.rows, USPA44.cols)
@@ -91,20 +81,18 @@ FIELDS: Final[dict[str, Field]] = {
     "a magnet near the pad": lambda rng: magnet_field(rng, 1)[0],
     "a steel plate near the pad": steel_field,
 }
-"""Fields by name."""
 FAULTS: Final[dict[str, Fault]] = {
-    **{name: partial(_added, field) for name, field in FIELDS.items()},
-    **{f"places {name}": partial(_moved, number) for number, name in enumerate(_MOVES, 1)},
-    "rows exchanged in pairs": partial(_places, _GRID[[1, 0, 3, 2]].ravel()),
-    "columns exchanged in pairs": partial(_places, _GRID[:, [1, 0, 3, 2]].ravel()),
-    "places shuffled": _shuffled,
-    "two neighbours exchanged": _neighbours,
-    "x and y exchanged": partial(_axes, (1, 0, 2), (1, 1, 1)),
-    "x and z exchanged": partial(_axes, (2, 1, 0), (1, 1, 1)),
-    "y and z exchanged": partial(_axes, (0, 2, 1), (1, 1, 1)),
-    "x turned": partial(_axes, (0, 1, 2), (-1, 1, 1)),
-    "y turned": partial(_axes, (0, 1, 2), (1, -1, 1)),
-    "x and y turned": partial(_axes, (0, 1, 2), (-1, -1, 1)),
+    **{name: _added(field) for name, field in FIELDS.items()},
+    **{f"places {name}": _moved(number) for number, name in enumerate(_MOVES, 1)},
+    "rows exchanged in pairs": _places(lambda rng: _GRID[[1, 0, 3, 2]].ravel()),
+    "columns exchanged in pairs": _places(lambda rng: _GRID[:, [1, 0, 3, 2]].ravel()),
+    "places shuffled": _places(lambda rng: rng.permutation(USPA44.taxel_count)),
+    "two neighbours exchanged": _places(_neighbours),
+    "x and y exchanged": _axes((1, 0, 2)),
+    "x and z exchanged": _axes((2, 1, 0)),
+    "y and z exchanged": _axes((0, 2, 1)),
+    "x turned": _axes((0, 1, 2), (-1, 1, 1)),
+    "y turned": _axes((0, 1, 2), (1, -1, 1)),
+    "x and y turned": _axes((0, 1, 2), (-1, -1, 1)),
     "gains off by a quarter": _gains,
 }
-"""Faults by name."""

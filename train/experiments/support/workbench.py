@@ -1,17 +1,19 @@
-"""Workbench of the experiments: datasets and networks made once and kept, and errors and cost of networks."""
+"""Workbench of the experiments: datasets and networks made once and kept, and errors and cost of methods."""
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from edge.evaluation.evaluate import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
@@ -23,7 +25,7 @@ from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import PressSet
 from train.data.world import World
 from train.freeze import freeze
-from train.learning.checkpoint import Training, fit_network, load_network
+from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import SymmetricConv2d
 from train.physics.gripped import FRAMES
@@ -34,24 +36,52 @@ from train.surfaces.poses import ANGLE_STEP_DEG, Split
 
 _TIMED_RUNS: Final = 30
 _TIMED_MS: Final = 2000.0
-_QUICK_STEPS: Final = 1
 _QUICK_SURFACES: Final = 2
 _QUICK_PRESSES: Final = 42
 _QUICK_ONE_IN: Final = 12
 _QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 
+Figures = dict[str, NDArray[np.float64]]
+"""Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """Method from windows to patterns.
+
+    Attributes:
+        name: as shown in tables.
+        taps: taps of a window that the method uses.
+        contact_level: share of a pattern's maximum from which a pixel counts as touched.
+        run: windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm], or None.
+        measure: gives parameters, multiply-accumulates and run time, as cells of a row.
+        training: steps and time, as cells of a row.
+    """
+
+    name: str
+    taps: int
+    contact_level: float
+    run: Callable[[NDArray[np.float32]], tuple[NDArray[np.floating], NDArray[np.float32] | None]]
+    measure: Callable[[], Row] = dict
+    training: Row = field(default_factory=dict)
+
+    @cached_property
+    def cost(self) -> Row:
+        """Parameters, multiply-accumulates and run time, as cells of a row; measured once, as it takes two seconds."""
+        return self.measure()
+
+    def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
+        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
+        return self.run(windows[:, : self.taps])[0]
+
+    def judged(self, frozen: FrozenSet, given: int | None = None) -> Figures:
+        """Return every metric of every frame, with the newest `given` taps or all that the method uses."""
+        return judge(self.patterns(frozen.windows(self.taps, given)), frozen, self.contact_level)
+
 
 @dataclass
 class Workbench:
-    """Store of datasets and networks that take long to make.
-
-    Attributes:
-        data_folder: datasets, by name.
-        checkpoints: trained networks, by name.
-        quick: everything tiny, to check that it runs.
-        models: folder of the shipped models.
-        used: files of models and frozen sets that the experiments of this run have used.
-    """
+    """Folders of datasets, trained networks and shipped models, with the files `used` of them; tiny ones if `quick`."""
 
     data_folder: Path = Path("data")
     checkpoints: Path = Path("checkpoints")
@@ -84,8 +114,8 @@ class Workbench:
         wide = load_frozen_presses(self.use(WIDE_TEST))
         return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
 
-    def network(self, training: Training, data: PressSet, validation: FrozenSet) -> tuple[PatternNet, dict[str, Any]]:
-        """Return a trained network and its report, read if the same training on these data exists, else trained."""
+    def network(self, training: Training, data: PressSet, validation: FrozenSet) -> Method:
+        """Return a trained network, read if the same training on these data exists, else trained."""
         if self.quick:
             training = _quick(training)
         path = self.checkpoints / f"{training.name}.pt"
@@ -94,15 +124,12 @@ class Workbench:
         net, report = load_network(self.use(path))
         if path.stat().st_mtime_ns != before:
             sys.stdout.write(f"{training.name}: {report['steps']} steps in {report['elapsed_s']:.0f} s\n")
-        return net, report
-
-    def training_cells(self, report: Mapping[str, Any]) -> Row:
-        """Return a network's training time, including that of the networks it started from, as cells of a row."""
-        steps, elapsed_s = report["steps"], report["elapsed_s"]
-        while (start := report["config"]["start"]) is not None:
+        steps, elapsed_s, level = report["steps"], report["elapsed_s"], report["contact_level"]
+        while (start := report["config"]["start"]) is not None:  # its training counts as well
             _, report = load_network(self.checkpoints / f"{start}.pt")
             steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
-        return {"steps": steps, "training min": round(elapsed_s / 60, 1)}
+        cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
+        return Method(training.name, net.taps, level, partial(infer, net), partial(_cost_of_network, net), cells)
 
     def held_out(
         self, split: Split, surfaces: Sequence[str] = SURFACES, angle_step_deg: float = ANGLE_STEP_DEG
@@ -117,17 +144,12 @@ class Workbench:
         self,
         split: Split,
         surfaces: Sequence[str] = SURFACES,
-        nuisances: Nuisances | None = None,
         scale: int = 10,
         angle_step_deg: float = ANGLE_STEP_DEG,
     ) -> FrozenSet:
-        """Return a frozen set made like the bundled one, with other surfaces, nuisances, scale or angle."""
-        frozen = freeze(self.held_out(split, surfaces, angle_step_deg), nuisances or Nuisances(), SEED, scale=scale)
+        """Return a frozen set made like the bundled one, with other surfaces, scale or angle."""
+        frozen = freeze(self.held_out(split, surfaces, angle_step_deg), Nuisances(), SEED, scale=scale)
         return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
-
-
-Figures = dict[str, NDArray[np.float64]]
-"""Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
 
 
 def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
@@ -142,7 +164,7 @@ def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
     }
 
 
-def cost_cells(net: PatternNet) -> Row:
+def _cost_of_network(net: PatternNet) -> Row:
     """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
     window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
     with one_thread(), torch.inference_mode():
@@ -162,13 +184,10 @@ def median_ms(run: Callable[[], object]) -> float:
 
 def _quick(training: Training) -> Training:
     """Return the training in miniature, under its own name."""
-    recipe = replace(training.recipe, steps=_QUICK_STEPS, batch=2, minutes=None)
+    recipe = replace(training.recipe, steps=1, batch=2, minutes=None)
     options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
-
-
-_TAXEL_AXES: Final = 3
 
 
 def parameters_count(net: nn.Module) -> int:
@@ -176,7 +195,7 @@ def parameters_count(net: nn.Module) -> int:
     return sum(parameter.numel() for parameter in net.parameters())
 
 
-def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
+def macs(net: PatternNet) -> int:
     """Count multiply-accumulates of one window in convolutions and linear layers, without norms and interpolation."""
     counted: list[int] = []
 
@@ -189,7 +208,7 @@ def macs(net: PatternNet, rows: int = 4, cols: int = 4) -> int:
     like, training = next(net.parameters()), net.training
     try:
         with torch.inference_mode():
-            net.eval()(torch.zeros(1, _TAXEL_AXES * net.taps, rows, cols, device=like.device, dtype=like.dtype))
+            net.eval()(torch.zeros(1, 3 * net.taps, USPA44.rows, USPA44.cols, device=like.device, dtype=like.dtype))
     finally:
         for hook in hooks:
             hook.remove()
