@@ -5,11 +5,11 @@ import torch
 from torch import nn
 
 from train.experiments.support.workbench import macs, parameters_count
+from train.networks.blocks import Residual
 from train.networks.compact import CompactNet
 from train.networks.symmetric import (
     Channels,
     SymmetricConv2d,
-    SymmetricResidual,
     fields,
     scalars,
     symmetries,
@@ -65,7 +65,7 @@ def test_a_convolution_keeps_every_symmetry(group, kind, kernel):
 def test_a_residual_block_and_a_pixel_shuffle_keep_every_symmetry(group):
     torch.manual_seed(0)
     wide = fields(group, 16)
-    assert_keeps(SymmetricResidual(wide), wide, wide)
+    assert_keeps(Residual(lambda: SymmetricConv2d(wide, wide, 3)), wide, wide)
     assert_keeps(nn.PixelShuffle(3), wide.shuffled(3), wide)
 
 
