@@ -73,10 +73,6 @@ def test_training_lowers_the_loss(tmp_path):
     assert not net.training
 
 
-def test_one_seed_gives_the_same_weights(tmp_path):
-    assert torch.equal(weights(trained(tmp_path)[0]), weights(trained(tmp_path)[0]))
-
-
 @pytest.mark.parametrize("killed_at", [1, 7, 11])
 def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, monkeypatch, killed_at):
     whole, _ = trained(tmp_path)
@@ -217,18 +213,6 @@ def test_a_batch_that_cannot_be_shared_evenly_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "rank_and_world", lambda: (0, 3))
     with pytest.raises(ValueError, match="4 windows is shared by 3 processes"):
         trained(tmp_path)
-
-
-def test_every_number_once_in_order_and_none_beyond_the_end():
-    drawn = []
-
-    def batch(number):
-        drawn.append(number)
-        return -number
-
-    assert list(drawn_ahead(batch, 3, 7)) == [-3, -4, -5, -6]
-    assert drawn == [3, 4, 5, 6]
-    assert list(drawn_ahead(batch, 7, 7)) == []
 
 
 def test_the_next_is_drawn_while_one_is_used():

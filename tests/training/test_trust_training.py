@@ -10,7 +10,6 @@ import torch
 from edge_samples import make_contract
 from press_samples import make_press_set
 
-from edge.inference.familiarity import contact_features
 from edge.inference.small_network import small_network
 from edge.inference.trust import trust_of
 from train import trust
@@ -68,13 +67,6 @@ class TestWrongReadings:
         assert changed.mean() > 0.5
         again = SPOILINGS[name](np.random.default_rng(1), counts)
         assert np.array_equal(again, wrong)
-
-    def test_faults_of_places_and_axes_keep_the_numbers(self):
-        counts = readings()
-        for name in ("taxels shuffled", "two taxels exchanged", "places turned or mirrored"):
-            wrong = SPOILINGS[name](np.random.default_rng(1), counts)
-            assert np.array_equal(np.sort(wrong.reshape(40, 3, 16)), np.sort(counts.reshape(40, 3, 16))), name
-        assert np.array_equal(np.abs(SPOILINGS["axes turned"](np.random.default_rng(1), counts)), np.abs(counts))
 
     def test_all_faults_occur_each_with_its_name(self):
         counts = readings(90)
@@ -198,20 +190,18 @@ class TestFile:
 
     @pytest.mark.parametrize(
         "damage",
-        [lambda one: one.pop("tap"), lambda one: one.update(contact=[]), lambda one: one["forward"].pop("noise")],
+        [
+            lambda one: json.dumps({**one, "contact": []}),
+            lambda one: json.dumps({name: value for name, value in one.items() if name != "tap"}),
+            lambda one: json.dumps({**one, "forward": {}}),
+            lambda one: "{",
+            lambda one: None,
+        ],
     )
-    def test_a_damaged_one_is_named(self, path, presses, tmp_path, damage):
-        fitted = json.loads(path.read_text())
-        damage(fitted)
-        (tmp_path / "bad.json").write_text(json.dumps(fitted))
-        with pytest.raises(CheckpointError, match=r"bad\.json: .*make it with 'python -m train.trust"):
-            load_trust(tmp_path / "bad.json", presses)
-
-    @pytest.mark.parametrize("content", [None, "", "[]", "{"])
-    def test_no_file_and_no_json_are_named(self, presses, tmp_path, content):
-        if content is not None:
+    def test_none_and_a_damaged_one_are_named(self, path, presses, tmp_path, damage):
+        if (content := damage(json.loads(path.read_text()))) is not None:
             (tmp_path / "bad.json").write_text(content)
-        with pytest.raises(CheckpointError, match=r"bad\.json"):
+        with pytest.raises(CheckpointError, match=r"bad\.json: .*make it with 'python -m train.trust"):
             load_trust(tmp_path / "bad.json", presses)
 
     def test_presses_of_one_tap_cannot_tell_taps_apart(self):
@@ -252,17 +242,3 @@ class TestLimits:
         assert plain.forward.to_json() == posed.forward.to_json() and plain.contact.to_json() == posed.contact.to_json()
         assert plain.tap.network.inputs != posed.tap.network.inputs
         assert trust_of(json.loads(json.dumps(plain.to_json())), len(INPUTS)) is not None
-
-    def test_limits_are_set_by_contacts_alone(self):
-        counts = np.zeros((4, 3, 4, 4), dtype=np.float32)
-        counts[:2, 2] = np.array([46, 48])[:, None, None]  # even: 736 and 768 in sum, of which none is above the least
-        counts[2:, 2, 0, 0] = 740, 760
-        assert in_contact(counts).tolist() == [False, False, False, True]
-        counts[1, 2, 0, 0] += 60
-        assert in_contact(counts).tolist() == [False, True, False, True]
-
-    def test_features_are_those_of_the_runtime(self):
-        counts, pads = readings(3), np.random.default_rng(0).normal(0, 1, (3, 13)).astype(np.float32)
-        unit = np.array([500, 500, 1000], dtype=np.float32)[:, None, None]
-        expected = [contact_features(tap / unit, pad) for tap, pad in zip(counts, pads, strict=True)]
-        assert np.array_equal(features_of(counts, pads), np.concatenate(expected))

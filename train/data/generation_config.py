@@ -42,11 +42,9 @@ def one_thread() -> Iterator[None]:
 def quiet_workers(jobs: int) -> Iterator[None]:
     """Start joblib's processes with SIGINT ignored, because Ctrl-C reaches them too and each would print a traceback.
 
-    They inherit what is ignored. A mask is not enough: the tracker of resources, which joblib starts before them, lifts
-    it. Calls of joblib with as many jobs in the with statement use these processes, and those that replace them: joblib
-    ends a process that has grown by 300 MB, and another, which inherits nothing, sets for itself what it ignores. An
-    interrupted call ends them. Enter from the main thread; until then, Ctrl-C does nothing. joblib's warning of a
-    process that it has ended is left out, since another one does its work.
+    They inherit what is ignored; a mask is not enough, since joblib's tracker of resources lifts it. joblib replaces a
+    process that has grown by 300 MB by another, which inherits nothing and sets for itself what it ignores; its warning
+    of that is left out. Enter from the main thread.
     """
     with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)

@@ -114,18 +114,8 @@ def _world(options: argparse.Namespace) -> World:
         names = [name for name in options.families.split(",") if name != "none"]
         families = {name: SHARES.get(name, 1.0) for name in names}
     families |= {mesh_name(path, options.unit_mm): options.mesh_share for path in options.mesh}
-    return World(
-        count=options.count,
-        taps=options.taps,
-        schedule=options.schedule,
-        begun=options.begun,
-        per_pad=options.per_pad,
-        families=families,
-        spread=options.spread,
-        seed=options.seed,
-        scale=options.scale,
-        pad=options.pad,
-    )
+    same = ("count", "taps", "schedule", "begun", "per_pad", "spread", "seed", "scale", "pad")
+    return World(families=families, **{name: getattr(options, name) for name in same})
 
 
 def _parser() -> argparse.ArgumentParser:

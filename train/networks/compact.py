@@ -53,17 +53,13 @@ class CompactNet(PatternNet):
         blocks: residual blocks of the trunk.
         known: numbers that say constants of the pad, see train.physics.pad_draws.
         group: symmetries. Not mirror images: a mirrored pad is turned the other way from tap to tap.
-        intervals: correct the deviations by region, see `add_intervals`.
-
-    Attributes:
-        deviation_scale: factor on the deviation, see `train.learning.interval_fit.calibrate`.
-        intervals: correction of the deviations by region; None until `add_intervals`.
+        intervals: correct the deviations by region, as after `add_intervals`.
 
     Raises:
         ValueError: no taps, an odd scale, or channels that do not divide.
     """
 
-    deviation_scale: Tensor
+    deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
 
     def __init__(
         self,
@@ -208,16 +204,15 @@ class CompactNet(PatternNet):
         theirs = dict(start.named_modules())
         for name, ours in self.named_modules():
             source = theirs.get(name)
-            if not isinstance(ours, SymmetricConv2d) or not isinstance(source, SymmetricConv2d):
-                continue
-            weight = source.weight.detach()
-            if name == "enter":
-                kept, about = 3 * min(self.taps, start.taps), self.known + 1
-                widened = torch.zeros_like(ours.weight)
-                widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
-                weight = widened
-            if weight.shape == ours.weight.shape:
-                ours.assign(weight, source.bias.detach())
+            if isinstance(ours, SymmetricConv2d) and isinstance(source, SymmetricConv2d):
+                weight = source.weight.detach()
+                if name == "enter":
+                    kept, about = 3 * min(self.taps, start.taps), self.known + 1
+                    widened = torch.zeros_like(ours.weight)
+                    widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
+                    weight = widened
+                if weight.shape == ours.weight.shape:
+                    ours.assign(weight, source.bias.detach())
         self.deviation_scale.copy_(start.deviation_scale)
 
 
@@ -270,10 +265,9 @@ class HeteroscedasticError(Objective):
 def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> Tensor:
     """Return the relative error of the patterns plus the loss of the deviations; all inputs (n, H, W) in [mm].
 
-    The deviation is trained by a Laplace likelihood, because errors have long tails: with the error e and b = deviation
-    / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b. Its slope over log b is b - e, so
-    pixels in the contact are covered as well as those around it. The error is a constant in this term, so a larger
-    uncertainty never allows a worse pattern.
+    The deviation is trained by a Laplace likelihood: with the error e and b = deviation / sqrt(2), both as shares of
+    the truth's RMS, (log b + e / b) times a fixed b. Its slope over log b is b - e, so pixels in the contact are
+    covered as well as those around it. The error is a constant in this term, so doubt never allows a worse pattern.
 
     Source: Seitzer et al. 2022, Eq. 5 with beta 1, for a Laplace density.
     """

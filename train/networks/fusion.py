@@ -162,14 +162,10 @@ class _Carrier:
     order in which its channels hold them: the four parts of a taxel first, then rows and columns.
 
     Args:
-        poses: (n, k - 1, 5) of the earlier taps.
-        there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0.
+        poses: (n, k - 1, 5) of the earlier taps; `inputs`, (n, k - 1, 7), are these as the encoder takes them.
+        there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0; `any`, (n, 1, 1, 1), is 1 where some tap is.
         grid: taxels of a pad, (rows, cols).
         reaches: variances of the Gaussians in cells, to the newest tap and from it.
-
-    Attributes:
-        inputs: (n, k - 1, 7), the poses as inputs of the encoder.
-        any: (n, 1, 1, 1), 1 where some earlier tap is there, else 0.
     """
 
     def __init__(self, poses: Tensor, there: Tensor, grid: tuple[int, int], reaches: Sequence[Tensor]) -> None:
@@ -196,10 +192,9 @@ class _Carrier:
             self._weights.append(torch.exp((here @ over).clamp_max(0.0)))
 
     def to_newest(self, sent: Tensor) -> Tensor:
-        """Return carried channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
+        """Return channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
 
-        Args:
-            sent: (n (k - 1), 4 (c + heads), rows, cols).
+        That is (n (k - 1), 4 (c + heads), rows, cols).
         """
         cells = sent.reshape(*self._taps, _CARRIED + _HEADS, self._cells).transpose(1, 2)
         weight = F.softplus(cells[:, _CARRIED:]) * self._there

@@ -1,13 +1,13 @@
 """The published networks, to compare with: TactileSRCNN, TactileSRGAN, STSR and MTSR-K.
 
 STSR and MTSR-K: Wu and Liu 2024, Section V and Fig. 8; channels and biases follow from the parameter counts of the
-authors' code. TactileSRCNN: Wu, Liu and Zhang 2022; parameters (4.36 M) and MACs (6.96 G at 40 x 40) of the later
-paper's table are those of three 3 x 3 convolutions before the blocks, of which the 2022 code has one.
+authors' code. TactileSRCNN: Wu, Liu and Zhang 2022, with three 3 x 3 convolutions before the blocks, which make the
+parameters and MACs of the later paper's table; the 2022 code has one.
 
 TactileSRGAN is TactileSRCNN trained against a discriminator. From the authors' code: a Wasserstein loss with gradient
 penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to the error.
-Chosen here: the discriminator's layers, which follow SRGAN's but score patches and take any scale; no batch
-normalisation in it (Gulrajani et al. 2017, Section 4); and its input, patterns relative to their truth's size.
+Chosen here: the discriminator's layers, which score patches and take any scale, without batch normalisation; and its
+input, patterns relative to their truth's size.
 """
 
 from typing import Any, Final
@@ -34,7 +34,11 @@ _TINY: Final = 1e-12
 
 
 class _PublishedNet(PatternNet):
-    """Network whose layers all work at the pattern's size."""
+    """Network whose layers all work at the pattern's size.
+
+    Raises:
+        ValueError: taps or scale out of range.
+    """
 
     def __init__(self, taps: int, scale: int) -> None:
         super().__init__()
@@ -57,10 +61,9 @@ class _PublishedNet(PatternNet):
         return F.interpolate(window, scale_factor=self.scale, mode="bilinear", align_corners=False)
 
     def _pattern(self, output: Tensor) -> Tensor:
-        """Convert the last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm], in evaluation cut at zero.
+        """Convert the last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm].
 
-        The published ones are cut in training too: for 3 of 16 seeds tried they start below zero everywhere, and would
-        never learn.
+        They are cut at zero in evaluation; in training too, as published, 3 of 16 seeds tried would never learn.
         """
         pattern = output[:, 0].float() * _MM_PER_UNIT
         return pattern if self.training else torch.relu(pattern)
@@ -71,9 +74,6 @@ class SeedNet(_PublishedNet):
 
     Taps are interpolated, each passes its stem, and they are merged; the newest tap also passes a branch without batch
     normalisation, which would remove the force.
-
-    Raises:
-        ValueError: taps or scale out of range.
     """
 
     def __init__(self, taps: int, scale: int) -> None:
@@ -109,11 +109,7 @@ class SeedNet(_PublishedNet):
 
 
 class TactileSRCNN(_PublishedNet):
-    """Network from a window of one tap to a pattern, with batch normalisation throughout.
-
-    Raises:
-        ValueError: scale is not positive.
-    """
+    """Network from a window of one tap to a pattern, with batch normalisation throughout."""
 
     def __init__(self, scale: int) -> None:
         super().__init__(1, scale)

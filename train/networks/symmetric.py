@@ -1,9 +1,9 @@
 """Convolutions that are exactly symmetric under quarter turns and mirror images of the pad.
 
 A contact that is turned or mirrored has the turned or mirrored pattern: a square pad has no preferred direction.
-Channels are grouped into fields, and a symmetry of the square permutes them, with a sign for those with a direction
-(the shear x, y). A kernel that keeps this has one free number for each orbit of its entries; the others are copies.
-Written out, it is an ordinary convolution, at the same cost.
+A symmetry of the square permutes channels, with a sign for those with a direction (the shear x, y). A kernel that
+keeps this has one free number for each orbit of its entries; the others are copies. Written out, it is an ordinary
+convolution, at the same cost.
 
 Source: Cohen and Welling 2016, group equivariant convolutional networks, p4 and p4m.
 """
