@@ -53,7 +53,7 @@ def test_a_damaged_file_is_told_from_one_that_is_none(tmp_path):
         load_presses(path)
     for name, value, told in (
         ("counts", arrays["counts"][:3], r"expected float32 \(12, "),
-        ("counts", arrays["counts"].astype(np.float64), "counts is float64"),
+        ("counts", arrays["counts"].astype(np.float64), "'counts' is float64"),
         ("version", np.array(99), "of version 99, expected .* of at most 3"),
         ("schema", np.array("another"), "is 'another' of version 3"),
         ("facts", np.array("{"), "or a damaged one"),

@@ -142,8 +142,3 @@ def test_assigning_takes_the_nearest_symmetric_kernel(group):
         torch.testing.assert_close(layer.weight, before[0])
         torch.testing.assert_close(layer.bias, before[1])
         assert (torch.equal(layer.weight, weight)) == (group == "p1")
-
-
-def test_channels_that_do_not_divide_into_fields_are_refused():
-    with pytest.raises(ValueError, match="12 channels, expected a multiple of the 8 symmetries of p4m"):
-        fields("p4m", 12)

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
@@ -152,7 +153,7 @@ def load_presses(path: Path) -> PressSet:
         arrays.setdefault("poses", _turned(arrays["angle_deg"]))
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
-        _check_axes(path, arrays)
+        check_axes(_AXES, arrays)
         loaded = PressSet(**arrays, config=facts["config"])
         hashed = str(facts["sha256"])
     except FileNotFoundError:
@@ -164,19 +165,6 @@ def load_presses(path: Path) -> PressSet:
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded
-
-
-def _check_axes(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise DatasetError if an array is of another type or shape than _AXES states."""
-    lengths = {"3": 3}
-    for name, (kind, axes) in _AXES.items():
-        array = arrays[name]
-        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
-        if not fits or any(
-            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
-        ):
-            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
-            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")
 
 
 def _turned(angle_deg: NDArray[np.float32]) -> NDArray[np.float32]:

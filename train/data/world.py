@@ -1,5 +1,6 @@
 """Simulated world of grips: pads, families of shapes, depths and drags."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil, inf
@@ -9,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44
-from train.data.generation_config import mesh_sha256, one_thread
+from train.data.generation_config import one_thread
 from train.data.presses import VERSION, PressSet, join_presses
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
-from train.surfaces.meshes import MESH
+from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS, schedule_of
 
@@ -91,8 +92,16 @@ class World:
             del facts["scale"]  # what was made before there was a choice keeps its name
         if self.pad == USPA44.name:
             del facts["pad"]
-        meshes = {name: mesh_sha256(name) for name in self.families if name.startswith(MESH)}
+        meshes = {name: _mesh_sha256(name) for name in self.families if name.startswith(MESH)}
         return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
+
+
+def _mesh_sha256(name: str) -> str:
+    """Return the hash of a user's file, because the content under a name may change."""
+    try:
+        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
 
 
 @one_thread()

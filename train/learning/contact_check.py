@@ -58,7 +58,7 @@ def _near_magnet(rng: np.random.Generator, counts: Counts) -> Counts:
 
 
 def _rearranged(counts: Counts, order: NDArray[np.integer]) -> Counts:
-    """Return readings whose taxels are in another order, (n, taxels)."""
+    """Return readings with their taxels in another order, (n, taxels)."""
     flat = counts.reshape(*counts.shape[:2], -1)
     return np.take_along_axis(flat, order[:, None], axis=2).reshape(counts.shape)
 

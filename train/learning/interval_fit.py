@@ -54,39 +54,21 @@ Run = Callable[
 
 
 def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.floating]:
-    """Return half the width of the interval that holds a share `level` of a Laplace density, in [mm].
-
-    Raises:
-        ValueError: the level is not between 0 and 1.
-    """
-    if not 0 < level < 1:
-        raise ValueError(f"level is {level}, expected a share between 0 and 1")
+    """Return half the width of the interval that holds a share `level` in 0..1 of a Laplace density, in [mm]."""
     return np.asarray(deviation_mm) * (-log(1 - level) / sqrt(2))
 
 
 def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
     """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm]."""
-    _errors(truth, pattern, deviation)
     return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
 
 
 def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
     """Return the factor on the deviations with which their intervals cover a share `level` of these pixels."""
-    errors = _errors(truth, pattern, deviation)
     widths = half_width_mm(deviation, level)
     if not np.all(widths > 0):
         raise ValueError("a deviation is not above zero: nothing can be scaled to cover its error")
-    return float(np.quantile(errors / widths, level, method="higher"))
-
-
-def _errors(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike) -> NDArray[np.floating]:
-    true, found = np.asarray(truth), np.asarray(pattern)
-    if not true.shape == found.shape == np.shape(deviation) or not true.size:
-        raise ValueError(
-            f"truth, pattern and deviation of shapes {true.shape}, {found.shape} and {np.shape(deviation)},"
-            " expected equal ones with pixels in them"
-        )
-    return np.abs(true - found)
+    return float(np.quantile(np.abs(np.asarray(truth) - np.asarray(pattern)) / widths, level, method="higher"))
 
 
 @dataclass(frozen=True, slots=True)
