@@ -131,9 +131,14 @@ def load_frozen_set(path: Path) -> FrozenSet:
     return FrozenSet(**values)
 
 
-def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
+def check_axes(axes_of: Mapping[str, tuple[str, str]], arrays: Mapping[str, NDArray[Any]]) -> Mapping[str, int]:
+    """Return the length of each axis of arrays whose type and axes are stated.
+
+    Raises:
+        ValueError: an array is missing, or of another type or shape.
+    """
     lengths = {"3": 3}
-    for name, (kind, axes) in _AXES.items():
+    for name, (kind, axes) in axes_of.items():
         if name not in arrays:
             raise ValueError(f"array '{name}' is missing")
         array = arrays[name]
@@ -143,6 +148,11 @@ def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
         ):
             expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
             raise ValueError(f"array '{name}' is {array.dtype} {array.shape}, expected {kind} ({expected})")
+    return lengths
+
+
+def _check_axes(arrays: Mapping[str, NDArray[Any]]) -> None:
+    lengths = check_axes(_AXES, arrays)
     taps = arrays["tap"]
     if not taps.size or taps.min() < 0 or taps.max() >= lengths["t"] or not 0 < arrays["full_scale_mm"] < np.inf:
         raise ValueError("array 'tap' names taps that are not there, or 'full_scale_mm' is not a length")

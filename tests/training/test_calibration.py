@@ -42,14 +42,7 @@ def test_the_level_is_met_whatever_the_density_and_holds_on_other_pixels():
     assert interval_coverage(truth, pattern, factor * deviation, 0.5) < 0.4
 
 
-def test_what_makes_no_sense_is_refused():
+def test_deviations_that_cannot_be_scaled_are_refused():
     truth, pattern, deviation = (part[:1] for part in laplace())
-    for level in (0.0, 1.0, 90):
-        with pytest.raises(ValueError, match="between 0 and 1"):
-            interval_coverage(truth, pattern, deviation, level)
-    with pytest.raises(ValueError, match="expected equal"):
-        interval_coverage(truth, pattern[:, 1:], deviation)
-    with pytest.raises(ValueError, match="expected equal"):
-        calibrate(truth[:0], pattern[:0], deviation[:0])
     with pytest.raises(ValueError, match="not above zero"):
         calibrate(truth, pattern, 0 * deviation)

@@ -7,8 +7,6 @@ from press_samples import make_press_set
 
 from train.data.press_batches import PosedBatches, stated_poses
 from train.errors import DatasetError
-from train.learning.checkpoint import batches_of
-from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.fusion import FusionNet
 from train.networks.registry import grown
@@ -100,18 +98,6 @@ def test_a_shift_by_half_a_pitch_moves_what_an_earlier_tap_shows_by_a_cell(net):
     assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (3, 3)
 
 
-def test_a_larger_stated_error_widens_the_weights():
-    from train.networks.fusion import _Carrier
-
-    there, state = torch.ones(1, 1, 1, 1, 1), torch.zeros(1, 1, 8, 8)
-    state[0, 0, 3, 4] = 1
-    peaks = []
-    for error_mm in (0.0, 2.0):
-        pose = torch.tensor([[[0.0, 0.0, 0.0, error_mm, 0.0]]])
-        peaks.append(float(_Carrier(pose, there, (4, 4), REACHES).to_taps(state).max()))
-    assert peaks[1] < 0.5 * peaks[0]
-
-
 def test_without_poses_the_schedule_of_the_paper_is_assumed(net, inputs):
     window, pad, _ = inputs
     poses = torch.zeros(2, 3, 5)
@@ -160,9 +146,3 @@ class TestBatches:
     def test_too_few_taps_are_refused(self):
         with pytest.raises(DatasetError, match="no sequences of 5 taps"):
             PosedBatches(make_press_set(48, taps=4), (0.2,) * 5, 16, seed=3)
-
-    def test_batches_of_a_network_with_poses_have_poses(self):
-        presses = make_press_set(48, taps=4)
-        recipe = Recipe(1, batch=8, given=(0, 0, 0, 1.0))
-        assert batches_of(presses, 10, recipe, 1, posed=True)(0).poses is not None
-        assert batches_of(presses, 10, recipe, 1)(0).poses is None

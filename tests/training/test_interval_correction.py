@@ -97,16 +97,6 @@ def test_a_turned_pad_has_turned_deviations():
     assert torch.allclose(net(turned)[1], expected, rtol=1e-4)
 
 
-def test_a_shift_is_of_one_region_and_one_number_of_taps():
-    correction = corrected(make_net(taps=3))
-    summary, later = torch.randn(3, len(correction.centre)), torch.tensor([[0.0, 0], [1, 0], [1, 1]])
-    before = correction.log_factors(summary, later)
-    shift = torch.tensor([0.0, 0.5, 0.0, -0.25])
-    correction.shift(2, shift)
-    moved = correction.log_factors(summary, later) - before
-    assert torch.allclose(moved, torch.stack([0 * shift, shift, 0 * shift]), atol=1e-5)
-
-
 def test_factors_are_bounded_whatever_the_weights():
     net = make_net()
     corrected(net, weights=1e3)

@@ -50,21 +50,6 @@ def test_absent_taps_are_the_same_as_fewer_taps(net):
             assert torch.allclose(output, expected, atol=1e-6 * float(output.detach().abs().max()) + 1e-6)
 
 
-def test_fewer_taps_have_weights_and_calibration_of_their_own():
-    torch.manual_seed(1)
-    net = CompactNet(4, 4, 16, 1)
-    net.deviation_scale.fill_(1.5)
-    before = net.enter.weight.clone()
-    fewer = CompactNet(2, 4, 16, 1)
-    fewer.take_over(net)
-    assert fewer.deviation_scale == 1.5
-    with torch.no_grad():
-        for value in (*fewer.parameters(), fewer.deviation_scale):
-            value.zero_()
-    assert (net.enter.weight == before).all()
-    assert net.deviation_scale == 1.5
-
-
 @pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])
 def test_another_width_or_other_inputs_of_the_pad_are_not_taken_over(other):
     start = CompactNet(1, 4, **{"channels": 16, "blocks": 1, **other})
@@ -91,21 +76,6 @@ def test_extreme_windows_give_finite_patterns_and_deviations_above_zero(net, fac
     assert torch.isfinite(deviation).all()
     assert torch.isfinite(traction).all()
     assert (deviation > 0).all()
-
-
-def test_no_tap_at_all_gives_next_to_nothing(net):
-    for nothing, something in zip(net(torch.zeros(1, 12, 4, 4)), net(window()), strict=True):
-        assert nothing.abs().max() < 0.03 * something.abs().max()
-
-
-def test_the_scale_of_deviations_changes_nothing_else(net):
-    pattern, deviation, traction = net(window())
-    net.deviation_scale.fill_(1.7)
-    again, wider, pulled = net(window())
-    net.deviation_scale.fill_(1.0)
-    assert torch.equal(pattern, again) and torch.equal(traction, pulled)
-    assert torch.allclose(wider, 1.7 * deviation)
-    assert "deviation_scale" in net.state_dict()
 
 
 def test_the_pattern_learns_as_if_there_were_no_deviation():
@@ -164,28 +134,6 @@ def test_slopes_are_finite_and_no_steeper_than_the_error(deviation_mm, error_mm)
     size = truth.square().mean(dim=(1, 2)).sqrt().min()
     assert slope.sum() <= (deviation_mm + error_mm) / size
     assert slope.sum() >= -error_mm / size - 1e-6
-
-
-@pytest.mark.night
-def test_deviations_learn_where_errors_are():
-    # Two kinds of windows: one determines its pattern, the other leaves a third of the pixels to chance.
-    torch.manual_seed(3)
-    generator = torch.Generator().manual_seed(4)
-    net, objective = CompactNet(1, 2, 32, 1, group="p1").train(), HeteroscedasticError()
-    optimizer = torch.optim.Adam(net.parameters(), lr=3e-3, betas=(0.9, 0.99))
-    sure, unsure = window(1, taps=1, seed=1), window(1, taps=1, seed=2)
-    windows = torch.cat([sure, unsure]).repeat(8, 1, 1, 1)
-    for step in range(600):
-        optimizer.param_groups[0]["lr"] = 3e-3 * (1 - step / 600)
-        truth = torch.full((16, 8, 8), 0.2)
-        truth[1::2, :, :3] += 0.1 * torch.randn(8, 8, 3, generator=generator)
-        optimizer.zero_grad()
-        objective.loss(net, Batch(windows, truth)).backward()
-        optimizer.step()
-    deviation = net.eval()(torch.cat([sure, unsure]))[1]
-    assert deviation[1, :, :3].mean() > 3 * deviation[1, :, 4:].mean()
-    assert deviation[1, :, :3].mean() > 3 * deviation[0].mean()
-    assert 0.05 < deviation[1, :, :3].mean() < 0.2
 
 
 @pytest.mark.parametrize("taps", [1, 2])

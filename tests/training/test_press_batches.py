@@ -8,7 +8,7 @@ import torch
 from press_samples import make_press_set
 
 from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
-from train.data.press_batches import COUNTS_PER_UNIT, PressBatches, read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, Batch, PressBatches, read_presses
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
@@ -19,6 +19,11 @@ GAINS_ALONE = replace(QUIET, gain_spread=0.1)
 @pytest.fixture(scope="module")
 def presses():
     return make_press_set(count=64, taps=2)
+
+
+@pytest.fixture
+def unmirrored(monkeypatch):
+    monkeypatch.setattr(Batch, "mirrored", lambda batch, _: batch)
 
 
 def counts_of(batch):
@@ -36,8 +41,9 @@ def test_one_number_is_one_batch_whatever_was_drawn_before(presses):
     assert not one(0).window.equal(PressBatches(presses, (0.4, 0.6), 16, seed=4)(0).window)
 
 
+@pytest.mark.usefixtures("unmirrored")
 def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
-    batches = PressBatches(presses, (1.0,), 16, seed=1, nuisances=QUIET, mirror=False)
+    batches = PressBatches(presses, (1.0,), 16, seed=1, nuisances=QUIET)
     marks = [row.tobytes() for row in presses.traction_kpa[:, 0, 0].astype(np.float32)]  # each has its own
     for first in (0, 4):
         drawn = [batches(number) for number in range(first, first + 4)]
@@ -54,7 +60,7 @@ def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
 
 
 def test_of_a_third_of_the_pads_nothing_is_known_of_a_third_all(presses):
-    batches = PressBatches(presses, (1.0,), 64, seed=2, nuisances=QUIET, mirror=False)
+    batches = PressBatches(presses, (1.0,), 64, seed=2, nuisances=QUIET)
     pads = np.concatenate([batches(number).pad.numpy() for number in range(40)])
     count = len(INPUTS)
     values, flags, gains = pads[:, :count], pads[:, count:-1], pads[:, -1]
@@ -74,10 +80,11 @@ def test_known_constants_are_near_the_pads_own(presses):
     assert values.mean() == pytest.approx(0.7, abs=0.01) and values.std() == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.usefixtures("unmirrored")
 def test_readings_of_known_gains_are_evened_out(presses):
     """One clean press is read by many sensors: the spread that is left is the one that the certainty states."""
     one = replace(presses, counts=np.broadcast_to(np.float32(4000), presses.counts.shape).copy())
-    batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE, mirror=False)(0)
+    batch = PressBatches(one, (1.0,), 64, seed=5, nuisances=GAINS_ALONE)(0)
     spread = counts_of(batch).std(axis=(1, 2, 3)) / 4000
     certainty = batch.pad[:, -1].numpy()
     for known in (0.9, 0.7, 0.4):
@@ -86,8 +93,10 @@ def test_readings_of_known_gains_are_evened_out(presses):
     assert spread[certainty == 0].max() > 0.1, "some new sensors spread wider than most"
 
 
-def test_half_of_the_windows_are_mirror_images(presses):
-    plain, images = (PressBatches(presses, (1.0,), 64, seed=7, mirror=mirror)(0) for mirror in (False, True))
+def test_half_of_the_windows_are_mirror_images(presses, monkeypatch):
+    images = PressBatches(presses, (1.0,), 64, seed=7)(0)
+    monkeypatch.setattr(Batch, "mirrored", lambda batch, _: batch)
+    plain = PressBatches(presses, (1.0,), 64, seed=7)(0)
     mirrored = np.array([not torch.equal(*pair) for pair in zip(plain.window, images.window, strict=True)])
     assert 0.3 < mirrored.mean() < 0.7
     for name, vectors in (("window", True), ("pattern", False), ("traction", True)):
@@ -99,9 +108,9 @@ def test_half_of_the_windows_are_mirror_images(presses):
     assert torch.equal(plain.pad, images.pad)
 
 
-def test_no_window_of_several_taps_is_mirrored(presses):
-    plain, images = (PressBatches(presses, (0.5, 0.5), 64, seed=7, mirror=mirror)(0) for mirror in (False, True))
-    assert torch.equal(plain.window, images.window)
+def test_no_window_of_several_taps_is_mirrored(presses, monkeypatch):
+    monkeypatch.setattr(Batch, "mirrored", lambda *_: pytest.fail("a mirrored pad would turn the other way"))
+    assert PressBatches(presses, (0.5, 0.5), 64, seed=7)(0).poses is None
 
 
 def test_windows_of_one_tap_come_from_presses_of_one(presses):

@@ -11,11 +11,10 @@ from edge.evaluation.metrics import psnr_db
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
 from train.errors import CheckpointError
-from train.fit import BUNDLED, given_taps, main
+from train.fit import given_taps, main
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import Recipe
-from train.networks.compact import CompactNet
 from train.networks.registry import grown
 from train.physics.pad_draws import KNOWN
 
@@ -78,14 +77,6 @@ def test_a_network_that_is_there_and_was_trained_alike_is_not_trained_again(fold
     fit_network(TRAINING, data, validation, tmp_path)
     names = {path.name for path in tmp_path.iterdir() if path.is_file()}
     assert names == {"small.pt", "small.json", "small.pt.bak", "small.json.bak"}
-
-
-def test_training_lowers_the_error(folder, validation):
-    _, report = load_network(folder / "small.pt")
-    torch.manual_seed(0)
-    patterns, _ = infer(CompactNet(2, 10, **SMALL).eval(), validation.windows(2))
-    untrained = psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean()
-    assert report["validation_psnr_db"] > untrained + 1
 
 
 def test_the_hash_tells_configurations_and_data_apart():
@@ -162,14 +153,6 @@ def test_the_contact_level_is_the_one_that_overlaps_best():
 def test_windows_of_every_number_of_taps_are_drawn(taps):
     shares = given_taps(taps)
     assert len(shares) == taps and sum(shares) == pytest.approx(1) and min(shares) > 0
-
-
-def test_bundled_networks_start_from_nothing_or_one_before_and_take_what_is_known_of_the_pad():
-    before = [None]
-    for training in BUNDLED:
-        assert training.start in before and training.options == {"known": KNOWN}
-        before.append(training.name)
-    assert before[1:] == ["stsr", "stsr-small", "mtsr4", "mtsr2", "mtsr7-wide"]
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):

@@ -24,20 +24,16 @@ from train.physics.sensor_noise import NAMES, Nuisances
 
 WIDE_TEST: Final = Path(__file__).with_name("wide-test.npz")
 """Frozen set of every family on pads of its own; nothing is selected by it."""
+_USUAL: Final = Nuisances()
 _BEFORE_GAIN: Final = ("pose_error_mm", "pose_error_deg", "hysteresis", "cross_talk", "gain_spread")
 
 
 @dataclass(frozen=True, slots=True)
 class FrozenPresses:
-    """Readings of n sequences of presses.
+    """Readings of n sequences of presses."""
 
-    Attributes:
-        presses: their counts are the readings, whole and zeroed.
-        gains: (n, 3, rows, cols) of each sequence's sensor.
-    """
-
-    presses: PressSet
-    gains: NDArray[np.float32]
+    presses: PressSet  # their counts are the readings, whole and zeroed
+    gains: NDArray[np.float32]  # (n, 3, rows, cols) of each sequence's sensor
 
     def __len__(self) -> int:
         return len(self.presses)
@@ -89,13 +85,11 @@ class FrozenPresses:
         )
 
 
-def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances | None = None) -> FrozenPresses:
+def freeze_presses(presses: PressSet, seed: int, nuisances: Nuisances = _USUAL) -> FrozenPresses:
     """Read every sequence once, each with a different sensor.
 
-    Gains act after hysteresis and cross-talk and before drift and noise, as in `train.physics.sensor_noise`; here they
-    are drawn separately, so that they can be returned.
+    Gains act where they do in `train.physics.sensor_noise`; they are drawn separately, so that they can be returned.
     """
-    nuisances = Nuisances() if nuisances is None else nuisances
     before = nuisances.without(*(name for name in NAMES if name not in _BEFORE_GAIN), "gain_spread")
     after = nuisances.without(*_BEFORE_GAIN)
     gains = _gains(seed, presses, nuisances.gain_spread)

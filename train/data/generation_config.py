@@ -1,29 +1,14 @@
-"""Means to make a set again with the same bytes: its seed, one thread, quiet workers, and the hash of a user's file."""
+"""Means to make a set again with the same bytes: its seed, and one thread."""
 
-import hashlib
-import signal
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-import joblib
 import torch
 from threadpoolctl import threadpool_limits
 
-from train.errors import DatasetError
-from train.surfaces.meshes import mesh_file
-
 SEED: Final = 20240228
 """Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
-
-
-def mesh_sha256(name: str) -> str:
-    """Return the hash of a user's file, because the content under a name may change."""
-    try:
-        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
-    except OSError as error:
-        raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
 
 
 @contextmanager
@@ -36,29 +21,3 @@ def one_thread() -> Iterator[None]:
             yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def quiet_workers(jobs: int) -> Iterator[None]:
-    """Start joblib's processes with SIGINT ignored, because Ctrl-C reaches them too and each would print a traceback.
-
-    They inherit what is ignored. A mask is not enough: the tracker of resources, which joblib starts before them, lifts
-    it. Calls of joblib with as many jobs in the with statement use these processes, and those that replace them: joblib
-    ends a process that has grown by 300 MB, and another, which inherits nothing, sets for itself what it ignores. An
-    interrupted call ends them. Enter from the main thread; until then, Ctrl-C does nothing. joblib's warning of a
-    process that it has ended is left out, since another one does its work.
-    """
-    with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            joblib.Parallel(n_jobs=jobs)(joblib.delayed(int)() for _ in range(2))
-        finally:
-            signal.signal(signal.SIGINT, before)
-        yield
-
-
-def _begin_quietly() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # shapely divides by the length of an edge, and leaves out those without length afterwards.
-    warnings.filterwarnings("ignore", category=RuntimeWarning, module="shapely")

@@ -10,10 +10,12 @@ Every pad's presses are solved by one of joblib's workers and written next to th
 import argparse
 import os
 import shutil
+import signal
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import nullcontext
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, cast
@@ -22,7 +24,6 @@ import joblib
 
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.pad_geometry import PADS, USPA44
-from train.data.generation_config import quiet_workers
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
@@ -75,6 +76,30 @@ def _part(folder: Path, number: int) -> Path:
     return folder / f"{number:06d}.npz"
 
 
+@contextmanager
+def _quiet_workers(jobs: int) -> Iterator[None]:
+    """Start joblib's processes with SIGINT ignored, because Ctrl-C reaches them too and each would print a traceback.
+
+    They inherit what is ignored; a mask is not enough, since joblib's tracker of resources lifts it. joblib replaces a
+    process that has grown by 300 MB by another, which inherits nothing and sets for itself what it ignores; its warning
+    of that is left out. Enter from the main thread.
+    """
+    with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            joblib.Parallel(n_jobs=jobs)(joblib.delayed(int)() for _ in range(2))
+        finally:
+            signal.signal(signal.SIGINT, before)
+        yield
+
+
+def _begin_quietly() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # shapely divides by the length of an edge, and leaves out those without length afterwards.
+    warnings.filterwarnings("ignore", category=RuntimeWarning, module="shapely")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
     options = _parser().parse_args(arguments)
@@ -88,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name.startswith(MESH):
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
-        with quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
+        with _quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
             made = make_presses(world, options.out, options.jobs, compressed=options.compress)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
@@ -114,18 +139,8 @@ def _world(options: argparse.Namespace) -> World:
         names = [name for name in options.families.split(",") if name != "none"]
         families = {name: SHARES.get(name, 1.0) for name in names}
     families |= {mesh_name(path, options.unit_mm): options.mesh_share for path in options.mesh}
-    return World(
-        count=options.count,
-        taps=options.taps,
-        schedule=options.schedule,
-        begun=options.begun,
-        per_pad=options.per_pad,
-        families=families,
-        spread=options.spread,
-        seed=options.seed,
-        scale=options.scale,
-        pad=options.pad,
-    )
+    same = ("count", "taps", "schedule", "begun", "per_pad", "spread", "seed", "scale", "pad")
+    return World(families=families, **{name: getattr(options, name) for name in same})
 
 
 def _parser() -> argparse.ArgumentParser:

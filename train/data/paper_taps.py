@@ -41,27 +41,16 @@ _ARRAYS: Final = ("surfaces", *_PER_TAP, "unit_patterns", "touching")
 
 @dataclass(frozen=True, slots=True)
 class PaperTaps:
-    """n sequences of K clean whole taps, newest first.
+    """n sequences of K clean whole taps, newest first."""
 
-    Attributes:
-        surfaces: (n,) names.
-        poses: (n, K, 3), true poses of the pad: x, y in [mm], angle in [deg].
-        counts: (n, K, FRAMES, 3, rows, cols), zeroed, without nuisances.
-        force_n: (n, K, FRAMES), in [N].
-        indentation_mm: (n, K, FRAMES), in [mm], even steps.
-        unit_patterns: (n, H, W) of the newest tap, deformation per indentation.
-        touching: (n, H, W), pixels that the surface touches.
-        scale: pattern pixels per taxel pitch.
-    """
-
-    surfaces: NDArray[np.str_]
-    poses: NDArray[np.float64]
-    counts: NDArray[np.float32]
-    force_n: NDArray[np.float32]
-    indentation_mm: NDArray[np.float32]
-    unit_patterns: NDArray[np.float32]
-    touching: NDArray[np.bool_]
-    scale: int = FINE_SCALE
+    surfaces: NDArray[np.str_]  # (n,) names
+    poses: NDArray[np.float64]  # (n, K, 3), true ones of the pad: x, y in [mm], angle in [deg]
+    counts: NDArray[np.float32]  # (n, K, FRAMES, 3, rows, cols), zeroed, without nuisances
+    force_n: NDArray[np.float32]  # (n, K, FRAMES), in [N]
+    indentation_mm: NDArray[np.float32]  # (n, K, FRAMES), in [mm], even steps
+    unit_patterns: NDArray[np.float32]  # (n, H, W) of the newest tap, deformation per indentation
+    touching: NDArray[np.bool_]  # (n, H, W), pixels that the surface touches
+    scale: int = FINE_SCALE  # pattern pixels per taxel pitch
 
     def __len__(self) -> int:
         return len(self.surfaces)
@@ -95,12 +84,7 @@ class PaperTaps:
         )
 
     def share_at_force(self, index: NDArray[np.integer], force_n: ArrayLike) -> NDArray[np.float64]:
-        """Return the shares (B, K) of the presses at which they reach their set forces; 1 if a press ends before.
-
-        Args:
-            index: (B,) sequences.
-            force_n: broadcast to (B, K), above 0, in [N].
-        """
+        """Return the shares (B, K) of presses at which they reach their set forces in [N]; 1 if a press ends before."""
         return np.minimum(np.asarray(force_n, dtype=np.float64) / self.force_n[index, :, -1], 1.0)
 
     def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -115,10 +99,7 @@ class PaperTaps:
 
 @one_thread()
 def paper_taps(
-    split: Split,
-    surfaces: Sequence[str] = SURFACES,
-    taps: int = MAX_TAPS,
-    angle_step_deg: float = ANGLE_STEP_DEG,
+    split: Split, surfaces: Sequence[str] = SURFACES, taps: int = MAX_TAPS, angle_step_deg: float = ANGLE_STEP_DEG
 ) -> PaperTaps:
     """Tap each flat surface at the places of a split, in four turns; poses and truth are off by a robot's error."""
     pad = GrippedPad(NOMINAL)
@@ -146,20 +127,11 @@ def tap(pad: GrippedPad, surface: str, poses: Sequence[Pose], force_n: float) ->
 
 
 def windows(
-    sequences: PaperTaps,
-    index: NDArray[np.integer],
-    force_n: ArrayLike,
-    nuisances: Nuisances,
-    seed: Seed,
+    sequences: PaperTaps, index: NDArray[np.integer], force_n: ArrayLike, nuisances: Nuisances, seed: Seed
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return windows (B, K, 3, rows, cols) in whole zeroed counts, and the newest taps' truth (B, H, W) in [mm].
 
-    Args:
-        sequences: with the truth at the required scale.
-        index: (B,) sequences.
-        force_n: at which every tap is read, broadcast to (B, K), in [N].
-        nuisances: of the B sensors.
-        seed: of the nuisances.
+    Every tap is read at its force in [N], broadcast to (B, K), by one sensor for each of the B sequences.
     """
     share = sequences.share_at_force(index, force_n)
     readings = read_windows(sequences.counts[index], share, nuisances, seed, None, sequences.poses[index, :, 2])

@@ -3,8 +3,8 @@
 Batches for a network that takes poses have one number of taps each, and poses with errors of a stated size.
 """
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -24,21 +24,13 @@ _MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Windows and their truth.
+    """Windows and their truth."""
 
-    Attributes:
-        window: (n, 3K, rows, cols) in network units.
-        pattern: (n, H, W) in [mm].
-        pad: (n, known), inputs of the pads, or None.
-        traction: (n, 3, h, w) in [kPa], or None if it is not trained on.
-        poses: (n, K, 5) of the taps in the newest one's axes, with their errors; None for a fixed schedule.
-    """
-
-    window: Tensor
-    pattern: Tensor
-    pad: Tensor | None = None
-    traction: Tensor | None = None
-    poses: Tensor | None = None
+    window: Tensor  # (n, 3K, rows, cols) in network units
+    pattern: Tensor  # (n, H, W) in [mm]
+    pad: Tensor | None = None  # (n, known), inputs of the pads
+    traction: Tensor | None = None  # (n, 3, h, w) in [kPa]; None if it is not trained on
+    poses: Tensor | None = None  # (n, K, 5) of the taps in the newest one's axes, with their errors; None: a schedule
 
     def mirrored(self, which: Tensor) -> "Batch":
         """Return the batch with mirror images, left for right, of some windows, (n,) of bool.
@@ -63,22 +55,20 @@ class Batch:
     def share(self, rank: int, world: int, device: torch.device) -> "Batch":
         """Return the part of one of several processes, on its device."""
 
-        def mine(part: Tensor) -> Tensor:
-            return part[rank::world].to(device)
+        def mine(part: Any) -> Any:
+            return None if part is None else part[rank::world].to(device)
 
-        return Batch(
-            mine(self.window),
-            mine(self.pattern),
-            None if self.pad is None else mine(self.pad),
-            None if self.traction is None else mine(self.traction),
-            None if self.poses is None else mine(self.poses),
-        )
+        return Batch(**{one.name: mine(getattr(self, one.name)) for one in fields(self)})
 
 
 def network_input(window_counts: NDArray[np.float32]) -> Tensor:
     """Convert windows (n, K, 3, rows, cols) in zeroed counts to network input (n, 3K, rows, cols)."""
-    per_unit = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
-    return torch.from_numpy((window_counts / per_unit).reshape(len(window_counts), -1, *window_counts.shape[3:]))
+    return torch.from_numpy(in_units(window_counts).reshape(len(window_counts), -1, *window_counts.shape[3:]))
+
+
+def in_units(counts: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return readings (..., 3, rows, cols) in counts as those in network units."""
+    return counts / np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
 _NOTHING: Final = 0.35
@@ -90,21 +80,22 @@ _GAIN_SPREADS: Final = ((0.4, 1.0), (0.15, 1.6), (0.15, 0.1), (0.15, 0.3), (0.15
 The first two are new sensors, the second kind wider than most; in the others calibration leaves a tenth to three fifths
 of the spread, which the certainty of the gains states.
 """
+_NEW_SENSORS: Final = Nuisances(dead_taxels=0.02)
 _SURE: Final = 0.1
 """Standard deviation of a constant used as input, over its spread: error that calibration leaves."""
 
 
 class PressBatches:
-    """Batches of windows, pad inputs, and truth.
+    """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
+
+    Windows of one tap are drawn from sequences with fewer taps where these exist, because they are many more.
 
     Args:
-        presses: some of them with all K taps; windows of one tap are drawn from sequences with fewer taps where these
-            exist, because they are many more.
+        presses: some of them with all K taps.
         given: share of windows with 1, 2, ... K taps; older taps are dropped.
         batch: windows in a batch.
         seed: of all draws.
         nuisances: of the sensors.
-        mirror: mirror half of the windows, where K is 1.
 
     Raises:
         DatasetError: there are no presses of K taps.
@@ -116,25 +107,18 @@ class PressBatches:
         given: tuple[float, ...],
         batch: int,
         seed: int,
-        nuisances: Nuisances | None = None,
-        *,
-        mirror: bool = True,
+        nuisances: Nuisances = _NEW_SENSORS,
     ) -> None:
         taps = len(given)
         self._presses = presses.with_taps(taps)
         whole = self._presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= taps)
         if not whole.any():
-            raise DatasetError(
-                f"no sequences of {taps} taps: make some with 'python -m train.data.make_presses --taps'"
-            )
-        self._given = given
+            raise _lacking(taps)
+        self._given, self._seed, self._nuisances = np.array(given), seed, nuisances
         batch = min(batch, len(presses))
-        single = 0 if whole.all() else round(given[0] * batch)
-        counts = ((np.flatnonzero(~whole), single), (np.flatnonzero(whole), batch - single))
+        self._single = 0 if whole.all() else round(given[0] * batch)
+        counts = ((np.flatnonzero(~whole), self._single), (np.flatnonzero(whole), batch - self._single))
         self._parts = [_Part(rows, count, [seed, 0, number]) for number, (rows, count) in enumerate(counts) if count]
-        self._single = single
-        self._seed, self._mirror = seed, mirror
-        self._nuisances = Nuisances(dead_taxels=0.02) if nuisances is None else nuisances
 
     def __call__(self, number: int) -> Batch:
         """Return the batch of a number."""
@@ -144,20 +128,30 @@ class PressBatches:
         readings, certainty = read_by_many(rng, picked, self._nuisances)
         taps = len(self._given)
         there = np.ones(len(index), dtype=np.int64)
-        shares = np.array(self._given)
+        shares = self._given.copy()
         shares[0] *= not self._single
         if self._single < len(index):
             there[self._single :] += rng.choice(taps, size=len(index) - self._single, p=shares / shares.sum())
         readings *= (np.arange(taps) < there[:, None])[..., None, None, None]
-        batch = Batch(
-            window=network_input(readings),
-            pattern=torch.from_numpy(picked.patterns.astype(np.float32)),
-            pad=torch.from_numpy(known_of_pads(rng, picked.constants, certainty)),
-            traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
-        )
-        if taps > 1 or not self._mirror:  # a mirrored pad would turn the other way from tap to tap
+        batch = _batch(rng, picked, readings, certainty)
+        if taps > 1:  # a mirrored pad would turn the other way from tap to tap
             return batch
         return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
+
+
+def _lacking(taps: int) -> DatasetError:
+    return DatasetError(f"no sequences of {taps} taps: make some with 'python -m train.data.make_presses --taps'")
+
+
+def _batch(
+    rng: np.random.Generator, presses: PressSet, readings: NDArray[np.float32], certainty: NDArray[np.float32]
+) -> Batch:
+    return Batch(
+        window=network_input(readings),
+        pattern=torch.from_numpy(presses.patterns.astype(np.float32)),
+        pad=torch.from_numpy(known_of_pads(rng, presses.constants, certainty)),
+        traction=torch.from_numpy(presses.traction_kpa.astype(np.float32)),
+    )
 
 
 class _Part:
@@ -231,26 +225,16 @@ class PosedBatches:
         DatasetError: there are no presses of so many taps.
     """
 
-    def __init__(
-        self,
-        presses: PressSet,
-        given: tuple[float, ...],
-        batch: int,
-        seed: int,
-        nuisances: Nuisances | None = None,
-    ) -> None:
+    def __init__(self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int) -> None:
         self._presses, self._seed = presses, seed
-        self._nuisances = Nuisances(dead_taxels=0.02) if nuisances is None else nuisances
         self._given = np.array(given) / sum(given)
         there = presses.counts.any(axis=(2, 3, 4)).sum(axis=1)
         self._rows = [np.flatnonzero(there >= taps) for taps in range(1, len(given) + 1)]
         self._single = np.flatnonzero(there == 1)
         self._batch = min(batch, len(presses))
-        lacking = [taps for taps, rows in enumerate(self._rows, 1) if given[taps - 1] and not len(rows)]
-        if lacking:
-            raise DatasetError(
-                f"no sequences of {lacking[0]} taps: make some with 'python -m train.data.make_presses --taps'"
-            )
+        for taps, rows in enumerate(self._rows, 1):
+            if given[taps - 1] and not len(rows):
+                raise _lacking(taps)
 
     def __call__(self, number: int) -> Batch:
         """Return the batch of a number."""
@@ -261,14 +245,8 @@ class PosedBatches:
             rows = self._single
         picked = self._presses.pick(rng.choice(rows, self._batch, replace=len(rows) < self._batch))
         picked = _some_of(rng, picked, taps)
-        readings, certainty = read_by_many(rng, picked, self._nuisances)
-        batch = Batch(
-            window=network_input(readings),
-            pattern=torch.from_numpy(picked.patterns.astype(np.float32)),
-            pad=torch.from_numpy(known_of_pads(rng, picked.constants, certainty)),
-            traction=torch.from_numpy(picked.traction_kpa.astype(np.float32)),
-            poses=torch.from_numpy(stated_poses(rng, picked.poses)),
-        )
+        batch = _batch(rng, picked, *read_by_many(rng, picked, _NEW_SENSORS))
+        batch = replace(batch, poses=torch.from_numpy(stated_poses(rng, picked.poses)))
         return batch.mirrored(torch.from_numpy(rng.random(len(picked)) < 0.5))
 
 

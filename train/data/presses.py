@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -11,71 +10,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
 from train.physics.resample import resample, resample_touching
-
-Axes = Mapping[str, tuple[str, str]]
-"""Type and axes of each array; a letter is the same length everywhere."""
-MOST_FACTS_BYTES: Final = 1 << 22
-"""Largest configuration read, in bytes; real ones take a few kB."""
-
-
-def arrays_sha256(configuration: object, arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Return the hash over a configuration and arrays, independent of the file."""
-    digest = hashlib.sha256(json.dumps(configuration, sort_keys=True).encode())
-    for name, values in arrays.items():
-        array = np.ascontiguousarray(values)
-        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
-    return digest.hexdigest()
-
-
-def write_arrays(
-    path: Path,
-    schema: str,
-    version: int,
-    facts: Mapping[str, Any],
-    arrays: Mapping[str, NDArray[Any]],
-    *,
-    compressed: bool = False,
-) -> None:
-    """Write arrays and facts about them as one npz, atomically.
-
-    Raises:
-        DatasetError: the file cannot be written.
-    """
-    save = np.savez_compressed if compressed else np.savez
-
-    def write(draft: Path) -> None:
-        with draft.open("wb") as file:
-            save(file, allow_pickle=False, schema=schema, version=version, facts=json.dumps(facts), **arrays)
-
-    try:
-        # Only the facts are read back: reading all arrays would need as much memory again.
-        write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], MOST_FACTS_BYTES), keep_before=False)
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
-
-
-def check_axes(path: Path, axes_of: Axes, arrays: Mapping[str, NDArray[Any]], **lengths: int) -> Mapping[str, int]:
-    """Check types and axes of arrays, and return the length of each axis; those in `lengths` are fixed.
-
-    Raises:
-        DatasetError: an array is of another type or shape.
-    """
-    lengths = {"3": 3} | lengths
-    for name, (kind, axes) in axes_of.items():
-        array = arrays[name]
-        fits = array.ndim == len(axes) and (array.dtype.kind == kind if kind == "U" else array.dtype == kind)
-        if not fits or any(
-            lengths.setdefault(axis, size) != size for axis, size in zip(axes, array.shape, strict=True)
-        ):
-            expected = ", ".join(str(lengths.get(axis, axis)) for axis in axes)
-            raise DatasetError(f"{path}: {name} is {array.dtype} {array.shape}, expected {kind} ({expected})")
-    return lengths
-
 
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
@@ -83,7 +22,9 @@ VERSION: Final = 3
 _NO_POSES: Final = 2
 """Version without poses, which is still loaded: its taps were turned at one place."""
 _MOST_BYTES: Final = 1 << 33
-_AXES: Final[Axes] = {
+_MOST_FACTS_BYTES: Final = 1 << 22
+"""Largest configuration read, in bytes; real ones take a few kB."""
+_AXES: Final = {
     "family": ("U", "n"),
     "pad": ("int64", "n"),
     "constants": ("float32", "np"),
@@ -97,40 +38,25 @@ _AXES: Final[Axes] = {
     "twist_nmm": ("float32", "n"),
     "indentation_mm": ("float32", "n"),
 }
+"""Type and axes of each array; a letter is the same length everywhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class PressSet:
-    """n sequences of K presses, newest first, each at one moment, with the newest one's truth.
+    """n sequences of K presses, newest first, each at one moment, with the newest one's truth."""
 
-    Attributes:
-        family: (n,) names, see train.families.catalogue.
-        pad: (n,), number of the pad within the set.
-        constants: (n, p) of the pads, over their spread, see train.physics.pad_draws.
-        counts: (n, K, 3, rows, cols), zeroed, without nuisances.
-        angle_deg: (n, K), turn of the pad seen from above, for the earth's field.
-        poses: (n, K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
-        patterns: (n, H, W) in [mm].
-        touching: (n, H, W).
-        traction_kpa: (n, 3, h, w).
-        force_n: (n, 3).
-        twist_nmm: (n,).
-        indentation_mm: (n,).
-        config: configuration of the presses, as read from JSON.
-    """
-
-    family: NDArray[np.str_]
-    pad: NDArray[np.int64]
-    constants: NDArray[np.float32]
-    counts: NDArray[np.float32]
-    angle_deg: NDArray[np.float32]
-    poses: NDArray[np.float32]
-    patterns: NDArray[np.float16]
-    touching: NDArray[np.bool_]
-    traction_kpa: NDArray[np.float16]
-    force_n: NDArray[np.float32]
-    twist_nmm: NDArray[np.float32]
-    indentation_mm: NDArray[np.float32]
+    family: NDArray[np.str_]  # (n,) names, see train.families.catalogue
+    pad: NDArray[np.int64]  # (n,), number of the pad within the set
+    constants: NDArray[np.float32]  # (n, p) of the pads, over their spread, see train.physics.pad_draws
+    counts: NDArray[np.float32]  # (n, K, 3, rows, cols), zeroed, without nuisances
+    angle_deg: NDArray[np.float32]  # (n, K), turn of the pad seen from above, for the earth's field
+    poses: NDArray[np.float32]  # (n, K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg]
+    patterns: NDArray[np.float16]  # (n, H, W) in [mm]
+    touching: NDArray[np.bool_]  # (n, H, W)
+    traction_kpa: NDArray[np.float16]  # (n, 3, h, w)
+    force_n: NDArray[np.float32]  # (n, 3)
+    twist_nmm: NDArray[np.float32]  # (n,)
+    indentation_mm: NDArray[np.float32]  # (n,)
     config: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -153,13 +79,11 @@ class PressSet:
     def with_taps(self, taps: int) -> "PressSet":
         """Return the sequences with their newest `taps` taps; absent taps are all zeros."""
         more = max(taps - self.taps, 0)
-        counts = np.pad(self.counts[:, :taps], [(0, 0), (0, more), (0, 0), (0, 0), (0, 0)])
-        return replace(
-            self,
-            counts=counts,
-            angle_deg=np.pad(self.angle_deg[:, :taps], [(0, 0), (0, more)]),
-            poses=np.pad(self.poses[:, :taps], [(0, 0), (0, more), (0, 0)]),
-        )
+
+        def padded(array: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.pad(array[:, :taps], [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2))
+
+        return replace(self, counts=padded(self.counts), angle_deg=padded(self.angle_deg), poses=padded(self.poses))
 
     def at_scale(self, scale: int) -> "PressSet":
         """Return the sequences with the truth at another scale, in pattern pixels per taxel pitch."""
@@ -179,16 +103,35 @@ class PressSet:
         """Return the hash over all data and the configuration, independent of the file."""
         # Taps that were only turned have the hash of version 2, by which reports and contracts name their sets.
         left_out = () if self.poses[..., :2].any() else ("poses",)
-        return arrays_sha256(self.config, {name: getattr(self, name) for name in _AXES if name not in left_out})
+        digest = hashlib.sha256(json.dumps(self.config, sort_keys=True).encode())
+        for name in _AXES:
+            if name not in left_out:
+                array = np.ascontiguousarray(getattr(self, name))
+                digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+                digest.update(array.data if array.dtype.kind != "U" else "\0".join(array.tolist()).encode())
+        return digest.hexdigest()
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
-        """Write the presses as one npz, atomically."""
+        """Write the presses as one npz, atomically.
+
+        Raises:
+            DatasetError: the file cannot be written.
+        """
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
-        facts = {"config": self.config, "sha256": self.sha256()}
-        with suppress(OSError):  # the writing reports it
+        facts = json.dumps({"config": self.config, "sha256": self.sha256()})
+        save = np.savez_compressed if compressed else np.savez
+
+        def write(draft: Path) -> None:
+            with draft.open("wb") as file:
+                save(file, allow_pickle=False, schema=SCHEMA, version=VERSION, facts=facts, **arrays)
+
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
-        write_arrays(path, SCHEMA, VERSION, facts, arrays, compressed=compressed)
+            # Only the facts are read back: reading all arrays would need as much memory again.
+            write_in_place(path, write, lambda draft: read_npz(draft, ["facts"], _MOST_FACTS_BYTES), keep_before=False)
+        except OSError as error:
+            raise DatasetError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def load_presses(path: Path) -> PressSet:
@@ -198,7 +141,7 @@ def load_presses(path: Path) -> PressSet:
         DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
     """
     try:
-        about = read_npz(path, ("schema", "version", "facts"), MOST_FACTS_BYTES)
+        about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
         if str(about["schema"]) != SCHEMA or int(about["version"]) > VERSION:
             raise DatasetError(
                 f"{path} is {str(about['schema'])[:60]!r} of version {about['version']}, expected {SCHEMA!r} of "
@@ -210,7 +153,7 @@ def load_presses(path: Path) -> PressSet:
         arrays.setdefault("poses", _turned(arrays["angle_deg"]))
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
-        check_axes(path, _AXES, arrays)
+        check_axes(_AXES, arrays)
         loaded = PressSet(**arrays, config=facts["config"])
         hashed = str(facts["sha256"])
     except FileNotFoundError:

@@ -22,32 +22,20 @@ _Z: Final = AXES.index("z")
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """Raw recording of one sensor in one trial.
-
-    Attributes:
-        trial: scans of one trial are not independent.
-        counts: (n, 3, rows, cols) raw.
-        free: the sensor's baseline, of the free pad.
-    """
+    """Raw recording of one sensor in one trial, whose scans are not independent."""
 
     trial: str
-    counts: NDArray[np.integer]
-    free: Baseline
+    counts: NDArray[np.integer]  # (n, 3, rows, cols) raw
+    free: Baseline  # of the sensor's free pad
 
 
 @dataclass(frozen=True, slots=True)
 class ScanSet:
-    """Pressed scans of one contact.
-
-    Attributes:
-        sensor: name of the sensor.
-        trial: scans of one trial are not independent.
-        counts: (n, 3, rows, cols) zeroed.
-    """
+    """Pressed scans of one sensor in one trial, which are not independent."""
 
     sensor: str
     trial: str
-    counts: NDArray[np.float32]
+    counts: NDArray[np.float32]  # (n, 3, rows, cols) zeroed
 
 
 def z_of(counts: NDArray[np.floating]) -> NDArray[np.floating]:

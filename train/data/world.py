@@ -1,5 +1,6 @@
 """Simulated world of grips: pads, families of shapes, depths and drags."""
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from math import ceil, inf
@@ -9,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44
-from train.data.generation_config import mesh_sha256, one_thread
+from train.data.generation_config import one_thread
 from train.data.presses import VERSION, PressSet, join_presses
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
-from train.surfaces.meshes import MESH
+from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS, schedule_of
 
@@ -37,52 +38,32 @@ _FRICTION: Final = (0.2, 1.2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """Configuration that determines a set of presses.
+    """Configuration that determines a set of presses."""
 
-    Attributes:
-        count: sequences drawn; those below LEAST_FORCE_N or without contact on the pattern are left out, or drawn again
-            where they are of a user's mesh.
-        taps: presses in each sequence.
-        schedule: of the taps' poses, see train.surfaces.poses.schedule_of.
-        begun: share of sequences whose newest tap has only begun, while the earlier ones are as at their ends.
-        per_pad: sequences of one pad.
-        families: relative frequency of each family, or figure of the paper.
-        spread: of the pads' constants, 1 for the whole ranges, 0 for the nominal pad.
-        seed: of all draws.
-        scale: pattern pixels per taxel pitch.
-        pad: name of the pads' model, see firmware_bridge.pad_geometry.PADS.
-    """
-
-    count: int = 24_000
-    taps: int = 1
-    schedule: str = "mixed"
-    begun: float = 0.5
-    per_pad: int = 24
-    families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))
-    spread: float = 1.0
+    count: int = 24_000  # sequences drawn; light ones are left out, or drawn again where they are of a user's mesh
+    taps: int = 1  # presses in each sequence
+    schedule: str = "mixed"  # of the taps' poses, see train.surfaces.poses.schedule_of
+    begun: float = 0.5  # share of sequences whose newest tap has only begun, while the earlier ones are at their ends
+    per_pad: int = 24  # sequences of one pad
+    families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))  # frequency of families or figures
+    spread: float = 1.0  # of the pads' constants, 1 for the whole ranges, 0 for the nominal pad
     seed: int = 1
-    scale: int = SCALE
-    pad: str = USPA44.name
+    scale: int = SCALE  # pattern pixels per taxel pitch
+    pad: str = USPA44.name  # model of the pads, one of firmware_bridge.pad_geometry.PADS
 
     def __post_init__(self) -> None:
-        for name in ("count", "taps", "per_pad"):
-            if getattr(self, name) < 1:
-                raise DatasetError(f"{name} is {getattr(self, name)}, expected 1 or more")
-        if self.taps > MAX_TAPS:
-            raise DatasetError(f"taps is {self.taps}, expected 1 to {MAX_TAPS}")
+        bounds = {"count": (1, inf), "taps": (1, MAX_TAPS), "per_pad": (1, inf), "scale": (1, FINE_SCALE)}
+        bounds |= {"spread": (0, 1), "begun": (0, 1), "seed": (0, inf)}
+        for name, (low, high) in bounds.items():
+            if not low <= (value := getattr(self, name)) <= high:
+                expected = f"{low} or more" if high == inf else f"{low} to {high}"
+                raise DatasetError(f"{name} is {value}, expected {expected}")
         try:
             schedule_of(self.schedule)
         except ValueError as error:
             raise DatasetError(str(error)) from error
-        if not 1 <= self.scale <= FINE_SCALE:
-            raise DatasetError(f"scale is {self.scale}, expected 1 to {FINE_SCALE}")
-        for name in ("spread", "begun"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise DatasetError(f"{name} is {getattr(self, name)}, expected 0 to 1")
         if self.pad not in {pad.name for pad in PADS}:
             raise DatasetError(f"pad is {self.pad!r}, expected one of {', '.join(pad.name for pad in PADS)}")
-        if self.seed < 0:
-            raise DatasetError(f"seed is {self.seed}, expected 0 or more")
         known = {*SHARES, *SURFACES}
         unknown = [name for name in self.families if name not in known and not name.startswith(MESH)]
         if unknown or not self.families:
@@ -91,7 +72,6 @@ class World:
         for name, share in self.families.items():
             if not 0 < share < inf:
                 raise DatasetError(f"frequency of {name} is {share}, expected more than 0")
-        for name in self.families:
             if name.startswith(MESH):
                 surface_mesh(name)  # checked before any work, because meshes fail most often
 
@@ -102,10 +82,9 @@ class World:
 
     def facts(self) -> dict[str, Any]:
         """Return the configuration as read from JSON, with the ranges of the pads' constants and the meshes' hashes."""
-        ranges = {name: list(bounds) for name, bounds in RANGES.items()}
         facts = asdict(self) | {
             "families": dict(self.families),
-            "ranges": ranges,
+            "ranges": {name: list(bounds) for name, bounds in RANGES.items()},
             "inputs": list(INPUTS),
             "version": VERSION,
         }
@@ -113,8 +92,16 @@ class World:
             del facts["scale"]  # what was made before there was a choice keeps its name
         if self.pad == USPA44.name:
             del facts["pad"]
-        meshes = {name: mesh_sha256(name) for name in self.families if name.startswith(MESH)}
+        meshes = {name: _mesh_sha256(name) for name in self.families if name.startswith(MESH)}
         return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
+
+
+def _mesh_sha256(name: str) -> str:
+    """Return the hash of a user's file, because the content under a name may change."""
+    try:
+        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
 
 
 @one_thread()

@@ -3,10 +3,10 @@
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+import platform
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any, Final
 
 import numpy as np
@@ -21,15 +21,15 @@ from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
 from train.learning.training_loop import (
-    Objective,
+    DAMAGES,
     Recipe,
-    device_name,
     device_of_rank,
     rank_and_world,
+    reason,
     train,
     wait_for_all,
 )
-from train.networks.blocks import PatternNet, RelativeError
+from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
@@ -42,26 +42,17 @@ _INFERRED_AT_ONCE: Final = 128
 class Training:
     """Configuration that determines the weights of a network.
 
-    Attributes:
-        name: of the checkpoint.
-        network: a name of train.networks.registry.
-        recipe: hyperparameters of the training.
-        scale: pattern pixels per taxel pitch.
-        start: checkpoint whose weights it starts from, or None.
-        seed: of weights and draws.
-        options: further arguments of the network's class.
-        keep: share of the weights it starts from in the final ones, from 0 to 1: what the training forgets of other
-            contacts comes back. Source: Wortsman et al. 2022 (WiSE-FT), Eq. 1.
+    `keep` brings back what the training forgets of other contacts. Source: Wortsman et al. 2022 (WiSE-FT), Eq. 1.
     """
 
-    name: str
-    network: str
+    name: str  # of the checkpoint
+    network: str  # a name of train.networks.registry
     recipe: Recipe
-    scale: int = 10
-    start: str | None = None
-    seed: int = 1
-    options: dict[str, Any] = field(default_factory=dict)
-    keep: float = 0.0
+    scale: int = 10  # pattern pixels per taxel pitch
+    start: str | None = None  # checkpoint whose weights it starts from
+    seed: int = 1  # of weights and draws
+    options: dict[str, Any] = field(default_factory=dict)  # further arguments of the network's class
+    keep: float = 0.0  # share of the weights it starts from in the final ones
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep < 1:
@@ -85,14 +76,20 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
     training_sha256 = training.sha256(data_sha256)
-    start = None if training.start is None else _file_sha256(folder / f"{training.start}.pt")
-    made_of = {"training_sha256": training_sha256, "start_sha256": start, "validation_sha256": validation.sha256()}
+    start_path = None if training.start is None else folder / f"{training.start}.pt"
+    start_sha256 = None if start_path is None else _file_sha256(start_path)
+    made_of = {"training_sha256": training_sha256, "start_sha256": start_sha256}
+    made_of["validation_sha256"] = validation.sha256()
     if path.exists() and path.with_suffix(".json").exists():
         _, report = load_network(path)
         if {name: report.get(name) for name in made_of} == made_of:
             return report
     torch.manual_seed(training.seed)
-    net = _first_weights(training, folder)
+    net = (
+        build(training.network, training.scale, **training.options)
+        if start_path is None
+        else grown(load_network(start_path)[0], training.network, training.scale, **training.options)
+    )
     first = copy.deepcopy(net.state_dict()) if training.keep else {}
     rank, world = rank_and_world()
     device = device_of_rank(rank)
@@ -105,9 +102,9 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
         batches,
         recipe,
         (resume_path := folder / f"{training.name}.resume"),
-        identity=f"{training_sha256} {start}",
+        identity=f"{training_sha256} {start_sha256}",
         log_folder=folder / "logs" / training.name,
-        validate=lambda net: {"validation PSNR dB": _psnr(net, validation)},
+        validate=lambda net: {"validation PSNR dB": _psnr(infer(net, validation.windows(net.taps))[0], validation)},
     )
     net.cpu()
     if training.keep:
@@ -126,7 +123,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
         "steps": done.steps,
         "elapsed_s": round(done.elapsed_s, 1),
         "course": done.course,
-        "device": device_name(device),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor",
         "processes": world,
         "threads": torch.get_num_threads(),
         **_evaluated(net, validation),
@@ -143,15 +140,8 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     return report
 
 
-def batches_of(
-    data: PressSet,
-    scale: int,
-    recipe: Recipe,
-    seed: int,
-    *,
-    posed: bool = False,
-) -> Callable[[int], Batch]:
-    """Return batches for a recipe; of presses, only the sequences that have all taps.
+def batches_of(data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: bool = False) -> Callable[[int], Batch]:
+    """Return batches for a recipe, whose taps were only turned unless they are posed.
 
     Raises:
         DatasetError: no sequence has as many taps, or the scale is not that of the presses.
@@ -175,9 +165,9 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         report = json.loads(path.with_suffix(".json").read_text())
         net = build(report["network"], report["scale"], **report["options"])
         net.load_state_dict(torch.load(path, weights_only=True))
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {reason}") from error
+    except DAMAGES as error:
+        said = reason(error)
+        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
     return net.eval(), report
 
 
@@ -206,32 +196,24 @@ def _file_sha256(path: Path) -> str:
         raise CheckpointError(f"{path}, to start from: {error.strerror or error}; train it first") from error
 
 
-def _first_weights(training: Training, folder: Path) -> PatternNet:
-    if training.start is None:
-        return build(training.network, training.scale, **training.options)
-    start, _ = load_network(folder / f"{training.start}.pt")
-    return grown(start, training.network, training.scale, **training.options)
-
-
 def _objective(net: PatternNet, device: torch.device, seed: int) -> Objective:
     if isinstance(net, CompactNet):
         return HeteroscedasticError()
     return SrganObjective(device, seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
 
 
-def _psnr(net: PatternNet, validation: FrozenSet) -> float:
-    patterns, _ = infer(net, validation.windows(net.taps))
+def _psnr(patterns: NDArray[np.float32], validation: FrozenSet) -> float:
     return float(psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean())
 
 
-def _evaluated(net: PatternNet, validation: FrozenSet) -> Mapping[str, float]:
+def _evaluated(net: PatternNet, validation: FrozenSet) -> dict[str, float]:
     """Return figures on the validation set, and set the factor of the deviations."""
     patterns, deviations = infer(net, validation.windows(net.taps))
-    truth, full_scale = validation.patterns(), validation.full_scale_mm
+    truth = validation.patterns()
     figures = {
         "contact_level": best_contact_level(patterns, validation.touching()),
-        "validation_psnr_db": float(psnr_db(patterns, truth, full_scale).mean()),
-        "validation_ssim": float(ssim(patterns, truth, full_scale).mean()),
+        "validation_psnr_db": _psnr(patterns, validation),
+        "validation_ssim": float(ssim(patterns, truth, validation.full_scale_mm).mean()),
     }
     if deviations is not None and isinstance(net, CompactNet):
         factor = calibrate(truth, patterns, deviations)

@@ -17,10 +17,10 @@ from edge.inference.small_network import SmallNetwork, small_network
 from edge.inference.trust import Check, contact_features
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.pattern_check import LEAST_COUNTS
-from firmware_bridge.pad_geometry import USPA44, SensorGeometry
-from train.data.press_batches import COUNTS_PER_UNIT, read_presses
+from firmware_bridge.pad_geometry import USPA44
+from train.data.press_batches import in_units, read_presses
 from train.data.presses import PressSet
-from train.networks.symmetric import symmetries
+from train.networks.symmetric import moved_scans, symmetries
 from train.physics.pad_draws import known_numbers
 from train.physics.sensor_noise import Nuisances
 
@@ -32,17 +32,13 @@ Counts = NDArray[np.float32]
 Spoiling = Callable[[np.random.Generator, Counts], Counts]
 
 
-def magnet_field(rng: np.random.Generator, count: int, geometry: SensorGeometry = USPA44) -> Counts:
-    """Draw the counts (n, 3, rows, cols) that far dipoles add, each with its gradient over the pad.
-
-    The dipole is above the pad, in any direction, and its moment points anywhere.
-    """
+def magnet_field(rng: np.random.Generator, count: int) -> Counts:
+    """Draw the counts (n, 3, rows, cols) that far dipoles above the pad add, with moments that point anywhere."""
     towards, moment = (_unit(rng.standard_normal((count, 3))) for _ in range(2))
     towards[:, 2] = np.abs(towards[:, 2])
     place_mm = towards * rng.uniform(*_FAR_MM, count)[:, None]
-    x_mm = (np.arange(geometry.cols) - (geometry.cols - 1) / 2) * geometry.pitch_mm
-    y_mm = (np.arange(geometry.rows) - (geometry.rows - 1) / 2) * geometry.pitch_mm
-    chips = np.stack(np.broadcast_arrays(x_mm, y_mm[:, None], 0.0), axis=-1)
+    centres_mm = USPA44.taxel_centres_mm().reshape(USPA44.rows, USPA44.cols, 2)
+    chips = np.pad(centres_mm, [(0, 0), (0, 0), (0, 1)])
     away = chips - place_mm[:, None, None]
     length = np.linalg.norm(away, axis=-1, keepdims=True)
     away /= length
@@ -61,26 +57,28 @@ def _near_magnet(rng: np.random.Generator, counts: Counts) -> Counts:
     return np.where(free, np.float32(0), counts) + magnet_field(rng, len(counts))
 
 
-def _shuffled(rng: np.random.Generator, counts: Counts) -> Counts:
+def _rearranged(counts: Counts, order: NDArray[np.integer]) -> Counts:
+    """Return readings with their taxels in another order, (n, taxels)."""
     flat = counts.reshape(*counts.shape[:2], -1)
-    order = rng.random((len(flat), 1, flat.shape[2])).argsort(axis=2)
-    return np.take_along_axis(flat, order, axis=2).reshape(counts.shape)
+    return np.take_along_axis(flat, order[:, None], axis=2).reshape(counts.shape)
+
+
+def _shuffled(rng: np.random.Generator, counts: Counts) -> Counts:
+    return _rearranged(counts, rng.random((len(counts), USPA44.taxel_count)).argsort(axis=1))
 
 
 def _two_exchanged(rng: np.random.Generator, counts: Counts) -> Counts:
-    flat = counts.reshape(*counts.shape[:2], -1)
-    taken = flat.copy()
-    rows, (one, other) = np.arange(len(flat)), rng.integers(flat.shape[2], size=(2, len(flat)))
-    taken[rows, :, one], taken[rows, :, other] = flat[rows, :, other], flat[rows, :, one]
-    return taken.reshape(counts.shape)
+    rows, (one, other) = np.arange(len(counts)), rng.integers(USPA44.taxel_count, size=(2, len(counts)))
+    order = np.tile(np.arange(USPA44.taxel_count), (len(counts), 1))
+    order[rows, one], order[rows, other] = other, one
+    return _rearranged(counts, order)
 
 
 def _places_moved(rng: np.random.Generator, counts: Counts) -> Counts:
     """Turn or mirror the places of the taxels, but not their axes, as another id map does."""
     moves = symmetries("p4m")[1:]
     which = rng.integers(len(moves), size=len(counts))
-    moved = np.stack([np.asarray(move(counts), dtype=np.float32) for move in moves])
-    return moved[which, np.arange(len(counts))]
+    return np.stack([np.asarray(move(counts), np.float32) for move in moves])[which, np.arange(len(counts))]
 
 
 def _axes_exchanged(rng: np.random.Generator, counts: Counts) -> Counts:
@@ -109,8 +107,7 @@ def _half_of_another(rng: np.random.Generator, counts: Counts) -> Counts:
 
 
 def _wrong_gains(rng: np.random.Generator, counts: Counts) -> Counts:
-    gains = 1 + _WRONG_GAINS * rng.standard_normal(counts.shape)
-    return (counts * gains).astype(np.float32)
+    return (counts * (1 + _WRONG_GAINS * rng.standard_normal(counts.shape))).astype(np.float32)
 
 
 SPOILINGS: Final[dict[str, Spoiling]] = {
@@ -144,7 +141,6 @@ _CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
 _BATCH: Final = 512
 _LEARNING_RATE: Final = 4e-3
 _LEAST_SPREAD: Final = 1e-3
-_UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
 
 
 def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
@@ -163,7 +159,7 @@ def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwor
     return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
 
 
-def drawn_readings(presses: PressSet, seed: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def drawn_readings(presses: PressSet, seed: int) -> tuple[Counts, NDArray[np.float32]]:
     """Return readings (n, 3, rows, cols) in counts by sensors of several certainties, and the pad inputs."""
     rng = np.random.default_rng([seed, 4])
     certainty = np.array(_CERTAINTIES, dtype=np.float32)[rng.integers(len(_CERTAINTIES), size=len(presses))]
@@ -177,51 +173,37 @@ def drawn_readings(presses: PressSet, seed: int) -> tuple[NDArray[np.float32], N
     return readings, known_numbers(presses.constants, known, certainty)
 
 
-def features_of(counts: NDArray[np.float32], pads: NDArray[np.float32]) -> NDArray[np.float32]:
+def features_of(counts: Counts, pads: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features of readings (n, 3, rows, cols) in counts, with the pad inputs (n, p)."""
-    return np.concatenate([contact_features(tap, pad) for tap, pad in zip(counts / _UNIT, pads, strict=True)])
+    return np.concatenate([contact_features(tap, pad) for tap, pad in zip(in_units(counts), pads, strict=True)])
 
 
-def moved(rng: np.random.Generator, counts: NDArray[np.float32], *, mirror: bool = True) -> NDArray[np.float32]:
+def moved(rng: np.random.Generator, counts: Counts, *, mirror: bool = True) -> Counts:
     """Turn each sequence of readings (n, ..., 3, rows, cols) as a whole, axes and all, and mirror half of them."""
     which = rng.integers(8 if mirror else 4, size=len(counts))
     result = counts.copy()
-    for number, move in enumerate(symmetries("p4m")):
-        part = which == number
-        result[part] = _as_vectors(
-            np.array(move(counts[part]), dtype=np.float32), turns=number % 4, mirrored=number >= 4
-        )
+    for number in range(8):
+        result[which == number] = moved_scans(counts[which == number], number)
     return result
 
 
-def _as_vectors(maps: NDArray[np.float32], turns: int, *, mirrored: bool) -> NDArray[np.float32]:
-    """Turn the axes x, y of maps (..., 3, rows, cols) with their places: x to the right, y down."""
-    x, y = maps[..., 0, :, :].copy(), maps[..., 1, :, :].copy()
-    if mirrored:
-        x = -x
-    for _ in range(turns):  # np.rot90 turns counter-clockwise: right becomes up, which is -y, and down becomes right
-        x, y = y, -x
-    maps[..., 0, :, :], maps[..., 1, :, :] = x, y
-    return maps
-
-
-def in_contact(counts: NDArray[np.float32]) -> NDArray[np.bool_]:
+def in_contact(counts: Counts) -> NDArray[np.bool_]:
     """Return which readings (n, 3, rows, cols) in counts the runtime checks: lighter ones would set limits by noise."""
     z = counts[:, 2]
     return (z.max(axis=(1, 2)) > LEAST_COUNTS) & (z.sum(axis=(1, 2)) >= OFF_COUNTS)
 
 
-def limit_of(scores: NDArray[np.floating], false_alarms: float) -> float:
-    """Return the score that a share of right rows exceeds."""
-    return float(np.quantile(scores, 1 - false_alarms, method="higher"))
+def limited(network: SmallNetwork, features: NDArray[np.float32], false_alarms: float) -> Check:
+    """Return the check whose limit a share of these right rows exceeds."""
+    scores = np.array(network(features))
+    return Check(network, float(np.quantile(scores, 1 - false_alarms, method="higher")))
 
 
 def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
     """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
     readings, pads = drawn_readings(presses, seed)
     met = in_contact(readings)
-    scores = network(features_of(readings[met], pads[met]))
-    return Check(network, limit_of(np.array(scores), false_alarms))
+    return limited(network, features_of(readings[met], pads[met]), false_alarms)
 
 
 def fit_classifier(
@@ -234,13 +216,7 @@ def fit_classifier(
 ) -> SmallNetwork:
     """Fit a network whose output is the log odds of a wrong row, right and wrong ones being equally frequent.
 
-    Args:
-        right: (n, inputs).
-        wrong: (m, inputs).
-        widths: units of the layers in between.
-        steps: of the optimizer.
-        seed: of weights and order.
-        weight_decay: of the optimizer; the fewer the rows, the more.
+    Rows are (n, inputs); `widths` are units of the layers in between; the fewer the rows, the more `weight_decay`.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -264,5 +240,4 @@ def fit_classifier(
     # The features are centred and scaled by the first layer, so that the runtime has nothing to know of it.
     weights, offsets = found[0]
     found[0] = (weights / spread, offsets - (weights / spread) @ centre)
-    rounded = SmallNetwork(found)
-    return small_network(rounded.to_json())  # as the contract holds it
+    return small_network(SmallNetwork(found).to_json())  # as the contract holds it

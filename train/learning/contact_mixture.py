@@ -31,39 +31,6 @@ from train.physics.sensor_noise import Nuisances, neighbours, read_windows
 
 CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)
 """Sensors by which bias and intervals of learned gains are set."""
-
-
-def sensor_of(world: World, number: int) -> tuple[Pad, NDArray[np.float64]]:
-    """Return a sensor's pad and the gains (3, rows, cols) of its chips."""
-    spread = Nuisances().gain_spread
-    chips = spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
-    return draw_pad(np.random.default_rng([world.seed, number])), 1 + chips.clip(-2 * spread, 2 * spread)
-
-
-def true_log_gains(pad: Pad, chips: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return log-gains (channels,): of chips and of what seats and moments do under an even load; z's mean is 0."""
-    seats = even_gains(GrippedPad(pad), GrippedPad(replace(pad, seed=None)))
-    true = np.log(chips) + np.log(seats)
-    return (true - true[AXES.index("z")].mean()).ravel()
-
-
-def contacts_of(presses: PressSet, world: World, number: int) -> NDArray[np.float32]:
-    """Return the contacts (n, 3, rows, cols) of a sensor of a world, as it reads them.
-
-    Sets number their pads with gaps, in the order in which they were drawn.
-    """
-    mine = presses.pick(presses.pad == np.unique(presses.pad)[number])
-    clean = mine.counts[:, 0] * sensor_of(world, number)[1].astype(np.float32)
-    return read_windows(clean[None, :, None], 1.0, Nuisances().without("gain_spread"), [world.seed, number])[0]
-
-
-def even_gains(gripped: GrippedPad, perfect: GrippedPad) -> NDArray[np.float64]:
-    """Return what the seats and moments of a pad's magnets do to z under an even load, (rows, cols)."""
-    even = np.full((1, 1, gripped.size, gripped.size), 0.02, dtype=np.float32)
-    z = AXES.index("z")
-    return gripped.skin.frames(even)[0, 0, z].astype(np.float64) / perfect.skin.frames(even)[0, 0, z]
-
-
 TAXELS: Final = USPA44.taxel_count
 CHANNELS: Final = len(AXES) * TAXELS
 Z: Final = slice(AXES.index("z") * TAXELS, (AXES.index("z") + 1) * TAXELS)
@@ -88,17 +55,13 @@ _SOFT: Final = 2.0 * CHANNELS
 
 @dataclass(frozen=True, slots=True)
 class ContactMixture:
-    """Density of normalised contacts as a function of the pad's constants.
+    """Density of normalised contacts as a function of the pad's constants."""
 
-    Attributes:
-        share: (k,) of the components.
-        means: (k, 1 + p, channels), the mean on a middle pad, then the change by half the range of each constant.
-        covariances: (k, channels, channels).
-    """
-
-    share: NDArray[np.float64]
-    means: NDArray[np.float64]
-    covariances: NDArray[np.float64]
+    share: NDArray[np.float64]  # (k,) of the components
+    means: NDArray[
+        np.float64
+    ]  # (k, 1 + p, channels), on a middle pad, then the change by half of each constant's range
+    covariances: NDArray[np.float64]  # (k, channels, channels)
 
     def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the means (k, channels) on a pad of these constants, (p,) over half of their ranges."""
@@ -121,10 +84,7 @@ class ContactMixture:
 
 
 def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return scans (n, 3, rows, cols) as contacts (n, channels) over the RMS of z, and a mask of the usable ones.
-
-    Usable contacts are strong enough and not clipped.
-    """
+    """Return scans (n, 3, rows, cols) as contacts (n, channels) over the RMS of z, and which are strong, unclipped."""
     flat = counts.reshape(len(counts), -1).astype(np.float64)
     peaks = np.abs(counts).max(axis=(2, 3))
     usable = (peaks[:, AXES.index("z")] > LEAST_COUNTS) & (peaks < LARGEST_COUNTS).all(axis=1)
@@ -134,10 +94,8 @@ def normalise(counts: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArra
 
 def scaled_constants(pad: Pad, cross_talk: float = 0.5) -> NDArray[np.float64]:
     """Return CONSTANTS of a pad over half of their ranges, (p,); `cross_talk` is a share of the largest."""
-    bounds = [RANGES[name] for name in CONSTANTS[:-1]]
-    scaled = [
-        2 * (getattr(pad, name) - low) / (high - low) - 1 for name, (low, high) in zip(CONSTANTS, bounds, strict=False)
-    ]
+    bounds = ((name, *RANGES[name]) for name in CONSTANTS[:-1])
+    scaled = [2 * (getattr(pad, name) - low) / (high - low) - 1 for name, low, high in bounds]
     return np.array([*scaled, 2 * cross_talk - 1])
 
 
@@ -151,12 +109,10 @@ def place_effects(pad: Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return (gap_mm / (gap_mm - rest[:, 2])) ** 4 * pad.moments(TAXELS), -rest[:, 3:5].T / 2
 
 
-def even_contacts(presses: PressSet, seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return usable contacts (n, channels) as even sensors read them, and the constants (n, p) of their pads.
 
-    Args:
-        presses: whole sets of `make_presses`, whose pads can be drawn again; the newest press of each sequence is used.
-        seed: of the nuisances.
+    The presses are whole sets of `make_presses`, whose pads can be drawn again; of each sequence it is the newest one.
     """
     rng = np.random.default_rng(seed)
     cross = rng.random(len(presses))
@@ -168,8 +124,7 @@ def even_contacts(presses: PressSet, seed: int = 0) -> tuple[NDArray[np.float64]
     read = read_windows(clean, 1.0, nuisances, seed).reshape(flat.shape).astype(np.float64)
     # Joined sets number their pads with gaps, in the order in which they were drawn.
     numbers, of_pad = np.unique(presses.pad, return_inverse=True)
-    world_seed = presses.config["seed"]
-    pads = [draw_pad(np.random.default_rng([world_seed, number])) for number in range(len(numbers))]
+    pads = [draw_pad(np.random.default_rng([presses.config["seed"], number])) for number in range(len(numbers))]
     effects = [place_effects(pad) for pad in pads]
     read /= np.array([seat for seat, _ in effects])[of_pad][:, None]
     read[:, :2] -= np.array([lean for _, lean in effects])[of_pad] * read[:, 2:]
@@ -179,34 +134,58 @@ def even_contacts(presses: PressSet, seed: int = 0) -> tuple[NDArray[np.float64]
     return contacts[usable], constants[usable]
 
 
-def fit_mixture(
-    presses: PressSet, seed: int = 0, components: int = _COMPONENTS, rounds: int = _ROUNDS
-) -> ContactMixture:
-    """Fit the mixture by expectation-maximisation to presses read by even sensors.
-
-    Args:
-        presses: as of `even_contacts`.
-        seed: of the nuisances and of the components' initial centres.
-        components: largest number; each needs twice as many presses as there are channels.
-        rounds: number of expectation-maximisation rounds.
+def fit_mixture(presses: PressSet, seed: int = 0) -> ContactMixture:
+    """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
 
     Raises:
-        DatasetError: too few presses for one component.
+        DatasetError: too few presses for one component, which needs twice as many as there are channels.
     """
     contacts, constants = even_contacts(presses, seed)
     design = np.insert(constants, 0, 1.0, axis=1)
-    components = min(components, len(contacts) // (2 * CHANNELS))
+    components = min(_COMPONENTS, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
-    rng = np.random.default_rng(seed)
-    mixture = _fitted(contacts, design, _nearest(contacts, rng, components, rounds))
-    for _ in range(rounds):
+    mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(seed), components))
+    for _ in range(_ROUNDS):
         mixture = _fitted(contacts, design, _given_constants(mixture, contacts, design))
     return mixture
 
 
 Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 """Contacts (n, 3, rows, cols) of a sensor, its true log-gains (channels,), and the constants (p,) of its pad."""
+
+
+def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
+    """Return the sensors of the presses of a world, one for each pad, which chips of its own make."""
+    found: list[Sensor] = []
+    for number in range(world.chunks):
+        pad, chips = sensor_of(world, number)
+        # Log-gains of the chips, and of what seats and moments do under an even load; the mean of z's is 0.
+        true = np.log(chips) + np.log(_even_z(GrippedPad(pad)) / _even_z(GrippedPad(replace(pad, seed=None))))
+        true -= true[AXES.index("z")].mean()
+        found.append((contacts_of(presses, world, number), true.ravel(), scaled_constants(pad)))
+    return found
+
+
+def sensor_of(world: World, number: int) -> tuple[Pad, NDArray[np.float64]]:
+    """Return a sensor's pad and the gains (3, rows, cols) of its chips."""
+    spread = Nuisances().gain_spread
+    chips = spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
+    return draw_pad(np.random.default_rng([world.seed, number])), 1 + chips.clip(-2 * spread, 2 * spread)
+
+
+def contacts_of(presses: PressSet, world: World, number: int) -> NDArray[np.float32]:
+    """Return the contacts (n, 3, rows, cols) of a sensor of a world, as it reads them."""
+    # Sets number their pads with gaps, in the order in which they were drawn.
+    mine = presses.pick(presses.pad == np.unique(presses.pad)[number])
+    clean = mine.counts[:, 0] * sensor_of(world, number)[1].astype(np.float32)
+    return read_windows(clean[None, :, None], 1.0, Nuisances().without("gain_spread"), [world.seed, number])[0]
+
+
+def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:
+    """Return z under an even load, (rows, cols)."""
+    even = np.full((1, 1, gripped.size, gripped.size), 0.02, dtype=np.float32)
+    return gripped.skin.frames(even)[0, 0, AXES.index("z")].astype(np.float64)
 
 
 def calibrated(mixture: ContactMixture, sensors: Sequence[Sensor]) -> ContactModel:
@@ -255,13 +234,11 @@ def _symmetric(bias: NDArray[np.float64]) -> NDArray[np.float64]:
     return ((planes + planes.swapaxes(1, 2)[[1, 0, 2]]) / 2).ravel()
 
 
-def _nearest(
-    contacts: NDArray[np.float64], rng: np.random.Generator, components: int, rounds: int
-) -> NDArray[np.float64]:
+def _nearest(contacts: NDArray[np.float64], rng: np.random.Generator, components: int) -> NDArray[np.float64]:
     """Return weights (n, k), each 0 or 1, of k means."""
     weights = np.zeros((len(contacts), components))
     centres = contacts[rng.choice(len(contacts), components, replace=False)]
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         nearest = (-2 * contacts @ centres.T + (centres**2).sum(axis=1)).argmin(axis=1)
         weights = (nearest[:, None] == np.arange(components)).astype(np.float64)
         centres = weights.T @ contacts / np.maximum(weights.sum(axis=0), 1.0)[:, None]
@@ -275,32 +252,26 @@ def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights:
     means, covariances = [], []
     for weight in weights.T:
         used = np.flatnonzero(weight > 1e-4)
-        share, columns, read = weight[used], design[used], contacts[used]
-        mean = np.linalg.solve(columns.T @ (share[:, None] * columns) + soft, columns.T @ (share[:, None] * read))
+        part, columns, read = weight[used], design[used], contacts[used]
+        mean = np.linalg.solve(columns.T @ (part[:, None] * columns) + soft, columns.T @ (part[:, None] * read))
         away = read - columns @ mean
-        spread = away.T @ (share[:, None] * away) + 0.1 * pooled
+        spread = away.T @ (part[:, None] * away) + 0.1 * pooled
         means.append(mean)
-        covariances.append(spread / (share.sum() + 1) + _RIDGE * np.eye(CHANNELS))
-    return ContactMixture(
-        (weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1]), np.array(means), np.array(covariances)
-    )
+        covariances.append(spread / (part.sum() + 1) + _RIDGE * np.eye(CHANNELS))
+    share = (weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1])
+    return ContactMixture(share, np.array(means), np.array(covariances))
 
 
 def _given_constants(
     mixture: ContactMixture, contacts: NDArray[np.float64], design: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    found = [
-        _log_normal(contacts - design @ mean, covariance)
-        for mean, covariance in zip(mixture.means, mixture.covariances, strict=True)
-    ]
-    return softmax(np.stack(found, axis=1) + np.log(mixture.share), axis=1)
-
-
-def _log_normal(away: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the log density (n,) of deviations (n, d), up to a constant."""
-    lower = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(lower, away.T)
-    return -0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum()
+    """Return the shares (n, k) of each contact that the components have."""
+    log_densities = []
+    for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
+        lower = np.linalg.cholesky(covariance)
+        white = np.linalg.solve(lower, (contacts - design @ mean).T)
+        log_densities.append(-0.5 * (white**2).sum(axis=0) - np.log(np.diag(lower)).sum())
+    return softmax(np.stack(log_densities, axis=1) + np.log(mixture.share), axis=1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -319,15 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         mixture = fit_mixture(load_presses(options.presses))
         presses = make_presses(CALIBRATION, options.sensors or options.presses.with_name("calibration.npz"))
-        sensors = [
-            (
-                contacts_of(presses, CALIBRATION, number),
-                true_log_gains(*sensor_of(CALIBRATION, number)),
-                scaled_constants(sensor_of(CALIBRATION, number)[0]),
-            )
-            for number in range(CALIBRATION.chunks)
-        ]
-        write_model(options.out, mixture, calibrated(mixture, sensors))
+        write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
     except TrainError as error:
         sys.stderr.write(f"train.learning.contact_mixture: {error}\n")
         return 1

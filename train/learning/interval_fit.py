@@ -1,17 +1,12 @@
 """Calibration of deviations, and fit of a network's interval correction.
 
-A deviation becomes an interval as that of a Laplace density, which the networks are trained with: errors of patterns
-are mostly small and occasionally large. At 90 % that is 1.63 deviations; a Gaussian's 1.64 is nearly the same. The
-factor is an empirical quantile, so that level is correct on the data of the calibration for any density of the errors;
-the other levels are as accurate as the Laplace density.
+A deviation becomes an interval as that of a Laplace density, which the networks are trained with. The factor is an
+empirical quantile, so that the level of the calibration is correct for any density of the errors; the other levels are
+as accurate as the Laplace density.
 
-The weights of a correction are fitted on training presses, its level on validation presses.
-
-The network is trained and stays as it is. Errors over half widths are sampled in each region of each window; the
-factors that cover a share LEVEL of them minimise the pinball loss of their logarithm, whose slope is the coverage
-itself, so every pixel counts the same whatever its size. Training presses leave errors slightly too small: the
-conformal step shifts the factors of each region and each number of taps until validation presses, which nothing was
-trained on, are covered.
+Weights of a correction are fitted on training presses: the factors that cover a share LEVEL of the errors sampled in
+each region minimise the pinball loss of their logarithm, so every pixel counts the same whatever its size. The
+conformal step then shifts the factors of each region and each number of taps until validation presses are covered.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,7 +37,7 @@ _SAMPLES: Final = 24
 """Pixels of each region of a window."""
 _PRESSES_AT_ONCE: Final = 512
 _ROUNDS: Final = 2
-"""Times that each press is read, each time by another sensor."""
+"""Sensors that read each training press."""
 _STEPS: Final = 2000
 _BATCH: Final = 512
 _RATE: Final = 5e-3
@@ -59,61 +54,31 @@ Run = Callable[
 
 
 def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.floating]:
-    """Return half the width of the interval that holds a share `level` of a Laplace density, in [mm].
-
-    Raises:
-        ValueError: the level is not between 0 and 1.
-    """
-    if not 0 < level < 1:
-        raise ValueError(f"level is {level}, expected a share between 0 and 1")
+    """Return half the width of the interval that holds a share `level` in 0..1 of a Laplace density, in [mm]."""
     return np.asarray(deviation_mm) * (-log(1 - level) / sqrt(2))
 
 
 def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
     """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm]."""
-    _errors(truth, pattern, deviation)
     return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
 
 
 def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Return the factor on the deviations with which their intervals cover a share `level` of these pixels.
-
-    Raises:
-        ValueError: shapes differ, there are no pixels, a deviation is not above zero, or the level is not between 0
-            and 1.
-    """
-    errors = _errors(truth, pattern, deviation)
+    """Return the factor on the deviations with which their intervals cover a share `level` of these pixels."""
     widths = half_width_mm(deviation, level)
     if not np.all(widths > 0):
         raise ValueError("a deviation is not above zero: nothing can be scaled to cover its error")
-    return float(np.quantile(errors / widths, level, method="higher"))
-
-
-def _errors(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike) -> NDArray[np.floating]:
-    true, found = np.asarray(truth), np.asarray(pattern)
-    if not true.shape == found.shape == np.shape(deviation) or not true.size:
-        raise ValueError(
-            f"truth, pattern and deviation of shapes {true.shape}, {found.shape} and {np.shape(deviation)},"
-            " expected equal ones with pixels in them"
-        )
-    return np.abs(true - found)
+    return float(np.quantile(np.abs(np.asarray(truth) - np.asarray(pattern)) / widths, level, method="higher"))
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Windows of all taps of a network, with what is known of their pads and the truth.
+    """Windows of all taps of a network, with what is known of their pads and the truth."""
 
-    Attributes:
-        windows: (n, K, 3, rows, cols) in zeroed counts.
-        pads: (n, width), inputs of the pads; None if nothing is known.
-        truth: (n, H, W) in [mm].
-        poses: (n, K, 5) of the taps, as a robot states them; None for the schedule.
-    """
-
-    windows: NDArray[np.float32]
-    pads: NDArray[np.float32] | None
-    truth: NDArray[np.float32]
-    poses: NDArray[np.float32] | None = None
+    windows: NDArray[np.float32]  # (n, K, 3, rows, cols) in zeroed counts
+    pads: NDArray[np.float32] | None  # (n, width), inputs of the pads; None if nothing is known
+    truth: NDArray[np.float32]  # (n, H, W) in [mm]
+    poses: NDArray[np.float32] | None = None  # (n, K, 5), as a robot states them; None for the schedule
 
     def with_taps(self, given: int) -> NDArray[np.float32]:
         """Return the windows in network units with the newest `given` taps, the others zero: (n, 3K, rows, cols)."""
@@ -138,14 +103,7 @@ def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS, *,
 
 
 def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0) -> None:
-    """Add a correction to a network, fitted on training presses.
-
-    Args:
-        net: trained, in evaluation mode.
-        presses: some of them with all taps of the network.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        seed: of all draws.
-    """
+    """Add a correction to a trained network in evaluation mode, fitted on presses, some of them with all its taps."""
     torch.manual_seed(seed)
     correction = net.add_intervals()
     correction.contact_level.fill_(contact_level)
@@ -174,7 +132,9 @@ def conform(net: CompactNet, run: Run, readings: Sequence[Readings]) -> dict[str
     Returns:
         For each of LEVELS, in percent, the deviations that make half of its interval in each region.
     """
-    correction, unit = _correction(net), float(half_width_mm(1.0))
+    if (correction := net.intervals) is None:
+        raise ValueError("the network has no correction of intervals: fit one first")
+    unit = float(half_width_mm(1.0))
     pooled: list[list[NDArray[np.floating]]] = [[] for _ in REGIONS]
     for given in tracked(range(1, net.taps + 1), "intervals", "taps"):
         ratios = _ratios(correction, run, given, readings)
@@ -208,12 +168,6 @@ def _ratios(
     return [np.concatenate(part) for part in parts]
 
 
-def _correction(net: CompactNet) -> IntervalCorrection:
-    if net.intervals is None:
-        raise ValueError("the network has no correction of intervals: fit one first")
-    return net.intervals
-
-
 def _samples(
     net: CompactNet, correction: IntervalCorrection, presses: PressSet, seed: int
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -228,6 +182,7 @@ def _samples(
     at_once = min(_PRESSES_AT_ONCE, len(chosen))
     batches = PosedBatches if net.takes_poses else PressBatches
     draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
+    unit = float(half_width_mm(1.0))
     found: list[tuple[Any, ...]] = []
     for number in tracked(range(max(_ROUNDS * len(chosen) // at_once, 1)), "intervals", "batch"):
         batch = draw(number)
@@ -235,19 +190,13 @@ def _samples(
             posed = () if batch.poses is None else (batch.poses,)
             seen = net.see(batch.window, batch.pad, *posed)
             pattern = torch.relu(seen.pattern)
-            peak = pattern.amax(dim=(1, 2), keepdim=True)
-            masks = correction.masks(pattern, peak)
-            summary = correction.summary(seen.features, masks, peak, seen.deviation, seen.about, seen.later)
+            _, summary = correction.summary(seen.features, pattern, seen.deviation, seen.about, seen.later)
             error = (pattern - batch.pattern / seen.newest).abs() + _LEAST_ERROR_MM
             region = regions(pattern.numpy(), float(correction.contact_level), correction.near)
-            found.append((summary, seen.later, _drawn(torch.log(error / _half(seen.deviation)), region)))
+            found.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
     # A copy, because tensors of inference take no gradient.
     inputs, later, ratios = (torch.cat(parts).clone() for parts in zip(*found, strict=True))
     return inputs, later, ratios
-
-
-def _half(deviation: Tensor) -> Tensor:
-    return deviation * float(half_width_mm(1.0))
 
 
 def _drawn(values: Tensor, region: NDArray[np.integer]) -> Tensor:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from edge.inference.small_network import SmallNetwork
 from edge.inference.trust import Check, pair_width, pose_tap_features, tap_features
 from edge.perception.pattern_check import LEAST_COUNTS
-from train.data.press_batches import COUNTS_PER_UNIT, read_presses, stated_poses
+from train.data.press_batches import in_units, read_presses, stated_poses
 from train.data.presses import PressSet
-from train.learning.contact_check import fit_classifier, limit_of, moved
+from train.learning.contact_check import fit_classifier, limited, moved
+from train.networks.symmetric import moved_scans
 from train.physics.sensor_noise import Nuisances
 
 _ROUNDS: Final = 4
@@ -32,9 +33,9 @@ _OFF_DEG: Final = (10.0, 90.0)
 _FAR: Final = 3.0
 """Errors of a pose that is wrong, in stated deviations at least."""
 _USUAL: Final = (0.2, 1.0)
-_UNIT: Final = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
-_MIRROR: Final = np.array([-1, 1, -1], dtype=np.float32)
-_FLIPPED: Final = np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
+_MIRROR: Final = 4
+"""Number of the mirror image, left for right, among the symmetries."""
+_MIRRORED_POSE: Final = np.array([-1, 1, -1], dtype=np.float32)
 
 
 def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
@@ -61,9 +62,7 @@ def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
 
 def seen_in_a_mirror(presses: PressSet) -> PressSet:
     """Return the readings of the sequences' mirror images, the last tap first: so they turn as the schedule does."""
-    signs = np.array([-1, 1, 1], dtype=np.float32)[:, None, None]
-    counts = np.ascontiguousarray(presses.counts[:, ::-1, :, :, ::-1] * signs)
-    return replace(presses, counts=counts, angle_deg=-presses.angle_deg[:, ::-1])
+    return replace(presses, counts=moved_scans(presses.counts[:, ::-1], _MIRROR), angle_deg=-presses.angle_deg[:, ::-1])
 
 
 def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
@@ -80,7 +79,7 @@ def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
 
 def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps, both (n, 3, rows, cols) in counts."""
-    pairs = np.stack([newest, earlier], axis=1) / _UNIT
+    pairs = in_units(np.stack([newest, earlier], axis=1))
     return np.concatenate([tap_features(pair, (steps,)) for pair in pairs])
 
 
@@ -88,7 +87,7 @@ def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, see
     """Return the check whose limit a share of the earlier taps of these presses exceeds."""
     windows = read_twice(presses, seed)
     rows = [pair_features(windows[:, 0], windows[:, steps], steps) for steps in range(1, presses.taps)]
-    return Check(network, limit_of(np.array(network(np.concatenate(rows))), false_alarms))
+    return limited(network, np.concatenate(rows), false_alarms)
 
 
 def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
@@ -118,17 +117,13 @@ def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: floa
         there = readings[:, earlier].any(axis=(1, 2, 3))
         pair, pose = readings[there][:, [0, earlier]], poses[there][:, earlier]
         rows.append(posed_pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
-    return Check(network, limit_of(np.array(network(np.concatenate(rows))), false_alarms))
+    return limited(network, np.concatenate(rows), false_alarms)
 
 
 def posed_pair_features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps (n, 2, 3, rows, cols) in counts, with poses (n, 2, 5)."""
-    rows = [pose_tap_features(*one) for one in zip(pairs / _UNIT, poses, strict=True)]
-    return (
-        np.concatenate(rows)
-        if rows
-        else np.empty((0, pair_width(int(np.prod(pairs.shape[2:])), poses=True)), np.float32)
-    )
+    none = np.empty((0, pair_width(int(np.prod(pairs.shape[2:])), poses=True)), np.float32)
+    return np.concatenate([none, *(pose_tap_features(*one) for one in zip(in_units(pairs), poses, strict=True))])
 
 
 def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -146,7 +141,7 @@ def _strong(
     """Return windows (n, K, 3, rows, cols) in counts whose taps are strong enough or absent, and their poses."""
     readings, poses = read_presses(presses, Nuisances(), seed), presses.poses
     if mirror:
-        readings, poses = readings[..., ::-1] * _FLIPPED, poses * _MIRROR
+        readings, poses = moved_scans(readings, _MIRROR), poses * _MIRRORED_POSE
     there = presses.counts.any(axis=(2, 3, 4))
     strong = ((readings[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS) | ~there).all(axis=1)
     return readings[strong], poses[strong]
@@ -173,8 +168,8 @@ def _wrong(
     shifted[:, 1, 1] += np.where(which[:, 0], far_mm * np.sin(way), 0)
     shifted[:, 1, 2] += np.where(which[:, 1], far_deg * sign, 0)
     depth = rng.uniform(*_DEPTHS, (len(pair), 1, 1, 1)).astype(np.float32)
-    moved = (np.hypot(*pose[:, :2].T) > np.maximum(_OFF_MM[0], _FAR * stated[:, 1, 3])) | (
-        np.abs(pose[:, 2]) > np.maximum(_OFF_DEG[0], _FAR * stated[:, 1, 4])
-    )
+    off_mm, off_deg = np.hypot(*pose[:, :2].T), np.abs(pose[:, 2])
+    moved = off_mm > np.maximum(_OFF_MM[0], _FAR * stated[:, 1, 3])
+    moved |= off_deg > np.maximum(_OFF_DEG[0], _FAR * stated[:, 1, 4])
     still = np.stack([pair[:, 0], np.rint(pair[:, 0] * depth)], axis=1)
     return [(foreign, stated), (pair, shifted), (still[moved], stated[moved])]

@@ -11,7 +11,6 @@ process up to the order of additions, except for batch normalisation, which sees
 import hashlib
 import json
 import os
-import platform
 import time
 from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,7 @@ from pickle import UnpicklingError
 from typing import Any, Final, Protocol, TypeVar
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
@@ -31,7 +30,7 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
 from train.errors import TrainError
-from train.networks.blocks import PatternNet
+from train.networks.blocks import Objective, PatternNet
 
 Batches = Callable[[int], Batch]
 """Function from a number to its batch; the same number always gives the same batch."""
@@ -47,6 +46,15 @@ _KEEP_EVERY_S: Final = 60.0
 _LOG_EVERY: Final = 50
 
 
+DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError)
+"""Errors of loading a file that is not what it should be."""
+
+
+def reason(error: BaseException) -> str:
+    """Return the first line of an error."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
 class NotResumableError(TrainError, ValueError):
     """State of an interrupted run that had another configuration."""
 
@@ -55,49 +63,18 @@ class DivergedError(TrainError, ArithmeticError):
     """Loss or gradient that is not finite."""
 
 
-class Objective(Protocol):
-    """Loss function of a training. One with its own networks, such as a discriminator, trains and keeps them itself."""
-
-    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
-        """Return the scalar loss of a batch."""
-        ...
-
-    def after_step(self) -> None:
-        """Update the objective after the network has taken its step."""
-        ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all learned state."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore learned state."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Hyperparameters of a training.
+    """Hyperparameters of a training."""
 
-    Attributes:
-        steps: optimizer steps.
-        batch: windows in a batch, shared by all devices.
-        learning_rate: highest of the one cycle.
-        weight_decay: of AdamW.
-        clip_norm: largest norm of a gradient.
-        given: share of windows with 1, 2, ... K taps; older taps are dropped.
-        bf16: multiply in bfloat16 and add in float32, on a device where that is faster.
-        minutes: time after which the cycle ends if that comes first, or None. The weights then depend on the machine.
-    """
-
-    steps: int
-    batch: int = 64
-    learning_rate: float = 2e-3
-    weight_decay: float = 0.0
-    clip_norm: float = 1.0
-    given: tuple[float, ...] = (1.0,)
-    bf16: bool = False
-    minutes: float | None = None
+    steps: int  # of the optimizer
+    batch: int = 64  # windows, shared by all devices
+    learning_rate: float = 2e-3  # highest of the one cycle
+    weight_decay: float = 0.0  # of AdamW
+    clip_norm: float = 1.0  # largest norm of a gradient
+    given: tuple[float, ...] = (1.0,)  # share of windows with 1, 2, ... K taps; older taps are dropped
+    bf16: bool = False  # multiply in bfloat16 and add in float32, on a device where that is faster
+    minutes: float | None = None  # after which the cycle ends if that comes first; weights then depend on the machine
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate", "minutes"):
@@ -108,18 +85,11 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """Result of a run.
-
-    Attributes:
-        steps: steps taken.
-        elapsed_s: seconds of training over all its parts.
-        loss: of the last batch.
-        course: validation figures, each with its step.
-    """
+    """Result of a run."""
 
     steps: int
-    elapsed_s: float
-    loss: float
+    elapsed_s: float  # over all its parts
+    loss: float  # of the last batch
     course: Course
 
 
@@ -136,8 +106,7 @@ def rank_and_world() -> tuple[int, int]:
 def _keep_apart(rank: int, world: int) -> None:
     """Pin one of several processes of a machine without a GPU to its share of the available cores.
 
-    Without it the kernel kept two processes on one core for minutes, each at half speed, while the other core was
-    idle: they wait for each other at every step, so neither is busy for long enough to be moved.
+    Without it the kernel kept two processes on one core for minutes, while the other core was idle.
     """
     if world == 1 or torch.cuda.is_available() or not hasattr(os, "sched_setaffinity"):
         return
@@ -155,27 +124,22 @@ def gains_by_bf16(device: torch.device) -> bool:
     return bool(able.get("avx512_bf16") or able.get("amx_bf16") or able.get("bf16"))
 
 
-def leave_group() -> None:
-    """End torchrun's group with all processes at once: one that leaves first would close the others' connections."""
-    if distributed.is_initialized():
-        distributed.barrier()
-        distributed.destroy_process_group()
-
-
 def wait_for_all() -> None:
     """Wait until all processes have reached this point."""
     if distributed.is_initialized():
         distributed.barrier()
 
 
+def leave_group() -> None:
+    """End torchrun's group with all processes at once: one that leaves first would close the others' connections."""
+    if distributed.is_initialized():
+        wait_for_all()
+        distributed.destroy_process_group()
+
+
 def device_of_rank(rank: int) -> torch.device:
     """Return the device on which a process computes."""
     return torch.device("cuda", rank % torch.cuda.device_count()) if torch.cuda.is_available() else torch.device("cpu")
-
-
-def device_name(device: torch.device) -> str:
-    """Return the name of a device in reports."""
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor"
 
 
 def learning_rate_share(progress: float) -> float:
@@ -203,12 +167,10 @@ def train(
         objective: loss function.
         batches: function from a number to its batch.
         recipe: hyperparameters.
-        resume_path: file that keeps the state while the run lasts.
+        resume_path: file that keeps the state; the caller deletes it when the result is safe.
         identity: of network and data; an interrupted run resumes only with the same identity.
         log_folder: for TensorBoard, or None.
         validate: returns figures to log and to keep, of the network in evaluation mode.
-
-    The state at `resume_path` is left there: the caller deletes it when the result is safe.
 
     Raises:
         ValueError: a batch cannot be shared evenly by the processes.
@@ -221,15 +183,18 @@ def train(
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     parallel = DistributedDataParallel(net) if world > 1 else net
-    keeper = _Keeper(resume_path, recipe, identity, net, optimizer, objective, rank)
-    step, spent_s, course = keeper.restore(device)
+    parts = {"net": net, "optimizer": optimizer, "objective": objective}
+    recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
+    state = _restored(resume_path, parts, recipe_sha256, device)
     wait_for_all()  # the first process to finish may delete the state
-    clock = _Clock(recipe, spent_s)
+    step, course = state["step"], state["course"]
+    kept_s = time.monotonic()
+    started_s = kept_s - state["elapsed_s"]
     logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
     check_at = {round(recipe.steps * (i + 1) / _VALIDATIONS) for i in range(_VALIDATIONS)} if validate else set()
     loss = torch.inf
     with closing(logged) as log, closing(drawn_ahead(batches, step, recipe.steps)) as drawn:
-        while (progress := clock.progress(step)) < 1:
+        while (progress := _progress(recipe, step, time.monotonic() - started_s)) < 1:
             rate = recipe.learning_rate * learning_rate_share(progress)
             for group in optimizer.param_groups:
                 group["lr"] = rate
@@ -252,9 +217,13 @@ def train(
                 log.figures(step, figures)
                 course.append({"step": step, **figures})
                 net.train()
-            keeper.keep_now_and_then(step, clock.elapsed_s(), course)
+            now_s = time.monotonic()
+            if rank == 0 and now_s - kept_s > _KEEP_EVERY_S:
+                figures = {"step": step, "elapsed_s": now_s - started_s, "course": course}
+                _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
+                kept_s = time.monotonic()
     net.eval()
-    return Trained(step, clock.elapsed_s(), loss, course)
+    return Trained(step, time.monotonic() - started_s, loss, course)
 
 
 Drawn = TypeVar("Drawn")
@@ -303,75 +272,45 @@ class _Log:
             self._writer.close()
 
 
-class _Clock:
-    """Progress of a run by its steps or by its time, the same in all processes."""
-
-    def __init__(self, recipe: Recipe, spent_s: float) -> None:
-        self._recipe = recipe
-        self._started_s = time.monotonic() - spent_s
-
-    def elapsed_s(self) -> float:
-        return time.monotonic() - self._started_s
-
-    def progress(self, step: int) -> float:
-        by_steps = step / self._recipe.steps
-        if self._recipe.minutes is None:
-            return by_steps
-        by_time = torch.tensor(self.elapsed_s() / (60 * self._recipe.minutes), dtype=torch.float64)
-        if distributed.is_initialized():
-            distributed.broadcast(by_time, src=0)
-        return max(by_steps, float(by_time))
+def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
+    """Return the share of a run that is over, by its steps or by its time, the same in all processes."""
+    by_steps = step / recipe.steps
+    if recipe.minutes is None:
+        return by_steps
+    by_time = torch.tensor(elapsed_s / (60 * recipe.minutes), dtype=torch.float64)
+    if distributed.is_initialized():
+        distributed.broadcast(by_time, src=0)
+    return max(by_steps, float(by_time))
 
 
-class _Keeper:
-    """State of a run on disk, saved every minute, so that an interruption costs at most that."""
+class _Part(Protocol):
+    """Part of a run that has a state: network, optimizer, objective."""
 
-    def __init__(
-        self,
-        path: Path,
-        recipe: Recipe,
-        identity: str,
-        net: nn.Module,
-        optimizer: torch.optim.Optimizer,
-        objective: Objective,
-        rank: int,
-    ) -> None:
-        self._path = path
-        self._hash = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
-        self._parts = {"net": net, "optimizer": optimizer, "objective": objective}
-        self._rank = rank
-        self._kept_s = time.monotonic()
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
 
-    def restore(self, device: torch.device) -> tuple[int, float, Course]:
-        """Return the steps, seconds and figures of an interrupted run; zeros for a new run."""
-        if not self._path.exists():
-            return 0, 0.0, []
-        try:
-            state = torch.load(self._path, map_location=device, weights_only=True)
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError) as error:
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise NotResumableError(
-                f"{self._path} is not a run's state ({reason}): delete it to start again"
-            ) from error
-        if not isinstance(state, dict) or state.get("recipe") != self._hash:
-            raise NotResumableError(
-                f"{self._path} is of a run with another recipe or on other data: delete it to start again"
-            )
-        for name, part in self._parts.items():
-            part.load_state_dict(state[name])
-        return state["step"], state["elapsed_s"], state.get("course", [])
 
-    def keep_now_and_then(self, step: int, elapsed_s: float, course: Course) -> None:
-        if self._rank == 0 and time.monotonic() - self._kept_s > _KEEP_EVERY_S:
-            self.keep(step, elapsed_s, course)
+def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
+    """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
+    if not path.exists():
+        return {"step": 0, "elapsed_s": 0.0, "course": []}
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except DAMAGES as error:
+        raise NotResumableError(f"{path} is not a run's state ({reason(error)}): delete it to start again") from error
+    if not isinstance(state, dict) or state.get("recipe") != recipe_sha256:
+        raise NotResumableError(f"{path} is of a run with another recipe or on other data: delete it to start again")
+    for name, part in parts.items():
+        part.load_state_dict(state[name])
+    return {"course": []} | state
 
-    def keep(self, step: int, elapsed_s: float, course: Course) -> None:
-        state = {name: part.state_dict() for name, part in self._parts.items()}
-        state |= {"recipe": self._hash, "step": step, "elapsed_s": elapsed_s, "course": course}
-        write_in_place(
-            self._path,
-            lambda draft: torch.save(state, draft),
-            lambda draft: torch.load(draft, map_location="cpu", weights_only=True),
-            keep_before=False,
-        )
-        self._kept_s = time.monotonic()
+
+def _keep(path: Path, parts: Mapping[str, _Part], facts: Mapping[str, Any]) -> None:
+    """Keep the state of a run on disk, so that an interruption costs at most a minute."""
+    state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
+    write_in_place(
+        path,
+        lambda draft: torch.save(state, draft),
+        lambda draft: torch.load(draft, map_location="cpu", weights_only=True),
+        keep_before=False,
+    )

@@ -31,15 +31,10 @@ FOREIGN: Final = 0.01
 
 @dataclass(frozen=True)
 class TrustFit:
-    """Forward model and checks of `train.trust`, and presses to set their limits by.
+    """Forward model and checks of `train.trust`, and presses to set their limits by."""
 
-    Attributes:
-        fitted: content of trust.json.
-        validation: presses of several taps, on pads of their own.
-    """
-
-    fitted: dict[str, Any]
-    validation: PressSet
+    fitted: dict[str, Any]  # content of trust.json
+    validation: PressSet  # of several taps, on pads of their own
 
     @cached_property
     def _checks(self) -> tuple[Check, Check, Check]:
@@ -64,9 +59,8 @@ def load_trust(path: Path, validation: PressSet) -> TrustFit:
     try:
         fitted = json.loads(path.read_text())
         forward_model(fitted["forward"], len(INPUTS))
-        small_network(fitted["contact"])
-        small_network(fitted["tap"])
-        small_network(fitted["posed_tap"])
+        for name in ("contact", "tap", "posed_tap"):
+            small_network(fitted[name])
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise CheckpointError(f"{path}: {reason}; make it with 'python -m train.trust {path} --data ...'") from error
@@ -82,12 +76,16 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
 
     Errors are relative to the amplitude.
     """
-    clean = _units(presses.counts[:, 0])
-    size = _amplitude(clean)[:, None]
-    inputs = condensed(np.stack([features(*maps) for maps in zip(*_maps(presses), strict=True)])) / size
+    clean = (presses.counts[:, 0] / _UNIT[:, None, None]).reshape(len(presses), -1)
+    z = clean.reshape(len(clean), len(AXES), -1)[:, AXES.index("z")]
+    size = np.sqrt((z**2).mean(axis=1))[:, None] + QUIET_UNITS
+    maps = zip(presses.patterns.astype(np.float32), presses.traction_kpa.astype(np.float32), strict=True)
+    inputs = condensed(np.stack([features(*one) for one in maps])) / size
     constants = presses.constants.astype(np.float64)
     columns = np.concatenate([inputs, *(inputs * constants[:, [number]] for number in range(len(INPUTS)))], axis=1)
-    weights = _least_squares(columns, clean / size)
+    normal = columns.T @ columns
+    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    weights = np.linalg.solve(normal, columns.T @ (clean / size))
     operator = weights.reshape(1 + len(INPUTS), inputs.shape[1], -1).transpose(0, 2, 1)
     left = (clean / size - columns @ weights).reshape(len(presses), len(AXES), -1)
     found = ForwardModel(
@@ -96,26 +94,6 @@ def fit_forward_model(presses: PressSet) -> ForwardModel:
         model_error=np.sqrt(np.mean(left**2, axis=(0, 2))).astype(np.float32),
     )
     return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
-
-
-def _maps(presses: PressSet) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return presses.patterns.astype(np.float32), presses.traction_kpa.astype(np.float32)
-
-
-def _units(counts: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return readings (n, 3, rows, cols) in counts as (n, channels) in network units."""
-    return (counts / _UNIT[:, None, None]).reshape(len(counts), -1)
-
-
-def _amplitude(readings: NDArray[np.float64]) -> NDArray[np.float64]:
-    z = readings.reshape(len(readings), len(AXES), -1)[:, AXES.index("z")]
-    return np.sqrt((z**2).mean(axis=1)) + QUIET_UNITS
-
-
-def _least_squares(columns: NDArray[np.floating], values: NDArray[np.floating]) -> NDArray[np.float64]:
-    normal = columns.T @ columns
-    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    return np.linalg.solve(normal, columns.T @ values)
 
 
 def _noise() -> NDArray[np.float64]:

@@ -2,48 +2,40 @@
 
 Compared with the paper's network (Wu and Liu 2024, Fig. 8) it keeps the two branches, pattern from all taps and force
 from the newest one, and leaves out the layers at full resolution and batch normalisation, which cost 8 dB after 1000
-steps here. It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an
-input; and it is exactly symmetric under quarter turns.
+steps here. It adds the uncertainty of each pixel, the traction on the pad, and the pad's constants as an input; and it
+is exactly symmetric under quarter turns.
 """
 
 from math import expm1, log, sqrt
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from train.data.press_batches import Batch
-from train.networks.blocks import PatternNet, relative_rms_error, truth_size
+from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_error, truth_size
 from train.networks.interval_correction import IntervalCorrection
-from train.networks.symmetric import Group, SymmetricConv2d, SymmetricResidual, fields, scalars, vectors
+from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 
 QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
-
-_LEAST_DEVIATION: Final = 1e-4
-"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of the indentation of such a tap."""
-
-_FIRST_UNCERTAINTY: Final = log(expm1(0.02))
-"""Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
-
-_MOST_LOGIT: Final = 8.0
-"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
-
-_LEAST_SHARE: Final = 1e-3
-"""Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
-
-_TRACTION_KPA: Final = 30.0
-"""Traction of an output of 1 and a tap of amplitude 1, in [kPa]."""
-
-_TRACTION_SHARE: Final = 0.2
-"""Weight of the traction's relative error in the loss."""
-
-_LEAST_KPA: Final = 0.05
-"""Least RMS traction of a truth, in [kPa]; smaller ones count as this."""
-
 TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
+_LEAST_DEVIATION: Final = 1e-4
+"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of the indentation of such a tap."""
+_FIRST_UNCERTAINTY: Final = log(expm1(0.02))
+"""Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
+_MOST_LOGIT: Final = 8.0
+"""Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
+_LEAST_SHARE: Final = 1e-3
+"""Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
+_TRACTION_KPA: Final = 30.0
+"""Traction of an output of 1 and a tap of amplitude 1, in [kPa]."""
+_TRACTION_SHARE: Final = 0.2
+"""Weight of the traction's relative error in the loss."""
+_LEAST_KPA: Final = 0.05
+"""Least RMS traction of a truth, in [kPa]; smaller ones count as this."""
 
 
 class CompactNet(PatternNet):
@@ -54,29 +46,20 @@ class CompactNet(PatternNet):
     is out of its range. The amplitude itself enters as a bounded number, for the nonlinear part. An absent tap is all
     zeros, and stays zero.
 
-    The deviation is computed from the features of the pattern, but its loss does not train them: the pattern is the
-    same as without a deviation.
-
     Args:
         taps: K.
         scale: pattern pixels per taxel pitch, even.
         channels: of the trunk, a multiple of the symmetries.
         blocks: residual blocks of the trunk.
         known: numbers that say constants of the pad, see train.physics.pad_draws.
-        group: symmetries. Mirror images are those of one tap alone: a mirrored pad is turned the other way from tap to
-            tap. At the same work quarter turns leave twice the free numbers, and training mirrors windows instead.
-        intervals: correct the deviations by region, see `add_intervals`.
-
-    Attributes:
-        deviation_scale: factor on the deviation, computed after training by
-            `train.learning.interval_fit.calibrate`.
-        intervals: correction of the deviations by region; None until `add_intervals`.
+        group: symmetries. Not mirror images: a mirrored pad is turned the other way from tap to tap.
+        intervals: correct the deviations by region, as after `add_intervals`.
 
     Raises:
         ValueError: no taps, an odd scale, or channels that do not divide.
     """
 
-    deviation_scale: Tensor
+    deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
 
     def __init__(
         self,
@@ -97,15 +80,11 @@ class CompactNet(PatternNet):
         self.group: Group = group
         self._width = (channels, blocks)
         grow = scale // 2
-        wide, narrow = fields(self.group, channels), fields(self.group, channels // 2)
-        merged, left, doubted = (
-            fields(self.group, channels * 3 // 2),
-            fields(self.group, 2 * channels),
-            fields(self.group, channels // 2),
-        )
-        about, pixel = scalars(self.group, known + 1), scalars(self.group, 1).shuffled(grow)
+        wide, merged, left = (fields(group, size) for size in (channels, channels * 3 // 2, 2 * channels))
+        narrow = fields(group, channels // 2)
+        about, pixel = scalars(group, known + 1), scalars(group, 1).shuffled(grow)
         # Two 3 x 3 convolutions cover nearly all of 4 x 4 taxels, so taps turned against each other are merged here.
-        self.enter = SymmetricConv2d(vectors(self.group, taps) + about, merged, 3)
+        self.enter = SymmetricConv2d(vectors(group, taps) + about, merged, 3)
         self.merge = nn.Sequential(
             nn.ReLU(),
             SymmetricConv2d(merged, merged, 3),
@@ -119,27 +98,22 @@ class CompactNet(PatternNet):
         )
         for part in self.context[2].parameters():
             nn.init.zeros_(part)
-        self.trunk = nn.Sequential(*(SymmetricResidual(wide) for _ in range(blocks)))
+        self.trunk = nn.Sequential(*(Residual(lambda: SymmetricConv2d(wide, wide, 3)) for _ in range(blocks)))
         self.force = nn.Sequential(
-            SymmetricConv2d(vectors(self.group) + about, narrow, 3),
+            SymmetricConv2d(vectors(group) + about, narrow, 3),
             nn.ReLU(),
-            SymmetricResidual(narrow),
+            Residual(lambda: SymmetricConv2d(narrow, narrow, 3)),
             SymmetricConv2d(narrow, narrow.shuffled(2), 1),
             nn.PixelShuffle(2),
         )
+        seen = wide + narrow
         self.leave = nn.Sequential(
-            SymmetricConv2d(wide + narrow, left, 3),
-            nn.ReLU(),
-            SymmetricConv2d(left, pixel, 3),
-            nn.PixelShuffle(grow),
+            SymmetricConv2d(seen, left, 3), nn.ReLU(), SymmetricConv2d(left, pixel, 3), nn.PixelShuffle(grow)
         )
         self.uncertainty = nn.Sequential(
-            SymmetricConv2d(wide + narrow, doubted, 1),
-            nn.ReLU(),
-            SymmetricConv2d(doubted, pixel, 3),
-            nn.PixelShuffle(grow),
+            SymmetricConv2d(seen, narrow, 1), nn.ReLU(), SymmetricConv2d(narrow, pixel, 3), nn.PixelShuffle(grow)
         )
-        self.traction = SymmetricConv2d(wide + narrow, vectors(self.group), 3)
+        self.traction = SymmetricConv2d(seen, vectors(group), 3)
         self.register_buffer("deviation_scale", torch.tensor(1.0))
         self.intervals: IntervalCorrection | None = None
         if intervals:
@@ -147,18 +121,16 @@ class CompactNet(PatternNet):
 
     def add_intervals(self) -> IntervalCorrection:
         """Add a correction of the deviations that changes nothing yet, and return it; an earlier one is replaced."""
-        channels = self._width[0]
-        symmetries = fields(self.group, channels).index.shape[0]
-        self.intervals = IntervalCorrection(
-            self.scale, channels + channels // 2, symmetries, self.known + 1, self.taps
-        ).to(self.deviation_scale.device)
-        return self.intervals
+        features, symmetries = self._width[0] * 3 // 2, len(scalars(self.group, 1).index)
+        correction = IntervalCorrection(self.scale, features, symmetries, self.known + 1, self.taps)
+        self.intervals = correction.to(self.deviation_scale.device)
+        return correction
 
     def forward(self, window: Tensor, pad: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
 
         Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
-        again. Deviations are always above zero.
+        again. Deviations are always above zero; their loss does not train the features of the pattern.
 
         Args:
             window: (n, 3K, rows, cols) in network units.
@@ -213,15 +185,17 @@ class CompactNet(PatternNet):
         deviation = (uncertainty + _LEAST_DEVIATION) * self.deviation_scale
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
-    def take_over(self, start: "CompactNet") -> None:
+    def take_over(self, start: PatternNet) -> None:
         """Copy another network's function of the newest taps; further taps are ignored until trained.
 
         From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
         again.
 
         Raises:
-            ValueError: another width, or another number of inputs for the pad.
+            ValueError: another kind, width, or number of inputs for the pad.
         """
+        if not isinstance(start, CompactNet):
+            raise ValueError("expected a compact network")
         if (start._width, start.known) != (self._width, self.known):
             raise ValueError(
                 f"its width and inputs of the pad are {start._width} and {start.known}, expected {self._width} and "
@@ -230,16 +204,15 @@ class CompactNet(PatternNet):
         theirs = dict(start.named_modules())
         for name, ours in self.named_modules():
             source = theirs.get(name)
-            if not isinstance(ours, SymmetricConv2d) or not isinstance(source, SymmetricConv2d):
-                continue
-            weight = source.weight.detach()
-            if name == "enter":
-                kept, about = 3 * min(self.taps, start.taps), self.known + 1
-                widened = torch.zeros_like(ours.weight)
-                widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
-                weight = widened
-            if weight.shape == ours.weight.shape:
-                ours.assign(weight, source.bias.detach())
+            if isinstance(ours, SymmetricConv2d) and isinstance(source, SymmetricConv2d):
+                weight = source.weight.detach()
+                if name == "enter":
+                    kept, about = 3 * min(self.taps, start.taps), self.known + 1
+                    widened = torch.zeros_like(ours.weight)
+                    widened[:, :kept], widened[:, -about:] = weight[:, :kept], weight[:, -about:]
+                    weight = widened
+                if weight.shape == ours.weight.shape:
+                    ours.assign(weight, source.bias.detach())
         self.deviation_scale.copy_(start.deviation_scale)
 
 
@@ -254,46 +227,28 @@ def tap_amplitude(taps: Tensor) -> Tensor:
 
 
 class Entered(NamedTuple):
-    """Features at the trunk's entrance.
+    """Features at the trunk's entrance."""
 
-    Attributes:
-        merged: (n, channels, h, w).
-        scale: (n, channels, 1, 1), by which they are multiplied, less 1.
-        shift: (n, channels, 1, 1), which is added to them.
-        felt: (n, channels / 2, h, w), of the newest tap alone.
-        about: (n, known + 1), the pad's inputs and the bounded amplitude.
-    """
-
-    merged: Tensor
-    scale: Tensor
-    shift: Tensor
-    felt: Tensor
-    about: Tensor
+    merged: Tensor  # (n, channels, h, w)
+    scale: Tensor  # (n, channels, 1, 1), by which they are multiplied, less 1
+    shift: Tensor  # (n, channels, 1, 1), which is added to them
+    felt: Tensor  # (n, channels / 2, h, w), of the newest tap alone
+    about: Tensor  # (n, known + 1), the pad's inputs and the bounded amplitude
 
 
 class Seen(NamedTuple):
-    """Outputs of a compact network for n windows, and what they were made of.
+    """Outputs of a compact network for n windows, and what they were made of."""
 
-    Attributes:
-        features: (n, channels, h, w).
-        newest: amplitude of the newest tap, (n, 1, 1).
-        about: (n, known + 1), the pad's inputs and the bounded amplitude.
-        later: (n, K - 1), as many times 1 as there are earlier taps, else 0.
-        pattern: (n, H, W), not cut at zero, over the amplitude, in [mm].
-        deviation: (n, H, W), not corrected, over the amplitude, in [mm].
-        traction: (n, 3, h, w) in [kPa].
-    """
-
-    features: Tensor
-    newest: Tensor
-    about: Tensor
-    later: Tensor
-    pattern: Tensor
-    deviation: Tensor
-    traction: Tensor
+    features: Tensor  # (n, channels, h, w)
+    newest: Tensor  # (n, 1, 1), amplitude of the newest tap
+    about: Tensor  # (n, known + 1), the pad's inputs and the bounded amplitude
+    later: Tensor  # (n, K - 1), as many times 1 as there are earlier taps, else 0
+    pattern: Tensor  # (n, H, W), not cut at zero, over the amplitude, in [mm]
+    deviation: Tensor  # (n, H, W), not corrected, over the amplitude, in [mm]
+    traction: Tensor  # (n, 3, h, w) in [kPa]
 
 
-class HeteroscedasticError:
+class HeteroscedasticError(Objective):
     """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
 
     def loss(self, net: nn.Module, batch: Batch) -> Tensor:
@@ -306,25 +261,13 @@ class HeteroscedasticError:
             loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
         return loss
 
-    def after_step(self) -> None:
-        """Do nothing, because the objective has no network of its own."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return an empty state."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load nothing."""
-
 
 def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> Tensor:
     """Return the relative error of the patterns plus the loss of the deviations; all inputs (n, H, W) in [mm].
 
-    The deviation is trained by a Laplace likelihood, because errors have long tails: with the error e and b = deviation
-    / sqrt(2), both as shares of the truth's RMS, (log b + e / b) times a fixed b. Its minimum is where b is the mean
-    error. The slope over log b is b - e, of the error's own size, so pixels in the contact are covered as well as those
-    around it; the likelihood alone would weigh most the pixels that are accurate already. The error is a constant in
-    this term, so a larger uncertainty never allows a worse pattern.
+    The deviation is trained by a Laplace likelihood: with the error e and b = deviation / sqrt(2), both as shares of
+    the truth's RMS, (log b + e / b) times a fixed b. Its slope over log b is b - e, so pixels in the contact are
+    covered as well as those around it. The error is a constant in this term, so doubt never allows a worse pattern.
 
     Source: Seitzer et al. 2022, Eq. 5 with beta 1, for a Laplace density.
     """

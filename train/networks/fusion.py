@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import lru_cache
 from math import log
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from edge.inference.pose_input import scheduled_rows
 from firmware_bridge.pad_geometry import USPA44
 from train.networks.blocks import PatternNet
 from train.networks.compact import QUIET_UNITS, CompactNet, Seen, tap_amplitude
-from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
+from train.networks.symmetric import SymmetricConv2d, fields, scalars, vectors
 from train.surfaces.poses import ANGLE_STEP_DEG
 
 _CARRIED: Final = 48
@@ -45,32 +45,22 @@ _TURN_ERROR_DEG: Final = 5.0
 
 
 class FusionNet(CompactNet):
-    """Network from a window of 1 to K taps and their poses to pattern, deviation and traction.
+    """Network from a window of 1 to K taps, K of two at least, and their poses to pattern, deviation and traction.
 
-    Raises:
-        ValueError: fewer than two taps, an odd scale, or channels that do not divide.
+    `shape` is of a `CompactNet`: channels, blocks, known and group.
     """
 
     takes_poses = True
     reach_to: Tensor
     reach_from: Tensor
 
-    def __init__(
-        self,
-        taps: int,
-        scale: int,
-        channels: int = 64,
-        blocks: int = 6,
-        known: int = 0,
-        group: Group = "p4",
-        intervals: bool = False,
-    ) -> None:
+    def __init__(self, taps: int, scale: int, *, intervals: bool = False, **shape: Any) -> None:
         if taps < 2:
             raise ValueError(f"{taps} taps asked for, expected at least 2: a network of one tap has nothing to fuse")
-        super().__init__(1, scale, channels, blocks, known, group)
-        self.taps = taps
+        super().__init__(1, scale, **shape)
+        self.taps, group, channels = taps, self.group, self._width[0]
         wide, merged = fields(group, channels), fields(group, channels * 3 // 2)
-        about, pose = scalars(group, known + 1), vectors(group) + scalars(group, 4)
+        about, pose = scalars(group, self.known + 1), vectors(group) + scalars(group, 4)
         carried, heads = fields(group, _CARRIED), scalars(group, _HEADS)
         sent = (carried + heads).shuffled(_CELLS)
         self.enter_earlier = SymmetricConv2d(vectors(group) + about + pose, merged, 3)
@@ -92,17 +82,10 @@ class FusionNet(CompactNet):
         if intervals:
             self.add_intervals()
 
-    def take_over(self, start: CompactNet) -> None:
-        """Copy a network of one tap, or another one of this kind; what encodes earlier taps starts as its entrance.
-
-        Raises:
-            ValueError: another width, or another number of inputs for the pad.
-        """
+    def take_over(self, start: PatternNet) -> None:
+        """Copy a network of one tap, or another one of this kind; what encodes earlier taps starts as its entrance."""
         if isinstance(start, FusionNet):
-            try:
-                self.load_state_dict(start.state_dict())
-            except RuntimeError as error:
-                raise ValueError(str(error).splitlines()[-1].strip()) from error
+            self.load_state_dict(start.state_dict())
             return
         super().take_over(start)
         weight = torch.zeros_like(self.enter_earlier.weight)
@@ -125,11 +108,10 @@ class FusionNet(CompactNet):
     def forward(
         self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return patterns and their deviations, both (n, H, W) in [mm], and tractions (n, 3, h, w) in [kPa].
+        """Return what `CompactNet.forward` does.
 
         Args:
-            window: (n, 3k, rows, cols), or (n, k, 3, rows, cols), in network units, of 1 to K taps, newest first;
-                absent taps are all zeros.
+            window: (n, 3k, rows, cols), or (n, k, 3, rows, cols), in network units, of 1 to K taps, newest first.
             pad: (n, known), constants of the pads; None for no constants.
             poses: (n, k, 5), x, y in [mm] and turn in [deg] of each tap in the newest one's axes, then the standard
                 deviations of place and turn; None for the paper's schedule.
@@ -180,14 +162,10 @@ class _Carrier:
     order in which its channels hold them: the four parts of a taxel first, then rows and columns.
 
     Args:
-        poses: (n, k - 1, 5) of the earlier taps.
-        there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0.
+        poses: (n, k - 1, 5) of the earlier taps; `inputs`, (n, k - 1, 7), are these as the encoder takes them.
+        there: (n, k - 1, 1, 1, 1), 1 for each that is there, else 0; `any`, (n, 1, 1, 1), is 1 where some tap is.
         grid: taxels of a pad, (rows, cols).
         reaches: variances of the Gaussians in cells, to the newest tap and from it.
-
-    Attributes:
-        inputs: (n, k - 1, 7), the poses as inputs of the encoder.
-        any: (n, 1, 1, 1), 1 where some earlier tap is there, else 0.
     """
 
     def __init__(self, poses: Tensor, there: Tensor, grid: tuple[int, int], reaches: Sequence[Tensor]) -> None:
@@ -205,20 +183,18 @@ class _Carrier:
         x, y = place[..., :1], place[..., 1:]
         moved = [cosine, sine, place, cosine * x + sine * y, cosine * y - sine * x, x * x + y * y]
         terms = (torch.cat([*moved, torch.ones_like(x)], dim=2) @ course).unflatten(2, (_TERMS, -1))
-        variance = (torch.cat([errors[..., :1] / _CELL_MM, torch.deg2rad(errors[..., 1:])], dim=2).square() @ spread)[
-            :, :, None
-        ]
-        self._weights: list[Tensor] = []
+        squared = torch.cat([errors[..., :1] / _CELL_MM, torch.deg2rad(errors[..., 1:])], dim=2).square()
+        variance = (squared @ spread)[:, :, None]
+        self._weights: list[Tensor] = []  # (n, cells, (k - 1) cells)
         for reach in reaches:
             # Minus half the squared distance over the variance, as one product of matrices.
             over = (terms / (variance + reach)).transpose(1, 2).flatten(2)  # (n, 4, (k - 1) cells)
-            self._weights.append(torch.exp((here @ over).clamp_max(0.0)))  # (n, cells, (k - 1) cells)
+            self._weights.append(torch.exp((here @ over).clamp_max(0.0)))
 
     def to_newest(self, sent: Tensor) -> Tensor:
-        """Return carried channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
+        """Return channels and the logarithms of their weights, (n, c + heads, H, W), of what taps sent.
 
-        Args:
-            sent: (n (k - 1), 4 (c + heads), rows, cols).
+        That is (n (k - 1), 4 (c + heads), rows, cols).
         """
         cells = sent.reshape(*self._taps, _CARRIED + _HEADS, self._cells).transpose(1, 2)
         weight = F.softplus(cells[:, _CARRIED:]) * self._there
@@ -250,11 +226,9 @@ def _encoding() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 @lru_cache
 def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return constants of a grid of taxels.
+    """Return terms of the newest tap's cells, (cells, 4), and factors from a pose to what an earlier tap's cells have.
 
-    Returns:
-        Terms of the newest tap's cells, (cells, 4); factors (8, 4 cells) from a pose to the terms of an earlier tap's
-        cells; and factors (2, cells) from the squared errors of a pose to their variances.
+    The factors are (8, 4 cells) to the terms of the cells, and (2, cells) from squared errors to variances.
     """
     part_y, part_x, row, col = np.meshgrid(*map(np.arange, (_CELLS, _CELLS, rows, cols)), indexing="ij")
     x = (_CELLS * col + part_x - (_CELLS * cols - 1) / 2).ravel()
@@ -262,23 +236,19 @@ def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.flo
     away, none, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
     order = np.lexsort((x, y))  # the newest tap's rows and columns
     here = np.stack([x, y, one, away], axis=1)[order]
-    course = np.stack(
+    course = np.concatenate(
         [  # of x there, y there, minus half their squares, and the constant
-            np.stack(terms)
-            for terms in (
-                (x, y, none, none),
-                (-y, x, none, none),
-                (one, none, none, none),
-                (none, one, none, none),
-                (none, none, -x, none),
-                (none, none, -y, none),
-                (none, none, -one / 2, none),
-                (none, none, -away / 2, -one / 2),
-            )
+            *(x, y, none, none),
+            *(-y, x, none, none),
+            *(one, none, none, none),
+            *(none, one, none, none),
+            *(none, none, -x, none),
+            *(none, none, -y, none),
+            *(none, none, -one / 2, none),
+            *(none, none, -away / 2, -one / 2),
         ]
-    )
-    spread = np.stack([one, away])
-    return here.astype(np.float32), course.reshape(len(course), -1).astype(np.float32), spread.astype(np.float32)
+    ).reshape(8, -1)
+    return here.astype(np.float32), course.astype(np.float32), np.stack([one, away]).astype(np.float32)
 
 
 class OneOrMoreNet(PatternNet):

@@ -2,9 +2,7 @@
 
 A deviation alone has one bias in the contact and another around it, and one for a contact that covers the pad and
 another for a wire. The correction multiplies it by one of four factors, by the pixel's region; a small network
-computes the four from what summarises the window: means of the features, what is known of the pad, the number of taps,
-and the pattern's own size and outline. It costs a hundredth of the network and is part of its graph, so everything that
-reads deviations reads corrected ones.
+computes the four from a summary of the window. It is part of the graph, so everything reads corrected deviations.
 """
 
 from typing import Final
@@ -42,8 +40,7 @@ class IntervalCorrection(nn.Module):
     Attributes:
         near: pixels outside the contact that are near it.
         contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        centre: mean of each input over the training presses.
-        spread: standard deviation of each input.
+        centre: mean of each input over the training presses; `spread` is the standard deviation.
     """
 
     contact_level: Tensor
@@ -65,20 +62,9 @@ class IntervalCorrection(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, features: Tensor, pattern: Tensor, deviation: Tensor, about: Tensor, later: Tensor) -> Tensor:
-        """Return the factors on the deviations, (n, H, W) above zero.
-
-        Args:
-            features: (n, channels, h, w).
-            pattern: (n, H, W), cut at zero, of a tap of amplitude 1.
-            deviation: (n, H, W) to be corrected, of a tap of amplitude 1.
-            about: (n, ...), the pad's inputs and the bounded amplitude.
-            later: (n, K - 1), 1 for each earlier tap that is there, else 0.
-        """
-        peak = pattern.amax(dim=(1, 2), keepdim=True)
-        masks = self.masks(pattern, peak)
-        steps, base = self.steps(self.summary(features, masks, peak, deviation, about, later), later).split(
-            [_MASKS, 1], dim=1
-        )
+        """Return the factors on the deviations, (n, H, W) above zero; arguments as `summary`."""
+        masks, summary = self.summary(features, pattern, deviation, about, later)
+        steps, base = self.steps(summary, later).split([_MASKS, 1], dim=1)
         log_factor = (steps[:, None] @ masks.flatten(2)).view_as(deviation) + base[:, :, None]
         return torch.exp(log_factor.clamp(*LOG_RANGE))
 
@@ -89,13 +75,22 @@ class IntervalCorrection(nn.Module):
         return torch.cat([near, F.max_pool2d(touched, 3, 1, 1), F.max_pool2d(1 - touched, 3, 1, 1)], dim=1)
 
     def summary(
-        self, features: Tensor, masks: Tensor, peak: Tensor, deviation: Tensor, about: Tensor, later: Tensor
-    ) -> Tensor:
-        """Return the inputs of the factors, (n, inputs)."""
-        count, channels = features.shape[:2]
-        means = features.reshape(count, channels // self._symmetries, -1).mean(dim=2)
+        self, features: Tensor, pattern: Tensor, deviation: Tensor, about: Tensor, later: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the masks (n, 3, H, W), and the inputs of the factors, (n, inputs).
+
+        Args:
+            features: (n, channels, h, w).
+            pattern: (n, H, W), cut at zero, of a tap of amplitude 1.
+            deviation: (n, H, W) to be corrected, of a tap of amplitude 1.
+            about: (n, ...), the pad's inputs and the bounded amplitude.
+            later: (n, K - 1), 1 for each earlier tap that is there, else 0.
+        """
+        peak = pattern.amax(dim=(1, 2), keepdim=True)
+        masks = self.masks(pattern, peak)
+        means = features.reshape(len(features), features.shape[1] // self._symmetries, -1).mean(dim=2)
         spread = deviation.mean(dim=(1, 2))[:, None]
-        return torch.cat([means, about, masks.mean(dim=(2, 3)), peak[:, :, 0], spread, later], dim=1)
+        return masks, torch.cat([means, about, masks.mean(dim=(2, 3)), peak[:, :, 0], spread, later], dim=1)
 
     def steps(self, summary: Tensor, later: Tensor) -> Tensor:
         """Return what each mask adds to the logarithm of the factors, then what all pixels have, (n, 4)."""

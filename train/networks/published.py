@@ -1,55 +1,40 @@
 """The published networks, to compare with: TactileSRCNN, TactileSRGAN, STSR and MTSR-K.
 
 STSR and MTSR-K: Wu and Liu 2024, Section V and Fig. 8; channels and biases follow from the parameter counts of the
-authors' code.
+authors' code. TactileSRCNN: Wu, Liu and Zhang 2022, with three 3 x 3 convolutions before the blocks, which make the
+parameters and MACs of the later paper's table; the 2022 code has one.
 
-TactileSRCNN, their predecessor with one tap and no force branch: Wu, Liu and Zhang 2022 ([20] of Wu and Liu 2024).
-Parameters (4.36 M) and MACs (6.96 G at 40 x 40) of the later paper's table are those of three 3 x 3 convolutions, six
-multi-scale blocks and a last convolution; the 2022 code has a single convolution before the blocks, which would be
-4.29 M.
-
-TactileSRGAN is TactileSRCNN trained against a discriminator. The paper states only the name, and that the generator is
-TactileSRCNN's. From the authors' code: a Wasserstein loss with gradient penalty 10, two steps of the discriminator to
-one of the generator, 0.001 of the adversarial loss added to the error. Chosen here: the discriminator's layers, which
-follow SRGAN's but score patches and take any scale; no batch normalisation in it, since the penalty is of one pattern
-at a time (Gulrajani et al. 2017, Section 4); and its input, patterns relative to their truth's size, as in the error.
+TactileSRGAN is TactileSRCNN trained against a discriminator. From the authors' code: a Wasserstein loss with gradient
+penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to the error.
+Chosen here: the discriminator's layers, which score patches and take any scale, without batch normalisation; and its
+input, patterns relative to their truth's size.
 """
 
 from typing import Any, Final
 
 import torch
 from torch import Tensor, distributed, nn
+from torch.nn import functional as F
 
 from train.data.press_batches import Batch
-from train.networks.blocks import (
-    MultiScaleResidual,
-    PatternNet,
-    Residual,
-    initialise,
-    normed_conv,
-    relative_error,
-    to_pattern,
-    truth_size,
-    upsample,
-)
+from train.networks.blocks import Objective, PatternNet, Residual, relative_error, truth_size
 
 CHANNELS: Final = 64
 BLOCKS: Final = 6
 MAX_TAPS: Final = 7
+_MM_PER_UNIT: Final = 0.02
+"""Size of an output of 1, in [mm]: the networks were made for patterns of up to 25, those here reach 0.5 mm."""
+_NORM_START: Final = 0.1
+"""Initial scale and shift of batch normalisation, as in the authors' code."""
 _CRITIC_CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
 _PENALTY: Final = 10.0
-"""Weight of the discriminator's gradient penalty."""
 _CRITIC_STEPS: Final = 2
-"""Steps of the discriminator to one of the network."""
 _TINY: Final = 1e-12
 
 
-class SeedNet(PatternNet):
-    """Network from a window of K taps to a pattern: STSR with one tap, MTSR-K with more.
-
-    All layers work at the pattern's size. Taps are interpolated, each passes its stem, and they are merged; the newest
-    tap also passes a branch without batch normalisation, which would remove the force.
+class _PublishedNet(PatternNet):
+    """Network whose layers all work at the pattern's size.
 
     Raises:
         ValueError: taps or scale out of range.
@@ -62,78 +47,117 @@ class SeedNet(PatternNet):
         if scale < 1:
             raise ValueError(f"scale is {scale}, expected at least 1")
         self.taps, self.scale = taps, scale
-        self.stems = nn.ModuleList(
-            nn.Sequential(normed_conv(3, CHANNELS, 3), normed_conv(CHANNELS, CHANNELS, 3)) for _ in range(taps)
-        )
-        self.merge = normed_conv(taps * CHANNELS, CHANNELS, 3)
-        self.trunk = nn.Sequential(*(MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)))
-        self.force = nn.Sequential(nn.Conv2d(3, CHANNELS, 3, padding=1, bias=False), nn.ReLU(), Residual(CHANNELS))
-        self.leave = nn.Sequential(
-            nn.Conv2d(2 * CHANNELS, 2 * CHANNELS, 3, padding=1, bias=False),
-            nn.ReLU(),
-            nn.Conv2d(2 * CHANNELS, 1, 3, padding=1, bias=False),
-        )
-        initialise(self)
+
+    def _initialise(self) -> None:
+        """Initialise the weights. Source: He et al. 2015, normal, by fan-out."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            elif isinstance(module, nn.BatchNorm2d):
+                nn.init.constant_(module.weight, _NORM_START)
+                nn.init.constant_(module.bias, _NORM_START)
+
+    def _upsampled(self, window: Tensor) -> Tensor:
+        return F.interpolate(window, scale_factor=self.scale, mode="bilinear", align_corners=False)
+
+    def _pattern(self, output: Tensor) -> Tensor:
+        """Convert the last convolution, (n, 1, H, W), to patterns (n, H, W) in [mm].
+
+        They are cut at zero in evaluation; in training too, as published, 3 of 16 seeds tried would never learn.
+        """
+        pattern = output[:, 0].float() * _MM_PER_UNIT
+        return pattern if self.training else torch.relu(pattern)
+
+
+class SeedNet(_PublishedNet):
+    """Network from a window of K taps to a pattern: STSR with one tap, MTSR-K with more.
+
+    Taps are interpolated, each passes its stem, and they are merged; the newest tap also passes a branch without batch
+    normalisation, which would remove the force.
+    """
+
+    def __init__(self, taps: int, scale: int) -> None:
+        super().__init__(taps, scale)
+        self.stems = nn.ModuleList(nn.Sequential(_normed(3, CHANNELS), _normed(CHANNELS)) for _ in range(taps))
+        self.merge = _normed(taps * CHANNELS, CHANNELS)
+        self.trunk = nn.Sequential(*(_MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)))
+        self.force = nn.Sequential(_plain(3, CHANNELS), nn.ReLU(), Residual(lambda: _plain(CHANNELS, bias=True)))
+        self.leave = nn.Sequential(_plain(2 * CHANNELS), nn.ReLU(), _plain(2 * CHANNELS, 1))
+        self._initialise()
 
     def forward(self, window: Tensor) -> Tensor:
         """Return patterns (n, H, W) in [mm] of windows (n, 3K, rows, cols) in network units, newest tap first."""
-        taps = upsample(window, self.scale).split(3, dim=1)
+        taps = self._upsampled(window).split(3, dim=1)
         shapes = [stem(tap) for stem, tap in zip(self.stems, taps, strict=True)]
         pattern = self.trunk(self.merge(torch.cat(shapes, dim=1)))
-        force = self.force(taps[0])
-        return to_pattern(self.leave(torch.cat([force, pattern], dim=1)), training=self.training)
+        return self._pattern(self.leave(torch.cat([self.force(taps[0]), pattern], dim=1)))
 
-    @classmethod
-    def from_stsr(cls, stsr: "SeedNet", taps: int) -> "SeedNet":
-        """Return an MTSR-K that computes the same as an STSR until it is trained.
+    def take_over(self, start: PatternNet) -> None:
+        """Copy another network's weights; after an STSR's an MTSR-K computes the same until it is trained.
 
         Every stem starts as the STSR's. In the merging layer the earlier taps have zero weights: these weights learn
         from the first step on, the stems before them from the second.
-
-        Raises:
-            ValueError: `stsr` takes more than one tap, or `taps` is out of range.
         """
-        if stsr.taps != 1:
-            raise ValueError(f"the network to start from takes {stsr.taps} taps, expected an STSR")
-        net = cls(taps, stsr.scale)
-        state = {name: value.clone() for name, value in stsr.state_dict().items()}
-        stem = {name: value for name, value in state.items() if name.startswith("stems.0.")}
-        for tap in range(1, taps):
-            state |= {name.replace("stems.0.", f"stems.{tap}."): value.clone() for name, value in stem.items()}
-        newest = state["merge.0.weight"]
-        state["merge.0.weight"] = torch.cat([newest, *[torch.zeros_like(newest)] * (taps - 1)], dim=1)
-        net.load_state_dict(state)
-        return net
+        state = dict(start.state_dict())
+        if isinstance(start, SeedNet) and start.taps == 1:
+            stem = {name: value for name, value in state.items() if name.startswith("stems.0.")}
+            for tap in range(1, self.taps):
+                state |= {name.replace("stems.0.", f"stems.{tap}."): value for name, value in stem.items()}
+            newest = state["merge.0.weight"]
+            state["merge.0.weight"] = torch.cat([newest, *[torch.zeros_like(newest)] * (self.taps - 1)], dim=1)
+        self.load_state_dict(state)
 
 
-class TactileSRCNN(PatternNet):
-    """Network from a window of one tap to a pattern, with batch normalisation throughout.
-
-    Raises:
-        ValueError: scale is not positive.
-    """
+class TactileSRCNN(_PublishedNet):
+    """Network from a window of one tap to a pattern, with batch normalisation throughout."""
 
     def __init__(self, scale: int) -> None:
-        super().__init__()
-        if scale < 1:
-            raise ValueError(f"scale is {scale}, expected at least 1")
-        self.taps, self.scale = 1, scale
+        super().__init__(1, scale)
         self.net = nn.Sequential(
-            normed_conv(3, CHANNELS, 3),
-            normed_conv(CHANNELS, CHANNELS, 3),
-            normed_conv(CHANNELS, CHANNELS, 3),
-            *(MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)),
-            nn.Conv2d(CHANNELS, 1, 3, padding=1, bias=False),
+            *(_normed(3, CHANNELS), _normed(CHANNELS), _normed(CHANNELS)),
+            *(_MultiScaleResidual(CHANNELS) for _ in range(BLOCKS)),
+            _plain(CHANNELS, 1),
         )
-        initialise(self)
+        self._initialise()
 
     def forward(self, window: Tensor) -> Tensor:
         """Return patterns (n, H, W) in [mm] of windows (n, 3, rows, cols) in network units."""
-        return to_pattern(self.net(upsample(window, self.scale)), training=self.training)
+        return self._pattern(self.net(self._upsampled(window)))
 
 
 class TactileSRGAN(TactileSRCNN):
     """Generator: TactileSRCNN with another training."""
+
+
+class _MultiScaleResidual(nn.Module):
+    """3 x 3 and 5 x 5 paths, exchanged half-way, fused by a 1 x 1 convolution parallel to an identity path.
+
+    Source: Li et al. 2018 (MSRN), Fig. 2, with batch normalisation after each convolution as in Wu and Liu 2024.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.fine = _normed(channels, bias=True)
+        self.coarse = _normed(channels, kernel=5, bias=True)
+        self.fine_of_both = _normed(2 * channels, bias=True)
+        self.coarse_of_both = _normed(2 * channels, kernel=5, bias=True)
+        self.fuse = nn.Conv2d(4 * channels, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        both = torch.cat([self.fine(x), self.coarse(x)], dim=1)
+        both = torch.cat([self.fine_of_both(both), self.coarse_of_both(both)], dim=1)
+        return torch.relu(x + self.fuse(both))
+
+
+def _plain(inputs: int, outputs: int | None = None, kernel: int = 3, *, bias: bool = False) -> nn.Conv2d:
+    """Build a convolution that keeps the size, and the number of channels unless `outputs` is given."""
+    return nn.Conv2d(inputs, inputs if outputs is None else outputs, kernel, padding=kernel // 2, bias=bias)
+
+
+def _normed(inputs: int, outputs: int | None = None, kernel: int = 3, *, bias: bool = False) -> nn.Sequential:
+    """Build a convolution, batch normalisation, and ReLU; the authors' blocks have a bias although it is redundant."""
+    convolution = _plain(inputs, outputs, kernel, bias=bias)
+    return nn.Sequential(convolution, nn.BatchNorm2d(convolution.out_channels), nn.ReLU())
 
 
 class Discriminator(nn.Module):
@@ -143,12 +167,8 @@ class Discriminator(nn.Module):
         super().__init__()
         layers: list[nn.Module] = []
         for inputs, outputs in zip((1, *_CRITIC_CHANNELS), _CRITIC_CHANNELS, strict=False):
-            layers += [
-                nn.Conv2d(inputs, outputs, 3, padding=1),
-                nn.LeakyReLU(_SLOPE),
-                nn.Conv2d(outputs, outputs, 3, stride=2, padding=1),
-                nn.LeakyReLU(_SLOPE),
-            ]
+            layers += [_plain(inputs, outputs, bias=True), nn.LeakyReLU(_SLOPE)]
+            layers += [nn.Conv2d(outputs, outputs, 3, stride=2, padding=1), nn.LeakyReLU(_SLOPE)]
         self.net = nn.Sequential(*layers, nn.Conv2d(_CRITIC_CHANNELS[-1], 1, 1))
 
     def forward(self, patterns: Tensor) -> Tensor:
@@ -156,30 +176,20 @@ class Discriminator(nn.Module):
         return self.net(patterns[:, None]).mean(dim=(1, 2, 3))
 
 
-class SrganObjective:
-    """Error of the patterns, less the score of a discriminator that is trained alongside.
-
-    Args:
-        device: of the network.
-        adversarial_share: weight of the discriminator's score relative to the error.
-        learning_rate: of the discriminator's Adam.
-        seed: of the discriminator's weights and of the points where the penalty is evaluated.
+class SrganObjective(Objective):
+    """Error of the patterns, less a share of the score of a discriminator that is trained alongside.
 
     Source: Gulrajani et al. 2017, Algorithm 1.
     """
 
     def __init__(
-        self,
-        device: torch.device | str = "cpu",
-        adversarial_share: float = 1e-3,
-        learning_rate: float = 1e-4,
-        seed: int = 0,
+        self, device: torch.device | str = "cpu", share: float = 1e-3, learning_rate: float = 1e-4, seed: int = 0
     ) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.critic = Discriminator().to(device)
         self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, betas=(0.0, 0.9))
-        self._adversarial_share = adversarial_share
+        self._share = share
         self._rng = torch.Generator().manual_seed(seed)
         self._seen: tuple[Tensor, Tensor] | None = None
 
@@ -189,7 +199,7 @@ class SrganObjective:
         size = truth_size(truth)
         self._seen = (patterns.detach() / size, truth / size)
         self.critic.requires_grad_(False)
-        return relative_error(patterns, truth) - self._adversarial_share * self.critic(patterns / size).mean()
+        return relative_error(patterns, truth) - self._share * self.critic(patterns / size).mean()
 
     def after_step(self) -> None:
         """Train the discriminator on the last batch of `loss`."""
@@ -214,11 +224,8 @@ class SrganObjective:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the discriminator, its optimizer, and the random draws."""
-        return {
-            "critic": self.critic.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "rng": self._rng.get_state(),
-        }
+        states = {"critic": self.critic.state_dict(), "optimizer": self._optimizer.state_dict()}
+        return states | {"rng": self._rng.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state."""

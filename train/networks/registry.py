@@ -1,4 +1,14 @@
-"""Networks by name."""
+"""Networks by name, each with its width.
+
+The bundled models are these, at scale 10:
+
+| model | network | channels | residual blocks |
+|---|---|---|---|
+| stsr | compact-stsr | 64 | 6 |
+| stsr-small | small-stsr | 32 | 4 |
+| mtsr2, mtsr4 | compact-mtsr2, compact-mtsr4 | 64 | 6 |
+| mtsr7 | fusion-mtsr7, and stsr for a window of one tap | 64 | 6 |
+"""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -9,19 +19,19 @@ from train.networks.fusion import FusionNet
 from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRGAN
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
-
+_WIDE: Final = {"channels": 64, "blocks": 6}
 _SMALL: Final = {"channels": 32, "blocks": 4}
-"""Options of a compact network with a quarter of the work, for a smaller time budget."""
+"""A quarter of the work, for a smaller time budget."""
 
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
     "srgan": (TactileSRGAN, {}),
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
-    **{f"compact-{name}": (CompactNet, {"taps": taps}) for name, taps in _TAPS.items()},
-    **{f"fusion-{name}": (FusionNet, {"taps": taps}) for name, taps in _TAPS.items() if taps > 1},
+    **{f"compact-{name}": (CompactNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items()},
+    **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},
     **{f"small-{name}": (CompactNet, {"taps": taps} | _SMALL) for name, taps in _TAPS.items()},
 }
-"""Class and fixed arguments of each network, by name."""
+"""Class of each network, and the arguments that options may replace, by name."""
 
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
@@ -33,7 +43,7 @@ def build(name: str, scale: int, **options: Any) -> PatternNet:
     if name not in NETWORKS:
         raise ValueError(f"no network {name!r}, expected one of {', '.join(NETWORKS)}")
     make, says = NETWORKS[name]
-    return make(scale=scale, **says, **options)
+    return make(scale=scale, **says | options)
 
 
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
@@ -46,20 +56,9 @@ def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNe
         ValueError: as `build`, or the weights do not fit.
     """
     net = build(name, scale, **options)
-    if isinstance(net, CompactNet) and isinstance(start, CompactNet):
-        try:
-            net.take_over(start)
-        except ValueError as error:
-            raise ValueError(f"{name} at scale {scale} cannot start from {_kind(start)}: {error}") from error
-        return net
-    if isinstance(net, SeedNet) and isinstance(start, SeedNet) and start.taps == 1:
-        start = SeedNet.from_stsr(start, net.taps)
     try:
-        net.load_state_dict(start.state_dict())
-    except RuntimeError as error:
-        raise ValueError(f"{name} at scale {scale} cannot start from {_kind(start)}: {error}") from error
+        net.take_over(start)
+    except (ValueError, RuntimeError) as error:
+        kind = f"a {type(start).__name__} of {start.taps} taps at scale {start.scale}"
+        raise ValueError(f"{name} at scale {scale} cannot start from {kind}: {error}") from error
     return net
-
-
-def _kind(net: PatternNet) -> str:
-    return f"a {type(net).__name__} of {net.taps} taps at scale {net.scale}"

@@ -1,17 +1,17 @@
 """Convolutions that are exactly symmetric under quarter turns and mirror images of the pad.
 
 A contact that is turned or mirrored has the turned or mirrored pattern: a square pad has no preferred direction.
-Channels are grouped into fields, and a symmetry of the square permutes them, with a sign for those with a direction
-(the shear x, y). A kernel that keeps this has one free number for each orbit of its entries, an eighth of them; the
-others are copies. Written out, it is an ordinary convolution, at the same cost.
+A symmetry of the square permutes channels, with a sign for those with a direction (the shear x, y). A kernel that
+keeps this has one free number for each orbit of its entries; the others are copies. Written out, it is an ordinary
+convolution, at the same cost.
 
 Source: Cohen and Welling 2016, group equivariant convolutional networks, p4 and p4m.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Final, Literal
+from functools import lru_cache, partial, reduce
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -33,13 +33,7 @@ _ELEMENTS: Final[dict[Group, tuple[tuple[int, bool], ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """Channels under symmetries: channel i becomes sign[g, i] times channel index[g, i].
-
-    Attributes:
-        group: the symmetries.
-        index: (symmetries, channels).
-        sign: (symmetries, channels), 1 or -1.
-    """
+    """Channels under symmetries g: channel i becomes sign[g, i], 1 or -1, times channel index[g, i]."""
 
     group: Group
     index: NDArray[np.int64]
@@ -55,10 +49,7 @@ class Channels:
 
     def __mul__(self, times: int) -> "Channels":
         """Return the same channels `times` times, one set after the other."""
-        total = self
-        for _ in range(times - 1):
-            total = total + self
-        return total
+        return reduce(Channels.__add__, [self] * times)
 
     def shuffled(self, side: int) -> "Channels":
         """Return the channels before a pixel shuffle, `side` x `side` pixels of each of these."""
@@ -176,20 +167,6 @@ class SymmetricConv2d(nn.Module):
         return plain
 
 
-class SymmetricResidual(nn.Module):
-    """Two 3 x 3 convolutions parallel to an identity path; without normalisation, so that amplitudes pass."""
-
-    def __init__(self, channels: Channels) -> None:
-        super().__init__()
-        self.body = nn.Sequential(
-            SymmetricConv2d(channels, channels, 3), nn.ReLU(), SymmetricConv2d(channels, channels, 3)
-        )
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return maps of the same shape, (n, channels, H, W)."""
-        return torch.relu(x + self.body(x))
-
-
 def write_out(net: nn.Module) -> nn.Module:
     """Replace every symmetric convolution of a network, in place, by the equivalent ordinary one.
 
@@ -207,13 +184,17 @@ def write_out(net: nn.Module) -> nn.Module:
 
 def symmetries(group: Group) -> list[Callable[[NDArray[np.generic]], NDArray[np.generic]]]:
     """Return each symmetry as a function on the last two axes of an array."""
-    return [
-        lambda maps, turns=turns, mirrored=mirrored: _move(maps, turns, mirrored)
-        for turns, mirrored in _ELEMENTS[group]
-    ]
+    return [partial(_move, turns=turns, mirrored=mirrored) for turns, mirrored in _ELEMENTS[group]]
 
 
-def _move(maps: NDArray[np.generic], turns: int, mirrored: bool) -> NDArray[np.generic]:
+def moved_scans(scans: NDArray[np.float32], number: int) -> NDArray[np.float32]:
+    """Return scans (..., 3, rows, cols) after symmetry `number` of p4m, axes and all: 0-3 turns, 4-7 mirror images."""
+    channels = vectors("p4m")
+    placed = _move(scans, *_ELEMENTS["p4m"][number])[..., channels.index[number], :, :]
+    return placed * channels.sign[number].astype(np.float32)[:, None, None]
+
+
+def _move(maps: NDArray[Any], turns: int, mirrored: bool) -> NDArray[Any]:
     return np.rot90(maps[..., ::-1] if mirrored else maps, turns, axes=(-2, -1))
 
 

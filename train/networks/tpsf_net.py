@@ -2,8 +2,7 @@
 
 Depth and PSF give the HR pattern, the pattern degraded to the taxels gives the scan's z again, and the difference
 trains the network: no HR truth is needed. Alpha has the scan's unit per area, since only the product of alpha and the
-taxels' sensitivity is visible in a scan. k_scale, one constant per sensor, converts that into [mm]: it is the
-least-squares factor from the plateaus to the indentations.
+taxels' sensitivity is visible in a scan; k_scale converts that into [mm].
 
 Source: Wu and Liu 2024, Section IV-C, Eq. 4-10 and Fig. 4.
 """
@@ -28,26 +27,18 @@ _SMALLEST: Final = 1e-6
 """Least length: softplus of a very negative number is 0, and the lengths are divisors."""
 _GAMMA_START: Final = 0.8
 _RATE: Final = 1e-3
-"""Learning rate of Adam; it falls to nothing on a half cosine."""
 _GAMMA_HASTE: Final = 20.0
-"""Learning rate of gamma over the network's, for whose stay a thousand weights of alpha and beta would make up."""
+"""Learning rate of gamma over the network's: a thousand weights of alpha and beta would make up for its staying."""
 _BATCH: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
 class PsfParameters:
-    """Parameters that the network estimates from n scans.
+    """Parameters that the network estimates from n scans."""
 
-    Attributes:
-        alpha: (n,) intensity, >= 0, in [counts / 100 / mm^4]: a taxel weighs its pattern over an area, and the
-            pattern the depth over another.
-        beta_mm: (n,) reach of the PSF, > 0, in [mm].
-        gamma: () perceptual region of a taxel, > 0, in [mm^0.5].
-    """
-
-    alpha: Tensor
-    beta_mm: Tensor
-    gamma: Tensor
+    alpha: Tensor  # (n,) intensity, >= 0, in [counts / 100 / mm^4]
+    beta_mm: Tensor  # (n,) reach of the PSF, > 0, in [mm]
+    gamma: Tensor  # () perceptual region of a taxel, > 0, in [mm^0.5]
 
 
 class PsfNet(nn.Module):
@@ -86,12 +77,10 @@ class PsfNet(nn.Module):
         return degrade(self.pattern(read, depth) / self.k_scale, read.gamma)
 
     def loss(self, counts: Tensor, depth: Tensor) -> Tensor:
-        """Return the squared error of the z readings, summed over the taxels, mean over the scans.
+        """Return the squared error of the z readings, summed over the taxels, mean over the scans; Eq. 9-10.
 
-        Only the positive part of a reading counts. Next to a contact the pad bulges and z is negative; the model cannot
-        reproduce that, and in fitting it beta would vanish.
-
-        Source: Wu and Liu 2024, Eq. 9-10.
+        Only the positive part of a reading counts: next to a contact the pad bulges, and in fitting that beta would
+        vanish.
         """
         error = self.degraded(self(counts), depth) - pressed(counts)
         return (error**2).sum(dim=(1, 2)).mean()
@@ -114,8 +103,7 @@ def pressed(counts: Tensor) -> Tensor:
 def degrade(pattern: Tensor, gamma: Tensor) -> Tensor:
     """Integrate HR patterns (n, H, W) with weights exp(-d/gamma^2), each taxel's divided by their largest; Eq. 7-8.
 
-    The sum over pixels is taken as an integral, so that a pattern reads alike at every scale: (n, rows, cols) in the
-    pattern's unit times [mm^2].
+    The integral, (n, rows, cols) in the pattern's unit times [mm^2], reads alike at every scale.
     """
     height, width = pattern.shape[1:]
     # Distances count from the nearest pixel, which replaces the division by the largest weight and avoids 0/0. Their
@@ -145,10 +133,10 @@ def fit_psf_net(
     epochs: int,
     seed: int = 0,
 ) -> list[float]:
-    """Train the network on scans and their depth images, fit k_scale, and return the loss of every epoch.
+    """Train the network from its first weights, fit k_scale, and return the loss of every epoch.
 
     Args:
-        net: the network; its weights are initialised again from the seed.
+        net: the network.
         counts: (n, 3, rows, cols) zeroed.
         depth: (n, H, W) in 0..1, 1 the surface's top.
         indentation_mm: (n,), in [mm].
