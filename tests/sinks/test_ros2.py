@@ -128,12 +128,11 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
         listener.until(lambda: all(map(extraordinary, ends)))
         (zeros,), (unknown,) = extraordinary("4"), extraordinary("left/4")
         assert not pixels(zeros).any() and np.isnan(pixels(unknown)).all()
-        assert np.isnan(pixels(listener.of("skin/s4/deviation")[-1])).all()
-        assert listener.of("skin/s4/points")[-1]["width"] == 0, "points of a contact that has ended"
+        listener.until(lambda: np.isnan(pixels(listener.of("skin/s4/deviation")[-1])).all())
+        listener.until(lambda: listener.of("skin/s4/points")[-1]["width"] == 0)
         listener.until(lambda: listener.of("skin/s4/state")[-1]["data"] == "lost")
-        assert (
-            math.isnan(listener.of("skin/s4/area_m2")[-1]["data"]) and listener.of("skin/s4/trusted")[-1]["data"] == -1
-        )
+        listener.until(lambda: math.isnan(listener.of("skin/s4/area_m2")[-1]["data"]))
+        listener.until(lambda: listener.of("skin/s4/trusted")[-1]["data"] == -1)
         assert stamp_ns(unknown) > stamp_ns(zeros)
         events = [json.loads(message["data"]) for message in listener.of("skin/events")]
         assert [(event["event"], event["note"]) for event in events] == [("lost", "the plug is out"), ("lost", "again")]
