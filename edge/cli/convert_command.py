@@ -34,10 +34,7 @@ _WITHOUT: Final = {
 def convert(options: argparse.Namespace) -> None:
     """Write a recording in the format that the new name ends in, or for a CSV a file for each sensor.
 
-    Raises:
-        UsageError: the new name ends in none, or the format is that of the recording; a rate for one with times.
-        BridgeError: the recording cannot be used.
-        SinkError: the new file exists, or cannot be written; then nothing is left of it.
+    Of a new file that cannot be written nothing is left.
     """
     source, target = Path(options.recording), Path(options.new)
     was, ending = ".mcap" if source.is_dir() else source.suffix.lower(), target.suffix.lower()

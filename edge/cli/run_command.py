@@ -59,14 +59,10 @@ def run(
     mapping: "MapSink | None" = None,
     player: "Player | None" = None,
 ) -> None:
-    """Run `edge-sr` without a command, or a command that runs the same way.
+    """Run `edge-sr` without a command, or a command that runs the same way, with a source that is not open yet.
 
-    Args:
-        options: of edge.cli.run_options.
-        source: not open yet.
-        statistics: filled on the way, so that they are available however the run ends.
-        mapping: takes the results into a map, which the live page shows; closed here.
-        player: of the recording that is the source, for the page.
+    `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
+    into a map, which the live page shows; it is closed here. `player` is of the recording that is the source.
     """
     stdout_taken = "jsonl:-" in options.sink
     share_one_heap()

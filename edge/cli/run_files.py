@@ -21,12 +21,7 @@ _NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
 
 @contextmanager
 def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Add a recording to the options of a run, and report it at the end, however the run ends.
-
-    Raises:
-        UsageError: another kind of file was requested, or a sink writes into it as well.
-        SinkError: the file exists.
-    """
+    """Add a recording to the options of a run, and report it at the end, however the run ends."""
     path = Path(options.file)
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
@@ -57,12 +52,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
 
 @contextmanager
 def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
-    """Yield the sink of a map, and report what is on it at the end, however the run ends.
-
-    Raises:
-        UsageError: the size is out of range, or a file has another ending.
-        SinkError: a file exists, or cannot be written.
-    """
+    """Yield the sink of a map, and report what is on it at the end, however the run ends."""
     from edge.api import MapSink, ObjectMap
 
     for path, ending in ((options.out, ".npz"), (options.png, ".png")):

@@ -29,11 +29,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 
 
 def understood(command: str, arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse the options of a command, and check of a run all that can be checked before anything is opened.
-
-    Raises:
-        UsageError: a sink or a field does not exist, a sink occurs twice, or thresholds are out of range.
-    """
+    """Parse the options of a command, and check of a run all that can be checked before anything is opened."""
     options = parser(command).parse_args(arguments)
     if "sink" not in options:
         return options

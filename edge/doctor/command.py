@@ -91,10 +91,8 @@ def _stdin_is_terminal() -> bool:
 class Visit:
     """Visit to the sensors of one link: what is asked of a person, and what that gives.
 
-    Attributes:
-        mountings: corrections of the mountings, by sensor.
-        newtons: counts per newton of the sensors that were weighed.
-        unfinished: True when a measurement was asked of a person, and not made.
+    `mountings` are corrections of the mountings, and `newtons` the counts per newton of those that were weighed, by
+    sensor; `unfinished` is true when a measurement was asked of a person, and not made.
     """
 
     def __init__(
@@ -194,10 +192,8 @@ class Visit:
 def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Callable[[], float] = time.monotonic) -> int:
     """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
-    Raises:
-        BridgeError: of the source, or of the files; a link that was lost, and a sensor file that could not be written
-            in the end, are raised after the findings were printed.
-        UsageError: several sources; or the sensor file is for another id map than the chosen one.
+    A link that was lost, and a sensor file that could not be written in the end, are raised after the findings were
+    printed.
     """
     if options.forget_gains is not None:
         if options.sensor is None:

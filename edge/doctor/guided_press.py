@@ -265,11 +265,9 @@ class GuidedPress:
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
-        """Take one more reading; returns the next request, or None.
+        """Take one more reading (3, rows, cols) over the baseline, in counts; returns the next request, or None.
 
-        Args:
-            zeroed: (3, rows, cols), over the baseline, in counts; where it is NaN the taxel's last reading stands.
-            time_s: of its scan, in [s].
+        Where it is NaN the taxel's last reading stands.
         """
         self._held = np.where(np.isnan(zeroed), self._held, zeroed)
         return self._go_on(lambda: self._dialogue.send(Reading(self._held, time_s)))

@@ -18,10 +18,8 @@ _AS_WIRED = frozenset({"mounting"})
 def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
-    The doctor started with what is `known`, and will ask for `presses`, and for a weight where it `weighs`.
-
-    Raises:
-        SensorFileError: the file cannot be written, or holds values that this visit cannot measure.
+    The doctor started with what is `known`, and will ask for `presses`, and for a weight where it `weighs`. Raises
+    SensorFileError where the file cannot be written, or holds values that this visit cannot measure.
     """
     try:
         in_place.check_writable(path)
@@ -53,19 +51,11 @@ def keep(
     *,
     emulated: bool = False,
 ) -> SensorFile:
-    """Write the facts from before and the new results into a sensor file, and return it.
+    """Write what is `known` from before and the new results, by sensor, into a sensor file, and return it.
 
-    Args:
-        path: of the file.
-        known: sensor file that the doctor started with.
-        port: of the adapter, whose serial number is kept where it has one.
-        baselines: of the free pads as they were read, by sensor.
-        found: corrections of the mounting, by sensor.
-        counts_per_newton: of the sensors that were weighed.
-        emulated: all results are of emulated sensors.
-
-    Raises:
-        SensorFileError: the file cannot be written, or holds values that were not measured this time.
+    `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
+    were read, and `found` are corrections of the mounting. Raises SensorFileError where the file cannot be written, or
+    holds values that were not measured this time.
     """
     with changing(path):
         before = _before(path)

@@ -52,11 +52,8 @@ class Refusal(NamedTuple):
 class Access:
     """Conditions that a request must meet.
 
-    Attributes:
-        host: name or address that the server listens at.
-        name: of this machine, with or without a domain.
-        token: or None where it is not needed.
-        key: sent within the page, and given by the page when it opens the socket.
+    The server listens at `host`, a name or an address; `name` is that of this machine, with or without a domain. The
+    token is None where it is not needed. The key is sent within the page, which gives it when it opens the socket.
     """
 
     host: str
@@ -131,8 +128,7 @@ class Access:
 def grant(host: str, name: str, token: str | None) -> Access:
     """Return the conditions for a server at `host`, on a machine called `name`: a token unless it is on loopback.
 
-    Raises:
-        UsageError: the token is too easy, or cannot be part of an address.
+    Raises UsageError where the token is too easy, or cannot be part of an address.
     """
     if token is not None and not _TOKEN.fullmatch(token):
         expected = f"expected at least {SHORTEST_TOKEN} letters, digits, - or _"

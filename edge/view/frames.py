@@ -179,11 +179,8 @@ def _path(path: Path | None) -> str | None:
 
 
 def _drawn(point: Point, first_ns: int) -> list[float | None]:
-    force = None if point.force_counts is None else round(point.force_counts, 1)
-    area = None if point.area_mm2 is None else round(point.area_mm2, 2)
-    force_n = None if point.force_n is None else round(point.force_n, 4)
-    shear = None if point.shear_ratio is None else round(point.shear_ratio, 3)
-    return [round((point.time_ns - first_ns) / 1e9, 3), force, area, force_n, shear]
+    values = (point.force_counts, 1), (point.area_mm2, 2), (point.force_n, 4), (point.shear_ratio, 3)
+    return [_seconds(point.time_ns - first_ns), *(None if value is None else round(value, n) for value, n in values)]
 
 
 def _seconds(ns: int) -> float:

@@ -81,31 +81,6 @@ def test_a_port_in_use_is_one_line_and_5(capsys):
     )
 
 
-@pytest.mark.parametrize(
-    ("code", "arguments", "words"),
-    [
-        (2, ["--view-host", "0.0.0.0"], "--view-host requires --view"),
-        (2, ["--view-token", "x" * 20], "--view-token requires --view"),
-        (2, ["--view-record-dir", "."], "--view-record-dir requires --view"),
-        (2, ["--view", "0", "--view-record-dir", "/dev/null"], "--view-record-dir /dev/null: expected a folder"),
-        (2, ["--view", "0", "--view-record-dir", "/no/such"], "--view-record-dir /no/such: expected a folder"),
-        (2, ["--view", "0", "--view-token", "short"], "a token of 5 characters for the live page: expected at least"),
-        (5, ["--view", "0", "--view-host", "192.0.2.1"], "192.0.2.1 is not an address of this machine; name one with"),
-        (5, ["--view", "0", "--view-host", "no.invalid"], "no.invalid is not an address of this machine; name one"),
-    ],
-)
-def test_what_makes_no_sense_is_one_line(capsys, code, arguments, words):
-    assert main(["--source", "demo", *arguments]) == code
-    assert words in capsys.readouterr().err.splitlines()[-1]
-
-
-@pytest.mark.parametrize("port", ["65536", "-1", "http"])
-def test_what_is_no_port_is_usage(capsys, port):
-    with pytest.raises(SystemExit) as caught:
-        main(["--source", "demo", f"--view={port}"])
-    assert caught.value.code == 2 and "argument --view" in capsys.readouterr().err
-
-
 def test_a_recording_is_played_as_if_live_where_somebody_is_to_look(tmp_path):
     path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
     for number, (options, live) in enumerate((([], False), (["--paced"], True), (["--view", "0"], True))):

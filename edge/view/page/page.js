@@ -232,6 +232,13 @@ function command(what) {
   return sent;
 }
 
+/** Switch what the page draws, and let the browser keep it. */
+function toggle(name) {
+  page[name] = !page[name];
+  memory.set(name, page[name] ? "on" : "off");
+  painter.all();
+}
+
 const act = {
   zero(sensor) {
     forgetRefusal();
@@ -252,16 +259,8 @@ const act = {
     painter.all();
     return undefined;
   },
-  relief() {
-    page.relief = !page.relief;
-    memory.set("relief", page.relief ? "on" : "off");
-    painter.all();
-  },
-  shear() {
-    page.shear = !page.shear;
-    memory.set("shear", page.shear ? "on" : "off");
-    painter.all();
-  },
+  relief() { toggle("relief"); },
+  shear() { toggle("shear"); },
   save() { if (!byId("saving").open) byId("saving").showModal(); },
   before() { hand.step(-1); },
   after() { hand.step(1); },
