@@ -209,12 +209,6 @@ def test_a_pad_is_still_while_blocks_differ_by_little(change, still):
     assert bool(pad.event) is still and (still or not any(pad.block(100 + number * change) for number in (5, 6, 7)))
 
 
-def test_a_restless_block_begins_the_wait_again():
-    pad = Blocks()
-    pad.blocks(4)
-    assert pad.blocks(5, of_z(own=40)) == [False] * 4 + [True]
-
-
 @pytest.mark.parametrize(
     ("level", "step", "event"),
     [
@@ -261,15 +255,6 @@ def test_since_zeroing_a_pad_may_have_drifted_by_fifty_counts(level, kept):
     answers = pad.blocks(5, level)
     assert pad.step == kept and answers == [False] * 4 + [kept > 0]
     assert kept == 0 or "since it was zeroed" in pad.event
-
-
-@pytest.mark.parametrize(("low", "kept"), [(7, 18.5), (8, 0)])
-def test_half_of_a_step_is_not_yet_common(low, kept):
-    """7.5 counts of all taxels, as a mean of sevens and eights, or 8."""
-    pad = Blocks()
-    for _ in range(5):
-        pad.block(of_z(low, own=11), of_z(8, own=11))
-    assert pad.step == kept
 
 
 def test_a_known_step_is_told_of_again_where_it_has_changed():

@@ -5,13 +5,12 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from bridge_samples import make_counts, make_recording, read_until_lost
+from bridge_samples import make_counts, make_recording
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, decode
 from firmware_bridge.scans.scan import ABSENT
@@ -62,18 +61,6 @@ def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
 def test_a_controller_that_falls_behind_sends_no_two_at_once():
     times = [time_s for time_s, _ in timeline(rate_hz=1000.0)]
     assert np.diff(times) == pytest.approx([FRAME_S] * (len(times) - 1))
-
-
-def test_two_controllers_share_the_bus():
-    frames = timeline(tracks=2, scans=3)
-    assert len(frames) == 96
-    assert [frame.can_id & 0xF for _, frame in frames[:6]] == [4, 6] * 3
-    assert [time_s for time_s, _ in frames] == sorted(time_s for time_s, _ in frames)
-
-
-def test_the_seed_decides_everything():
-    first, again, other = (timeline(seed=seed, jitter_s=0.002) for seed in (1, 1, 2))
-    assert first == again != other
 
 
 def test_looping_goes_on_in_time():
@@ -163,11 +150,3 @@ def test_recordings_that_no_such_sensor_made():
         Emulator([type(other)(other.path, (wide,), 100.0)])
     with pytest.raises(RecordingError, match="--rate-hz"):
         Emulator([type(other)(other.path, other.tracks, None)])
-
-
-def test_the_rate_may_come_from_the_recorded_times():
-    made = make_recording(5)
-    times = np.arange(5, dtype=np.int64) * 5_000_000
-    timed = type(made)(made.path, (Track("4", made.tracks[0].counts, times),), None)
-    with Emulator([timed]) as emulator, SlcanSerialLink(emulator.port) as link:
-        assert len(read_until_lost(link)) == 5
