@@ -69,8 +69,6 @@ class CanBusLink(Link):
         self.name = f"can:{interface}:{channel}"
         pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
         self.kind: SourceKind = "emulated" if pretended else "device"
-        self.ended = False
-        self.trouble: str | None = None
         if interface in _NOT_THROUGH_PYTHON_CAN:
             raise SourceError(f"source is {self.name!r}: {_NOT_THROUGH_PYTHON_CAN[interface]}")
         self._can = _python_can()

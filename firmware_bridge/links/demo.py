@@ -32,8 +32,6 @@ class DemoLink(Link):
         self.name = "demo"
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
-        self.ended = False
-        self.trouble: str | None = None
         self._recording = str(recording)
         self._rate_hz = rate_hz
         self._loop = loop

@@ -72,8 +72,6 @@ class GsUsbLink(Link):
         """
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
-        self.ended = False
-        self.trouble: str | None = None
         self.serial_number = wanted
         self._wanted = wanted
         self._known: Recognised[GsUsbDevice] = Recognised()
@@ -137,9 +135,9 @@ class GsUsbLink(Link):
                 fed = self._scans.feed(data, now_ns)
                 if data and len(data) < len(self._packet):
                     self._scans.end_transfer()
-            scans = self._unread.mark(fed, now_ns, self._scans.clock_begun_ns)
-            self.trouble = self._scans.trouble(now_ns)
-            self.stamps_dropped |= self._scans.stamps_dropped
+            scans = self._unread.mark(fed, now_ns, self._scans.clock.begun_ns)
+            self.trouble = self._scans.errors.trouble(now_ns)
+            self.stamps_dropped |= self._scans.clock.dropped
             left_ns = end_ns - now_ns
             if scans or left_ns <= 0:
                 return scans

@@ -60,7 +60,6 @@ class LastingLink(Link):
         self.name = link.name
         self.kind = link.kind
         self.ended = link.ended
-        self.trouble: str | None = None
         self.patient = link.patient
         self.unix_offset_ns = link.unix_offset_ns
         self.origin = link.origin

@@ -76,8 +76,6 @@ class XelaServerLink(Link):
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
-        self.ended = False
-        self.trouble: str | None = None
         self.url = self._address.url
         self._scans = ServerScans(geometry)
         self._clock_ns = clock_ns
