@@ -112,11 +112,7 @@ class CanBusLink(Link):
             self._close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
-
-        Raises:
-            LinkLostError: the interface is gone, or down.
-        """
+        """Return the scans that closed since the last call; raises LinkLostError if the interface is gone, or down."""
         if self._bus is None:
             raise ValueError("the link is not open: use it in a with statement")
         end_ns = self._clock_ns() + int(timeout_s * 1e9)

@@ -110,12 +110,9 @@ class GsUsbLink(Link):
         self._release(device)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
+        """Return the scans that closed since the last call; raises LinkLostError if the adapter is gone.
 
         An adapter sends each frame in a transfer of its own: transfers are fetched until a scan closes.
-
-        Raises:
-            LinkLostError: the adapter is gone.
         """
         if self._device is None:
             raise ValueError("the link is not open: use it in a with statement")

@@ -139,11 +139,7 @@ class SlcanSerialLink(Link):
         port.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first byte.
-
-        Raises:
-            LinkLostError: the port is gone.
-        """
+        """Return the scans that closed since the last call; raises LinkLostError if the port is gone."""
         if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
         try:
@@ -194,7 +190,7 @@ class SlcanSerialLink(Link):
         return Piece(data, time.monotonic_ns(), empty_ns)
 
     def counters(self) -> dict[str, int]:
-        """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
+        """Return the counts of bytes received, and dropped on opening or closing, and the stages' counters."""
         with self._counting:
             sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
             return sizes | self._scans.counters()

@@ -194,11 +194,7 @@ class XelaServerLink(Link):
 
 
 def server_address(url: str) -> ServerAddress:
-    """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL.
-
-    Raises:
-        SourceError: any other form.
-    """
+    """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL; raises SourceError on any other form."""
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
         parts = urlsplit(url)
