@@ -62,7 +62,7 @@ class Link(Protocol):
 
     name: str
     kind: SourceKind
-    ended: bool
+    ended: bool = False
     trouble: str | None = None
     stamps_dropped: bool = False
     patient: bool = False

@@ -69,8 +69,6 @@ class CanBusLink(Link):
         self.name = f"can:{interface}:{channel}"
         pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
         self.kind: SourceKind = "emulated" if pretended else "device"
-        self.ended = False
-        self.trouble: str | None = None
         if interface in _NOT_THROUGH_PYTHON_CAN:
             raise SourceError(f"source is {self.name!r}: {_NOT_THROUGH_PYTHON_CAN[interface]}")
         self._can = _python_can()
@@ -114,11 +112,7 @@ class CanBusLink(Link):
             self._close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
-
-        Raises:
-            LinkLostError: the interface is gone, or down.
-        """
+        """Return the scans that closed since the last call; raises LinkLostError if the interface is gone, or down."""
         if self._bus is None:
             raise ValueError("the link is not open: use it in a with statement")
         end_ns = self._clock_ns() + int(timeout_s * 1e9)

@@ -32,8 +32,6 @@ class DemoLink(Link):
         self.name = "demo"
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
-        self.ended = False
-        self.trouble: str | None = None
         self._recording = str(recording)
         self._rate_hz = rate_hz
         self._loop = loop
@@ -80,11 +78,7 @@ class DemoLink(Link):
             self._reap()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first byte.
-
-        Raises:
-            LinkLostError: the emulator ended before the end of the recording.
-        """
+        """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
         if self._link is None or self._process is None:
             raise ValueError("the link is not open: use it in a with statement")
         if self.ended:

@@ -72,8 +72,6 @@ class GsUsbLink(Link):
         """
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
-        self.ended = False
-        self.trouble: str | None = None
         self.serial_number = wanted
         self._wanted = wanted
         self._known: Recognised[GsUsbDevice] = Recognised()
@@ -112,12 +110,9 @@ class GsUsbLink(Link):
         self._release(device)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first.
+        """Return the scans that closed since the last call; raises LinkLostError if the adapter is gone.
 
         An adapter sends each frame in a transfer of its own: transfers are fetched until a scan closes.
-
-        Raises:
-            LinkLostError: the adapter is gone.
         """
         if self._device is None:
             raise ValueError("the link is not open: use it in a with statement")
@@ -137,9 +132,9 @@ class GsUsbLink(Link):
                 fed = self._scans.feed(data, now_ns)
                 if data and len(data) < len(self._packet):
                     self._scans.end_transfer()
-            scans = self._unread.mark(fed, now_ns, self._scans.clock_begun_ns)
-            self.trouble = self._scans.trouble(now_ns)
-            self.stamps_dropped |= self._scans.stamps_dropped
+            scans = self._unread.mark(fed, now_ns, self._scans.clock.begun_ns)
+            self.trouble = self._scans.errors.trouble(now_ns)
+            self.stamps_dropped |= self._scans.clock.dropped
             left_ns = end_ns - now_ns
             if scans or left_ns <= 0:
                 return scans

@@ -60,7 +60,6 @@ class LastingLink(Link):
         self.name = link.name
         self.kind = link.kind
         self.ended = link.ended
-        self.trouble: str | None = None
         self.patient = link.patient
         self.unix_offset_ns = link.unix_offset_ns
         self.origin = link.origin
@@ -103,10 +102,8 @@ class LastingLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; an empty list while the link is away.
 
-        The next call closes and opens a link that is lost or silent, which may take long.
-
-        Raises:
-            LinkLostError: it was away for longer than allowed.
+        The next call closes and opens a link that is lost or silent, which may take long. It raises
+        LinkLostError where it was away for longer than allowed.
         """
         if not self._open:
             self._come_back(timeout_s)
@@ -241,12 +238,7 @@ class LastingLink(Link):
             self._reopen(now_ns)
 
     def _guarded(self, call: Callable[..., _Answer], *arguments: object) -> _Answer:
-        """Return what the wrapped link returns.
-
-        Raises:
-            LinkLostError: it raised an error that no link is expected to raise.
-            BridgeError: it raised another.
-        """
+        """Return what the wrapped link returns; any error that no link is expected to raise is a LinkLostError."""
         try:
             return call(*arguments)
         except BridgeError:

@@ -63,9 +63,7 @@ def open_sources(
         mountings: mountings of sensors, by name including that of their source.
 
     Raises:
-        SourceError: no such form, or one name twice.
-        NoDeviceError: as in `open_source`.
-        RecordingError: as in `open_source`.
+        SourceError: no such form, or one name twice; and the other errors of `open_source`.
     """
     named: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):

@@ -91,7 +91,6 @@ class ReplayLink(Link):
             raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
         self.name = harmless(f"replay:{','.join(str(one.path) for one in self.recordings)}")
         self.kind: SourceKind = "replay"
-        self.ended = False
         self.patient = not paced
         self.origin = one_origin(recording.origin for recording in self.recordings)
         self.mountings = {

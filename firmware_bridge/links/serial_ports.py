@@ -37,9 +37,7 @@ class Port(NamedTuple):
         path: path of the port, such as /dev/ttyUSB0.
         usb_id: vendor and product; None for a port that is not on USB.
         serial_number: serial number of the USB device, which several ports may share.
-        description: description for the user.
-        product: name that the device reports.
-        manufacturer: manufacturer that the device reports.
+        description: description for the user; `product` and `manufacturer` are as the device reports them.
         interface: port of a device with several ones, such as "1.0".
         location: bus and sockets of the USB device, such as "1-2.3".
     """
@@ -118,11 +116,7 @@ def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:
 
 
 def find_adapter(ports: Sequence[Port]) -> Port:
-    """Return the only recognised adapter among `ports`.
-
-    Raises:
-        NoDeviceError: there is no adapter, or there are several.
-    """
+    """Return the only recognised adapter among `ports`; raises NoDeviceError if there is none, or several."""
     found = [port for port in ports if port.adapter is not None]
     if len(found) == 1:
         return found[0]
@@ -135,11 +129,7 @@ def find_adapter(ports: Sequence[Port]) -> Port:
 
 
 def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
-    """Return the port whose USB device has this serial number.
-
-    Raises:
-        NoDeviceError: there is no such port, or there are several.
-    """
+    """Return the port whose USB device has this serial number; raises NoDeviceError unless there is one."""
     found = [port for port in ports if port.serial_number == serial_number]
     if len(found) != 1:
         count = len(found) or "no"

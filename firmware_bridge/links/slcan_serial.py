@@ -88,8 +88,6 @@ class SlcanSerialLink(Link):
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
-        self.ended = False
-        self.trouble: str | None = None
         self.port = port
         self.low_latency = False
         self.baudrate = baudrate
@@ -141,11 +139,7 @@ class SlcanSerialLink(Link):
         port.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; waits at most `timeout_s` for the first byte.
-
-        Raises:
-            LinkLostError: the port is gone.
-        """
+        """Return the scans that closed since the last call; raises LinkLostError if the port is gone."""
         if self._bursts is None or self._serial is None:
             raise ValueError("the link is not open: use it in a with statement")
         try:
@@ -157,12 +151,12 @@ class SlcanSerialLink(Link):
             with self._counting:
                 self._received_bytes += len(data)
                 fed = self._scans.feed(data, time_ns)
-            scans += self._unread.mark(fed, time_ns, self._scans.clock_begun_ns)
+            scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
         if self._questions.due(len(scans), self._scans.decoder.refusals, pieces[-1].time_ns):
             _ask(self._serial, STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
         self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
-        if self._stamps_on and (self._stamps_are_none() or self._scans.stamps_dropped):
+        if self._stamps_on and (self._stamps_are_none() or self._scans.clock.dropped):
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
             self._open_anew(self._serial, STAMPS_OFF)
@@ -196,7 +190,7 @@ class SlcanSerialLink(Link):
         return Piece(data, time.monotonic_ns(), empty_ns)
 
     def counters(self) -> dict[str, int]:
-        """Return the counts of received bytes and of bytes dropped on opening or closing, and the stages' counters."""
+        """Return the counts of bytes received, and dropped on opening or closing, and the stages' counters."""
         with self._counting:
             sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
             return sizes | self._scans.counters()

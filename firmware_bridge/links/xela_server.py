@@ -76,8 +76,6 @@ class XelaServerLink(Link):
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
-        self.ended = False
-        self.trouble: str | None = None
         self.url = self._address.url
         self._scans = ServerScans(geometry)
         self._clock_ns = clock_ns
@@ -196,11 +194,7 @@ class XelaServerLink(Link):
 
 
 def server_address(url: str) -> ServerAddress:
-    """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL.
-
-    Raises:
-        SourceError: any other form.
-    """
+    """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL; raises SourceError on any other form."""
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
         parts = urlsplit(url)

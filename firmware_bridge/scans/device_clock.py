@@ -61,12 +61,7 @@ class DeviceClock:
     """
 
     def __init__(self, tick_ns: int, wrap_ticks: int | None) -> None:
-        """Start without a stamp.
-
-        Args:
-            tick_ns: duration of one tick of a stamp, in [ns].
-            wrap_ticks: number of ticks after which stamps begin at 0 again; None if they never do.
-        """
+        """Start without a stamp; ticks are of `tick_ns` [ns], and wrap at `wrap_ticks`, None if they never do."""
         self.restarts = 0
         self.begun_ns: int | None = None
         self.dropped = False
@@ -92,9 +87,7 @@ class DeviceClock:
     def at(self, stamp: int, arrival_ns: int) -> DeviceTime | None:
         """Return the time at which a frame was on the bus, never later than its arrival; None if stamps are no clock.
 
-        Args:
-            stamp: time stamp of the device, in ticks.
-            arrival_ns: monotonic time at which the frame was read, in [ns], never before that of the frame before.
+        `stamp` is in ticks, and `arrival_ns` [ns] of monotonic time is never before that of the frame before.
         """
         if self.dropped:
             return None

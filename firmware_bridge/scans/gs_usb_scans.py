@@ -15,13 +15,20 @@ WRAP_TICKS: Final = 1 << 32
 
 
 class GsUsbScans:
-    """Stages from bytes to scans, over any number of starts of the adapter."""
+    """Stages from bytes to scans, over any number of starts of the adapter.
+
+    Attributes:
+        clock: the adapter's clock since the last start.
+        errors: what the adapter reported of its bus.
+        can_ids: the standard CAN ids received so far, of any device.
+    """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self._scans = ScanAssembler(model)
-        self._errors = BusErrors()
-        self._decoder_counts: dict[str, int] = {}
-        self._start_decoder(GsUsbDecoder(stamped=False))
+        self.can_ids = self._scans.can_ids
+        self.errors = BusErrors()
+        self._earlier_counts: dict[str, int] = {}
+        self._decoder, self.clock = GsUsbDecoder(stamped=False), DeviceClock(TICK_NS, WRAP_TICKS)
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken."""
@@ -29,55 +36,32 @@ class GsUsbScans:
 
     def start(self, *, stamped: bool, channels: int) -> None:
         """Begin with a new decoder and clock after a start of the adapter, which may have reset its clock."""
-        self._decoder_counts = self._sum_decoder_counts()
-        self._start_decoder(GsUsbDecoder(stamped=stamped, channels=channels))
-        self._errors.restarted()
+        self._earlier_counts = self._sum_decoder_counts()
+        self._decoder, self.clock = GsUsbDecoder(stamped=stamped, channels=channels), DeviceClock(TICK_NS, WRAP_TICKS)
+        self.errors.restarted()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
         """Return the scans that close within `data`, which arrived at `time_ns` [ns] of monotonic time."""
         scans: list[Scan] = []
         for host_frame in self._decoder.feed(data):
             if host_frame.overflow:
-                self._errors.overflow(time_ns)
+                self.errors.overflow(time_ns)
             if host_frame.error is not None:
-                self._errors.error_frame(host_frame.error, host_frame.frame.data, time_ns)
+                self.errors.error_frame(host_frame.error, host_frame.frame.data, time_ns)
                 continue
-            self._errors.frame_heard()
+            self.errors.frame_heard()
             stamp_us = host_frame.stamp_us
-            device = None if stamp_us is None else self._clock.at(stamp_us, time_ns)
+            device = None if stamp_us is None else self.clock.at(stamp_us, time_ns)
             scans += self._scans.feed_frame(host_frame.frame, time_ns, device)
         return scans
-
-    @property
-    def stamps_dropped(self) -> bool:
-        """True once the adapter's time stamps have shown that they are no clock."""
-        return self._clock.dropped
-
-    @property
-    def clock_begun_ns(self) -> int | None:
-        """Monotonic time at which the adapter's clock was first compared, as in `DeviceClock`, in [ns]."""
-        return self._clock.begun_ns
 
     def end_transfer(self) -> None:
         """Discard an incomplete frame: the next transfer begins with another one."""
         self._decoder.end_transfer()
 
-    def trouble(self, time_ns: int) -> str | None:
-        """Return the trouble to report to the user at `time_ns` [ns] of monotonic time, None if there is none."""
-        return self._errors.trouble(time_ns)
-
-    @property
-    def can_ids(self) -> set[int]:
-        """Standard CAN ids received so far."""
-        return self._scans.can_ids
-
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages."""
-        return self._sum_decoder_counts() | self._errors.counters() | self._scans.counters()
-
-    def _start_decoder(self, decoder: GsUsbDecoder) -> None:
-        self._decoder = decoder
-        self._clock = DeviceClock(TICK_NS, WRAP_TICKS)
+        return self._sum_decoder_counts() | self.errors.counters() | self._scans.counters()
 
     def _sum_decoder_counts(self) -> dict[str, int]:
-        return {name: self._decoder_counts.get(name, 0) + count for name, count in self._decoder.counters().items()}
+        return {name: self._earlier_counts.get(name, 0) + count for name, count in self._decoder.counters().items()}

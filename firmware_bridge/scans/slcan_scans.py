@@ -110,13 +110,14 @@ class SlcanScans:
 
     Attributes:
         decoder: the first stage, with its counters and the status that the adapter reported.
+        clock: the adapter's clock since the last opening.
         can_ids: the standard CAN ids received so far, of any device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self._model = model
         self._taxels = model.geometry.taxel_count
-        self._clock = _millisecond_clock()
+        self.clock = _millisecond_clock()
         self._stamped: tuple[int, int] | None = None
         self._device: DeviceTime | None = None
         self._cycles: dict[bytes, Cycle | None] = {}
@@ -162,17 +163,7 @@ class SlcanScans:
             self._assembler.abandon(self._mixed.names[number], len(frames) // STAMPED_BYTES)
         self._mixed.begun.clear()
         self._assembler.begin_anew()
-        self._clock, self._stamped = _millisecond_clock(), None
-
-    @property
-    def stamps_dropped(self) -> bool:
-        """True once the adapter's time stamps have shown that they are no clock."""
-        return self._clock.dropped
-
-    @property
-    def clock_begun_ns(self) -> int | None:
-        """Monotonic time at which the adapter's clock was first compared, as in `DeviceClock`, in [ns]."""
-        return self._clock.begun_ns
+        self.clock, self._stamped = _millisecond_clock(), None
 
     def bytes_until_scan(self) -> int:
         """Return the number of bytes, from 1, that must come at least before a scan can close whole."""
@@ -190,7 +181,7 @@ class SlcanScans:
 
     def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
         """Feed a run of usual frames, parted into the whole cycles of their sensors and single frames."""
-        waits = frame_bytes == STAMPED_BYTES and not self._clock.dropped
+        waits = frame_bytes == STAMPED_BYTES and not self.clock.dropped
         if not waits:
             self._give_up_begun(time_ns, scans)
         for place, frames in self._mixed.part(packed, frame_bytes, time_ns, waits=waits):
@@ -224,7 +215,7 @@ class SlcanScans:
             if frame_bytes == STAMPED_BYTES:
                 before_ms, stamp_ms = stamp_ms, int.from_bytes(packed[end - 2 : end])
                 if late and before_ms is not None:
-                    self._clock.follow_order((stamp_ms - before_ms) * _MS_NS)
+                    self.clock.follow_order((stamp_ms - before_ms) * _MS_NS)
             self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
 
     def _feed_reading(
@@ -234,7 +225,7 @@ class SlcanScans:
             self._assembler.foreign += 1
             return
         device = None
-        if stamp_ms is not None and not self._clock.dropped:
+        if stamp_ms is not None and not self.clock.dropped:
             device = self._earlier_time(stamp_ms, time_ns) if late else self._device_time(stamp_ms, time_ns)
         scans += self._assembler.feed(reading, time_ns, device)
 
@@ -250,7 +241,7 @@ class SlcanScans:
             self._cycles[can_ids] = self._model.cycle(order)
         cycle = self._cycles[can_ids]
         # Checked before the clock gets the last stamp: earlier ones after it would count as a clock set back.
-        arrival_ns = time_ns if frame_bytes == PACKED_BYTES or self._clock.dropped else None
+        arrival_ns = time_ns if frame_bytes == PACKED_BYTES or self.clock.dropped else None
         longest_ns = 0 if cycle is None else self._assembler.longest_cycle_ns(cycle, arrival_ns)
         if cycle is None or not longest_ns:
             return None
@@ -278,7 +269,7 @@ class SlcanScans:
         # Sixteen frames that come together have about three different stamps: a scan takes 2 ms on the bus.
         if (stamp_ms, time_ns) != self._stamped:
             self._stamped = stamp_ms, time_ns
-            self._device = self._clock.at(stamp_ms, time_ns)
+            self._device = self.clock.at(stamp_ms, time_ns)
         return self._device
 
 

@@ -99,11 +99,7 @@ class ServerDecoder:
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
     def decode(self, text: str | bytes) -> ServerMessage:
-        """Decode one message.
-
-        Args:
-            text: the message, as text or in UTF-8.
-        """
+        """Decode one message, as text or in UTF-8."""
         self._counted["messages"] += 1
         content = self._content(text)
         if content is None:

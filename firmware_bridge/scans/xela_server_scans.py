@@ -99,12 +99,7 @@ class ServerScans:
             sensor.begin()
 
     def feed(self, text: str | bytes, arrival_ns: int) -> list[Scan]:
-        """Return the scans that this message closes.
-
-        Args:
-            text: one message.
-            arrival_ns: monotonic time at which it was read, in [ns], never before that of the message before.
-        """
+        """Return the scans that a message closes; `arrival_ns` [ns] is never before that of the message before."""
         message = self._decoder.decode(text)
         self.version = message.version or self.version
         if message.kind == "welcome":

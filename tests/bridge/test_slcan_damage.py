@@ -135,5 +135,6 @@ def test_what_a_broken_link_left_unfinished_is_skipped():
     line = encode_frame(CanFrame(0x004, bytes(8)))
     decoder.feed(line[:9])
     decoder.begin_anew()
+    assert decoder.pending_bytes == 0
     assert decoder.feed(line[9:]) == [] and decoder.feed(line) == [CanFrame(0x004, bytes(8))]
     assert decoder.counters()["skipped_bytes"] == len(line) - 1

@@ -131,6 +131,7 @@ def test_every_standard_id_that_came_is_known_whoever_it_is_of():
     for frame in frames:
         by_frame.feed_frame(frame, 1)
     assert text.can_ids == by_frame.can_ids == expected
+    assert text.counters()["foreign"] == by_frame.counters()["foreign"] == len(others) + 1
     for known in ([frames[:0], half], [half[:3], *[whole] * 5], [whole[10:], *[whole] * 5]):
         alone = SlcanScans()
         for number, piece in enumerate(known):
