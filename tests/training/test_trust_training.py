@@ -11,7 +11,7 @@ from edge_samples import make_contract
 from press_samples import make_press_set
 
 from edge.inference.small_network import small_network
-from edge.inference.trust import contact_features, trust_of
+from edge.inference.trust import trust_of
 from train import trust
 from train.data.press_batches import network_input
 from train.errors import CheckpointError, DatasetError
