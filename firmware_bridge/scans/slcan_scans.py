@@ -180,11 +180,21 @@ class SlcanScans:
         return counters
 
     def _feed_frames(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan]) -> None:
-        """Feed a run of usual frames, parted into the whole cycles of their sensors and single frames."""
+        """Feed a run of usual frames: the cycles of a sensor that come in one piece, and then the others, parted."""
+        start, cycle_bytes = 0, self._taxels * frame_bytes
         waits = frame_bytes == STAMPED_BYTES and not self.clock.dropped
         if not waits:
             self._give_up_begun(time_ns, scans)
-        for place, frames in self._mixed.part(packed, frame_bytes, time_ns, waits=waits):
+        mixed = bool(self._mixed.begun)
+        while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
+            scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
+            if scan is None:
+                break
+            scans.append(scan)
+            start += cycle_bytes
+        if start == len(packed):
+            return
+        for place, frames in self._mixed.part(packed[start:], frame_bytes, time_ns, waits=waits):
             if len(frames) > frame_bytes:
                 scan = self._feed_cycle(frames, frame_bytes, time_ns)
                 if scan is not None:
@@ -217,6 +227,12 @@ class SlcanScans:
                 if late and before_ms is not None:
                     self.clock.follow_order((stamp_ms - before_ms) * _MS_NS)
             self._feed_reading(decode_packed(packed, start, self._model), stamp_ms, time_ns, scans, late=late)
+
+    def _one_sensor(self, packed: bytes, start: int, frame_bytes: int) -> bool:
+        """Return whether two frames in a row are of one sensor; where scans of several mix, no cycle begins."""
+        taxels = self._model.taxels
+        first, second = (taxels.get(packed[at] << 4 | packed[at + 1] >> 4) for at in (start, start + frame_bytes))
+        return first is not None and second is not None and first[0] == second[0]
 
     def _feed_reading(
         self, reading: Reading | None, stamp_ms: int | None, time_ns: int, scans: list[Scan], *, late: bool = False
