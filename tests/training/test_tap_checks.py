@@ -52,7 +52,7 @@ def shares_caught(network, presses, spoil):
     """Return the share of earlier taps that a check at a share of false alarms catches, after `spoil` of a pair."""
     check = posed_tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
     rng = np.random.default_rng(5)
-    readings, poses = tap_checks._strong(rng, presses, 5, mirror=False)
+    readings, poses = tap_checks._strong(presses, 5)
     pose = poses[:, 1]
     stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), (0.2, 1.0))
     pair, stated = spoil(readings[:, :2], stated)

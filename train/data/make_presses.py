@@ -147,40 +147,26 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m train.data.make_presses", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("out", type=Path, metavar="OUT.npz")
-    parser.add_argument("--count", type=int, default=24_000, help="number of sequences (24000)")
-    parser.add_argument("--taps", type=int, default=1, help="presses in each sequence (1)")
-    parser.add_argument(
-        "--schedule",
-        default="mixed",
-        help=f"poses of a sequence's presses: {', '.join(SCHEDULES)}, or turns:DEGREES (mixed)",
-    )
-    parser.add_argument(
-        "--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)"
-    )
-    parser.add_argument("--per-pad", type=int, default=24, help="sequences of each pad (24)")
-    parser.add_argument(
-        "--families",
-        default="all",
-        help=f"all; even (equally many of each); figures; none; or names with commas: {', '.join(SHARES)}, or of "
-        "figures of the paper (all)",
-    )
-    parser.add_argument(
-        "--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add"
-    )
-    parser.add_argument(
-        "--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)"
-    )
-    parser.add_argument("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
-    parser.add_argument(
-        "--spread", type=float, default=1.0, help="spread of the pads' constants; 0: the nominal pad (1)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
-    parser.add_argument("--scale", type=int, default=SCALE, help=f"pattern pixels per taxel pitch ({SCALE})")
+    add = parser.add_argument
+    add("out", type=Path, metavar="OUT.npz")
+    add("--count", type=int, default=24_000, help="number of sequences (24000)")
+    add("--taps", type=int, default=1, help="presses in each sequence (1)")
+    schedules = f"poses of a sequence's presses: {', '.join(SCHEDULES)}, or turns:DEGREES (mixed)"
+    add("--schedule", default="mixed", help=schedules)
+    add("--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)")
+    add("--per-pad", type=int, default=24, help="sequences of each pad (24)")
+    families = f"names with commas: {', '.join(SHARES)}, or of figures of the paper (all)"
+    add("--families", default="all", help=f"all; even (equally many of each); figures; none; or {families}")
+    add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
+    add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)")
+    add("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
+    add("--spread", type=float, default=1.0, help="spread of the pads' constants; 0: the nominal pad (1)")
+    add("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
+    add("--scale", type=int, default=SCALE, help=f"pattern pixels per taxel pitch ({SCALE})")
     models = ", ".join(pad.name for pad in PADS)
-    parser.add_argument("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
-    parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
-    parser.add_argument("--compress", action="store_true", help="write a smaller file, more slowly")
+    add("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
+    add("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
+    add("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser
 
 

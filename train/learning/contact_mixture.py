@@ -58,9 +58,7 @@ class ContactMixture:
     """Density of normalised contacts as a function of the pad's constants."""
 
     share: NDArray[np.float64]  # (k,) of the components
-    means: NDArray[
-        np.float64
-    ]  # (k, 1 + p, channels), on a middle pad, then the change by half of each constant's range
+    means: NDArray[np.float64]  # (k, 1 + p, channels), of a middle pad, then the change by half a constant's range
     covariances: NDArray[np.float64]  # (k, channels, channels)
 
     def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -156,30 +154,21 @@ Sensor = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
 
 
 def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
-    """Return the sensors of the presses of a world, one for each pad, which chips of its own make."""
+    """Return the sensors that read the presses of a world, one for each pad, with chips of their own."""
     found: list[Sensor] = []
-    for number in range(world.chunks):
-        pad, chips = sensor_of(world, number)
+    spread, read_by = Nuisances().gain_spread, Nuisances().without("gain_spread")
+    # Sets number their pads with gaps, in the order in which they were drawn.
+    for number, pad_number in zip(range(world.chunks), np.unique(presses.pad), strict=True):
+        pad = draw_pad(np.random.default_rng([world.seed, number]))
+        chips = spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
+        chips = 1 + chips.clip(-2 * spread, 2 * spread)
         # Log-gains of the chips, and of what seats and moments do under an even load; the mean of z's is 0.
         true = np.log(chips) + np.log(_even_z(GrippedPad(pad)) / _even_z(GrippedPad(replace(pad, seed=None))))
         true -= true[AXES.index("z")].mean()
-        found.append((contacts_of(presses, world, number), true.ravel(), scaled_constants(pad)))
+        clean = presses.pick(presses.pad == pad_number).counts[:, 0] * chips.astype(np.float32)
+        contacts = read_windows(clean[None, :, None], 1.0, read_by, [world.seed, number])[0]
+        found.append((contacts, true.ravel(), scaled_constants(pad)))
     return found
-
-
-def sensor_of(world: World, number: int) -> tuple[Pad, NDArray[np.float64]]:
-    """Return a sensor's pad and the gains (3, rows, cols) of its chips."""
-    spread = Nuisances().gain_spread
-    chips = spread * np.random.default_rng([world.seed, 1, number]).standard_normal(USPA44.scan_shape)
-    return draw_pad(np.random.default_rng([world.seed, number])), 1 + chips.clip(-2 * spread, 2 * spread)
-
-
-def contacts_of(presses: PressSet, world: World, number: int) -> NDArray[np.float32]:
-    """Return the contacts (n, 3, rows, cols) of a sensor of a world, as it reads them."""
-    # Sets number their pads with gaps, in the order in which they were drawn.
-    mine = presses.pick(presses.pad == np.unique(presses.pad)[number])
-    clean = mine.counts[:, 0] * sensor_of(world, number)[1].astype(np.float32)
-    return read_windows(clean[None, :, None], 1.0, Nuisances().without("gain_spread"), [world.seed, number])[0]
 
 
 def _even_z(gripped: GrippedPad) -> NDArray[np.float64]:

@@ -95,14 +95,15 @@ def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetw
     rng = np.random.default_rng([seed, 7])
     right, wrong = [], []
     for number in range(_POSED_ROUNDS):
-        readings, poses = _strong(rng, presses, seed + number, mirror=number % 2 == 1)
+        readings, poses = _strong(presses, seed + number, mirror=number % 2 == 1)
         for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:_PAIRS]:
             there = readings[:, [newest, earlier]].any(axis=(2, 3, 4)).min(axis=1)
             pair = readings[there][:, [newest, earlier]]
             pose = relative(poses[there, newest], poses[there, earlier])
             stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1))
-            # What is astray in the network's training is wrong here.
-            near = _near(stated[:, 1], pose)
+            # What is astray in the network's training, by more than a few of its errors, is wrong here.
+            off = np.abs(stated[:, 1, :3] - pose)
+            near = (np.hypot(*off[:, :2].T) <= _FAR * stated[:, 1, 3]) & (off[:, 2] <= _FAR * stated[:, 1, 4])
             right.append(posed_pair_features(pair[near], stated[near]))
             wrong += [posed_pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
     return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _POSED_WEIGHT_DECAY)
@@ -111,7 +112,7 @@ def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetw
 def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
     """Return the check whose limit a share of the earlier taps of these presses exceeds, with usual errors of poses."""
     rng = np.random.default_rng([seed, 8])
-    readings, poses = _strong(rng, presses, seed, mirror=False)
+    readings, poses = _strong(presses, seed)
     rows = []
     for earlier in range(1, presses.taps):
         there = readings[:, earlier].any(axis=(1, 2, 3))
@@ -135,9 +136,7 @@ def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDA
     return np.stack([cosine * x + sine * y, cosine * y - sine * x, turned], axis=1).astype(np.float32)
 
 
-def _strong(
-    rng: np.random.Generator, presses: PressSet, seed: int, *, mirror: bool
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _strong(presses: PressSet, seed: int, *, mirror: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return windows (n, K, 3, rows, cols) in counts whose taps are strong enough or absent, and their poses."""
     readings, poses = read_presses(presses, Nuisances(), seed), presses.poses
     if mirror:
@@ -145,12 +144,6 @@ def _strong(
     there = presses.counts.any(axis=(2, 3, 4))
     strong = ((readings[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS) | ~there).all(axis=1)
     return readings[strong], poses[strong]
-
-
-def _near(stated: NDArray[np.float32], true: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which stated poses (n, 5) are within a few of their errors."""
-    off_mm = np.hypot(*(stated[:, :2] - true[:, :2]).T)
-    return (off_mm <= _FAR * stated[:, 3]) & (np.abs(stated[:, 2] - true[:, 2]) <= _FAR * stated[:, 4])
 
 
 def _wrong(

@@ -88,7 +88,8 @@ class IntervalCorrection(nn.Module):
         """
         peak = pattern.amax(dim=(1, 2), keepdim=True)
         masks = self.masks(pattern, peak)
-        means = features.reshape(len(features), features.shape[1] // self._symmetries, -1).mean(dim=2)
+        count, channels = features.shape[:2]  # not len(), which a traced graph would hold as a constant
+        means = features.reshape(count, channels // self._symmetries, -1).mean(dim=2)
         spread = deviation.mean(dim=(1, 2))[:, None]
         return masks, torch.cat([means, about, masks.mean(dim=(2, 3)), peak[:, :, 0], spread, later], dim=1)
 
