@@ -17,7 +17,7 @@ from edge.inference.bound_run import BoundRun, Outputs
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_guard import read_model
 from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
-from edge.inference.timed_loading import flush_denormals, within_limit
+from edge.inference.timed_loading import within_limit
 from firmware_bridge.errors import harmless
 
 WARM_UP_RUNS: Final = 10
@@ -52,9 +52,6 @@ onnxruntime.disable_telemetry_events()  # if it was imported before `edge`, whic
 
 class ModelSession:
     """Model ready to run, on one thread by default, without spinning.
-
-    Build it on the thread that runs it: onnxruntime makes denormals zero once in a process, on the thread that builds
-    the first session and on threads which that one starts later. Everything else on them computes like this as well.
 
     Attributes:
         name: of the model.
@@ -287,7 +284,6 @@ def session_options(threads: int = 1) -> onnxruntime.SessionOptions:
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
-    options.add_session_config_entry("session.set_denormal_as_zero", "1")
     # A second lock after `read_model`. No file can lie below the null device; and without the format a file might be
     # read as onnxruntime's own, which `read_model` does not check.
     options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
@@ -302,7 +298,6 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
         ModelError: the file is missing, not a model, not one plain graph with its weights, or loading takes too long.
     """
     content = read_model(path)
-    flush_denormals(session_options)
     options = session_options(threads)
 
     def load() -> onnxruntime.InferenceSession:

@@ -8,14 +8,10 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from edge.errors import ModelError
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 LOAD_LIMIT_S: Final = 60.0
 """Longest load: a thousand times that of the bundled models."""
@@ -23,14 +19,6 @@ STOP_S: Final = 0.5
 """Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
 _POLL_S: Final = 0.1
 _THREAD: Final = "edge: loading a model"
-_IDENTITY: Final = (
-    b"\x08\x08"  # IR version
-    b"\x3a\x37\x0a\x10\x0a\x01a\x12\x01b\x22\x08Identity\x12\x01g"  # a graph of one node, from a to b
-    b"\x5a\x0f\x0a\x01a\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01"
-    b"\x62\x0f\x0a\x01b\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01"
-    b"\x42\x02\x10\x0d"  # operator set
-)
-"""Smallest graph that onnxruntime loads. Source: onnx.proto, ModelProto and its messages."""
 
 Made = TypeVar("Made")
 
@@ -83,11 +71,3 @@ def unfinished_load() -> bool:
     Otherwise onnxruntime may crash at exit, when it frees objects that the thread still uses.
     """
     return any(thread.name == _THREAD for thread in threading.enumerate())
-
-
-@cache
-def flush_denormals(options_of: "Callable[[], onnxruntime.SessionOptions]") -> None:
-    """Build a session here: onnxruntime makes denormals zero once in a process, on the thread of the first session."""
-    import onnxruntime  # here, so that the command line can call `unfinished_load` without it
-
-    onnxruntime.InferenceSession(_IDENTITY, options_of(), providers=["CPUExecutionProvider"])

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
-    """Load a model and its contract; call it in the thread that will run the model.
+    """Load a model and its contract.
 
     Args:
         model: a file, or the name of a bundled one.

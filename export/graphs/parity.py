@@ -55,7 +55,7 @@ FULL_TRACTION_KPA: Final = 100.0
 FULL_RANGE_COUNTS: Final = 32768
 """Largest distance of a zeroed reading from rest: `firmware_bridge.zeroing.baseline.deformation` wraps around."""
 _DENORMAL_BITS: Final = 0x000116C2
-"""Bits of 1e-40 in float32: written as a number it would be zero wherever onnxruntime has set denormals to zero."""
+"""Bits of 1e-40 in float32: written as a number it would be zero wherever a program has set denormals to zero."""
 PARITY_WINDOWS: Final = 100
 """Approximate number of frozen readings in the parity check; readings have no scale, so they fit every network."""
 
@@ -89,8 +89,6 @@ class GraphRun:
         options.log_severity_level = LOG_FATAL_ONLY
         options.intra_op_num_threads = 1
         options.graph_optimization_level = LEVELS[level]
-        # As in the runtime, denormals count as zero.
-        options.add_session_config_entry("session.set_denormal_as_zero", "1")
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
