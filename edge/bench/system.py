@@ -203,11 +203,14 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 emulators.stdin.close()
 
 
-def _started(arguments: Sequence[str], tree: Path, **pipes: Any) -> subprocess.Popen[Any]:
+def _started(
+    arguments: Sequence[str], tree: Path, *, stdin: int, stdout: int, stderr: int | None = None
+) -> subprocess.Popen[bytes]:
     """Start Python in the tree; its bytecode is kept, as that of an installed program is."""
     paths = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
     variables = os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
-    return subprocess.Popen([sys.executable, *arguments], env=variables, start_new_session=True, **pipes)
+    command = [sys.executable, *arguments]
+    return subprocess.Popen(command, env=variables, stdin=stdin, stdout=stdout, stderr=stderr, start_new_session=True)
 
 
 def write_recording(path: Path, number: int, *, pressed: bool) -> Path:
