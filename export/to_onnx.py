@@ -29,7 +29,7 @@ from export.graphs.intervals import IntervalData
 from export.graphs.parity import check_parity, extreme_windows
 from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
-from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED
 from train.data.paper_taps import paper_taps
@@ -55,12 +55,13 @@ _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batch: int | str) -> Contract:
-    """Return the contract of a network's graph, with its error still empty.
+    """Return the contract of a network's graph for the pad of the test set, with its error still empty.
 
     Raises:
         CheckpointError: the report of the weights lacks a key; the error names it.
     """
-    example = torch.zeros(1, 3 * net.taps, USPA44.rows, USPA44.cols)
+    pad = pad_of(*frozen.newest.shape[-2:])
+    example = torch.zeros(1, 3 * net.taps, pad.rows, pad.cols)
     given = outputs(net, example)
     known = known_width(net)
     try:
@@ -78,10 +79,10 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
         output_unit=OUTPUT_UNIT,
         output_full_scale=frozen.full_scale_mm,
         contact_level=contact_level,
-        sensor=USPA44.name,
-        rows=USPA44.rows,
-        cols=USPA44.cols,
-        pitch_mm=USPA44.pitch_mm,
+        sensor=pad.name,
+        rows=pad.rows,
+        cols=pad.cols,
+        pitch_mm=pad.pitch_mm,
         arithmetic="float32",
         interval_factor=float(half_width_mm(1.0)) if len(given) > 1 else None,
         confidence={},
@@ -90,7 +91,7 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
         test_error={},
         pad_inputs=tuple(input_scale()) if known else (),
         takes_gains=bool(known),
-        traction_scale=given[2].shape[-1] // USPA44.cols if len(given) > 2 else None,
+        traction_scale=given[2].shape[-1] // pad.cols if len(given) > 2 else None,
         takes_poses=net.takes_poses,
         reach_mm=REACH_MM if net.takes_poses else 0.0,
     )
@@ -115,7 +116,7 @@ def export(
     Args:
         checkpoint: NAME.pt of train.fit.
         folder: of the model.
-        frozen: the test set.
+        frozen: the test set, of the pad that the model is for.
         batch: windows in one run, or ANY_BATCH.
         calibration: training taps from which int8 ranges are measured; None for float32.
         validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
@@ -126,6 +127,7 @@ def export(
     net, report = load_network(checkpoint)
     write_out(net)
     contract = contract_of(net, report, frozen, batch)
+    pad = pad_of(contract.rows, contract.cols)
     level = contract.contact_level
     if intervals is not None and contract.interval_factor is not None:
         report = {**report, "options": {**report["options"], "intervals": True}}
@@ -136,10 +138,10 @@ def export(
         found = intervals.corrected(net, level)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
     traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
-    single = to_model(net, traced)
+    single = to_model(net, traced, pad)
     parity = check_parity(net, single, frozen, contract)
     if calibration is None:
-        model = single if batch == traced else to_model(net, batch)
+        model = single if batch == traced else to_model(net, batch, pad)
         if model is not single:
             check_parity(net, model, frozen, contract)
         return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
@@ -150,8 +152,8 @@ def export(
     if intervals is not None:
         found = intervals.conformed(net, integers)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        integers = quantise(to_model(net, traced))
-    model = integers if batch == traced else quantise(to_model(net, batch))
+        integers = quantise(to_model(net, traced, pad))
+    model = integers if batch == traced else quantise(to_model(net, batch, pad))
     integer, convs = convolutions(model)
     float_error = writer.error(single, contract)
     contract = replace(contract, arithmetic="int8", test_error={}, confidence={})

@@ -31,7 +31,7 @@ from edge.inference.contract import (
 from edge.inference.pose_input import POSE_WIDTH
 from export.errors import ExportError
 from export.graphs.joined import branches
-from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.blocks import PatternNet
 from train.networks.fusion import OneOrMoreNet
 from train.networks.registry import build
@@ -48,7 +48,7 @@ ONE_TAP: Final = "one_tap"
 """Key of the origin of a graph's branch for a single tap, with the name of that model."""
 
 
-def to_model(net: PatternNet, batch: int | str = 1) -> onnx.ModelProto:
+def to_model(net: PatternNet, batch: int | str = 1, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
     """Return the network as a checked ONNX graph of `batch` windows a run, or ANY_BATCH, without a contract.
 
     The exporter folds batch normalisation into the convolutions before it.
@@ -59,7 +59,7 @@ def to_model(net: PatternNet, batch: int | str = 1) -> onnx.ModelProto:
     if not isinstance(batch, str) and batch < 1:
         raise ExportError(f"a batch of {batch} asked for, expected 1 or more")
     traced = _TRACED if isinstance(batch, str) else batch
-    example = torch.zeros(traced, 3 * net.taps, USPA44.rows, USPA44.cols)
+    example = torch.zeros(traced, 3 * net.taps, pad.rows, pad.cols)
     width, free = known_width(net), {0: torch.export.Dim(batch)} if isinstance(batch, str) else {}
     inputs, dims = {INPUT_NAME: example}, {INPUT_NAME: free}
     if net.takes_poses:

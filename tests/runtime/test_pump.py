@@ -52,12 +52,12 @@ class TestOvertaking:
         assert not [thread for thread in threading.enumerate() if thread.name.startswith("scan-reader")]
 
     def test_scans_between_the_calls_of_a_round_overtake(self):
-        """Six sensors press; a call has time for two of them, and the next scans come during the second call."""
+        """Six sensors press; a call takes four of them, and the next scans come during each of the first two calls."""
         names = [f"{number}" for number in range(6)]
         batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
         gates, read_on = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
         link = FakeLink([batches[0], gates[0], batches[1], gates[1], batches[2]])
-        inner, clock_us, calls = link.read, itertools.count(0, 3000), []
+        inner, calls = link.read, []
 
         def read(timeout_s):
             if link.reads in (3, 5):  # the batch before was handed over
@@ -74,11 +74,15 @@ class TestOvertaking:
 
         link.read = read
         baselines, sink = dict.fromkeys(names, BASELINE), ListSink()
-        runtime = make_runtime(Slow(), baselines=baselines, clock_ns=lambda: 1000 * next(clock_us))
-        statistics = pumped(link, sink, runtime=runtime, rate_hz=250)  # a call may take 1 ms
+        runtime = make_runtime(Slow(), baselines=baselines)
+        statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
         made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
-        assert calls[:4] == [6, 2, 2, 2] and max(calls[4:]) <= 2
-        assert made == [(0, name) for name in names] + [(1, "0"), (1, "1")] + [(2, name) for name in "234501"]
+        assert calls == [4, 4, 4, 2]
+        assert made == [
+            *((0, name) for name in "0123"),
+            *((1, name) for name in "4501"),
+            *((2, name) for name in "230145"),
+        ]
         assert statistics.dropped == 4
         assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 

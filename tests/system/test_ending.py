@@ -213,7 +213,7 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback(monkeypatch, capsys):
     def interrupt(arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli.COMMANDS, "models", interrupt)
+    monkeypatch.setattr(cli, "_command", interrupt)
     assert cli.main(["models"]) == 130
     assert capsys.readouterr().err == ""
 

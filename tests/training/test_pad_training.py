@@ -59,7 +59,7 @@ def model(unseen, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pad46")
     torch.set_num_threads(1)
     fit_network(TRAINING, presses(40, seed=3), unseen, folder)
-    export(folder / "pad46.pt", folder, unseen, USPA46)
+    export(folder / "pad46.pt", folder, unseen)
     return folder / "pad46.onnx"
 
 
