@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 import textwrap
 from collections.abc import Callable
 from typing import Any, Final, NoReturn
@@ -62,8 +63,13 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--version", action="version", version=f"edge-sr {__version__}", help="show the version")
 
     def error(self, message: str) -> NoReturn:
-        """End with the message and a hint at the help."""
-        self.exit(EXIT_USAGE, f"edge-sr: {message} ({self.prog} --help lists all options)\n")
+        """End with the message, the option that was meant, and a hint at the help."""
+        from difflib import get_close_matches
+
+        named = re.search(r"unrecognized arguments: (--[\w-]+)", message)
+        near = get_close_matches(named[1], self._option_string_actions, n=1) if named else ()
+        meant = f"did you mean {near[0]}? " if near else ""
+        self.exit(EXIT_USAGE, f"edge-sr: {message} ({meant}{self.prog} --help lists all options)\n")
 
 
 def positive(text: str, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> float:
