@@ -41,8 +41,8 @@ def telling(number: int, *, touched: bool) -> NDArray[np.int64]:
 
 
 UNUSED_NS: Final = 5_000_000_000
-"""Time after which an adapter that is back must have been used, in [ns]: links look for theirs every two seconds, so that
-one that came back just before the end need not have been."""
+"""Time after which an adapter that is back must have been used, in [ns]: links look for theirs every two seconds, and
+one that came back just before the end need not have been used."""
 
 
 class Judge:
