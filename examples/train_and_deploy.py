@@ -62,7 +62,7 @@ TRIED = 8
 REST_STEPS = 150
 """Steps that take as long as all else: importing, the validation set, the export and its checks."""
 JUDGED = 60
-"""Presses, on pads of their own, by which the model is compared with others."""
+"""Presses, each on a pad of its own, by which the model is compared with others."""
 LEAST_SHARE = 0.005
 """Smallest share of presses and steps, whatever minutes are given."""
 
@@ -111,7 +111,8 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
 
 def is_better(model: Path, mesh: Path, out: Path, seed: int) -> bool:
     """Compare a model with others on presses of the object that none was trained on; print and return the verdict."""
-    presses = load_presses(Path(taps(out / "unseen.npz", ["--families", "none", "--mesh", str(mesh)], JUDGED, seed)))
+    options = ["--families", "none", "--mesh", str(mesh), "--per-pad", "1"]
+    presses = load_presses(Path(taps(out / "unseen.npz", options, JUDGED, seed)))
     counts, truth = presses.counts[:, 0].astype(np.float32), presses.patterns.astype(np.float32)
     own, bundled = (load_model(one) for one in (model, find_model(DEFAULT_MODEL)))
 
@@ -134,9 +135,9 @@ def is_better(model: Path, mesh: Path, out: Path, seed: int) -> bool:
     return True
 
 
-def taps(out: Path, surfaces: list[str], count: int, seed: int) -> str:
+def taps(out: Path, options: list[str], count: int, seed: int) -> str:
     """Simulate taps: python -m train.data.make_presses ..."""
-    code = make_presses([str(out), *surfaces, "--count", str(count), "--seed", str(seed)])
+    code = make_presses([str(out), *options, "--count", str(count), "--seed", str(seed)])
     if code != 0:
         sys.exit(code)  # it has printed the reason
     return str(out)

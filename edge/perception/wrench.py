@@ -20,6 +20,9 @@ LEAST_FORCE_N: Final = 0.1
 _N_OF_KPA_MM2: Final = 1e-3
 _LEVEL_SCANS: Final = 200
 """Scans over which the level of a contact is taken, two seconds at 100 Hz: one that rolls on gets a new one."""
+_SHEAR_SCALES: Final = (0.5, 3.0)
+"""Least and largest newtons of shear for a nominal one: 0.62 to 2.96 on 2000 drawn pads. An offset of x or y, as of a
+cable, must not be taken for more."""
 _SHEAR_PRIOR_N2: Final = 5.0
 """Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
 
@@ -139,7 +142,7 @@ class Balance:
         nominal += shear_x * shear_x + shear_y * shear_y
         found += shear_x * x_n + shear_y * y_n
         self._shear = nominal, found
-        scale = max(found / nominal, 0.0)
+        scale = min(max(found / nominal, _SHEAR_SCALES[0]), _SHEAR_SCALES[1])
         # Shear that the network has not found, or too much of it, lies where the pad is pressed.
         more_x, more_y = (scale * shear_x - x_n) / z_n, (scale * shear_y - y_n) / z_n
         mixed = np.array([(1, 0, more_x), (0, 1, more_y), (0, 0, z * by_force / squares / z_n)], dtype=np.float32)

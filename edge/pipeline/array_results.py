@@ -64,8 +64,10 @@ def infer(
 def _checked(name: str, counts: Any, *, lowest: int) -> NDArray[Any]:
     """Return counts as (n, 3, rows, cols); those in the vendor's order have the axes of each taxel together."""
     array = np.asarray(counts)
-    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+    if array.dtype.kind not in "iuf":
         raise UsageError(f"{name} are of type {array.dtype}, expected numbers: raw counts, nothing subtracted")
+    if not np.isfinite(array).all():
+        raise UsageError(f"{name} hold NaN or infinity, expected raw counts: -1 where a taxel gave no reading")
     if array.ndim in (1, 2) and array.shape[-1] == GAINS:
         array = array.reshape(-1, GAINS // len(AXES), len(AXES))
     if array.ndim in (2, 3) and array.shape[-2:] == (GAINS // len(AXES), len(AXES)):

@@ -62,7 +62,7 @@ def test_arrays_as_numpy_loads_them_and_in_the_vendors_order_are_taken(counts, b
             "counts are not whole numbers, expected raw counts: no means, and nothing subtracted",
         ),
         ({"counts": COUNTS.astype(str)}, "counts are of type <U.*, expected numbers: raw counts, nothing subtracted"),
-        ({"baseline": np.full((3, 4, 4), np.nan)}, "baseline are of type float64, expected numbers"),
+        ({"baseline": np.full((3, 4, 4), np.nan)}, "baseline hold NaN or infinity, expected raw counts"),
         ({"counts": COUNTS[:, :2]}, r"counts have shape \(15, 2, 4, 4\), expected \(3, rows, cols\) or \(n, 3, rows"),
         ({"counts": COUNTS[:0]}, r"counts have shape \(0, 3, 4, 4\), expected"),
         ({"counts": COUNTS - 70_000}, "counts are -.*, expected -1 to 65535"),

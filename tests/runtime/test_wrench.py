@@ -69,7 +69,7 @@ def test_the_ratio_of_shear_is_that_of_the_forces(traction_kpa, ratio):
     assert wrench_of(even(*traction_kpa), PIXEL_MM).shear_ratio == pytest.approx(ratio)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def press():
     """Readings of a press to the right of the middle under 4 N of drag, by the bundled model's own operator."""
     contract = load_model(find_model("stsr-int8")).contract
@@ -92,6 +92,15 @@ def test_force_in_a_contact_changes_as_its_readings_do_whatever_the_network_find
         force_n = wrench_of(balanced, PIXEL_MM).force_n
         assert force_n[2] == pytest.approx(strength * level_n, rel=0.02), number
         assert force_n[:2] == pytest.approx(strength * drag_n, abs=0.05 if strength == 1 else 0.4), number
+
+
+@pytest.mark.parametrize(("off", "most"), [(20.0, 3.0), (-5.0, 0.5)])
+def test_shear_is_never_scaled_beyond_what_pads_differ_by(press, off, most):
+    balance, pattern, traction, readings, row, drag_n = press
+    found = traction * np.array([off, off, 1], np.float32)[:, None, None]
+    for _ in range(300):
+        force_n = wrench_of(balance(found, pattern, readings, 9, row), PIXEL_MM).force_n
+    assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
 
 
 def test_each_contact_has_a_level_of_its_own(press):
