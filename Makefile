@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr2.pt checkpoints/mtsr4.pt checkpoints/mtsr7.pt
+NETWORKS := checkpoints/stsr.pt checkpoints/stsr-small.pt checkpoints/mtsr.pt
 
 .PHONY: run test night lint docs wheels models reports reports-stale clean
 
@@ -32,16 +32,15 @@ docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and man page; and training, export, bench
 	$(BIN)/python release/wheels.py
 
-TAPS := data/gripped.npz data/gripped4.npz data/taps4.npz data/taps7.npz data/more4.npz data/more7.npz
-NAMED := data/named4.npz data/nominal4.npz data/named7.npz data/taps4.npz data/taps7.npz
+PRESSES := data/gripped.npz data/taps4.npz data/taps7.npz
+FIGURES := data/named4.npz data/named7.npz data/nominal4.npz data/nominal7.npz
 
-models: $(VENV)/.dev $(TAPS) $(NAMED) data/validation.npz  ## retrain and re-export the bundled models: some five hours on two cores
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(TAPS) --validation data/validation.npz
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(NAMED) --validation data/validation.npz --network fusion-mtsr7 --name mtsr7 --start-from mtsr7-wide --keep 0.15 --steps 21000 --learning-rate 1.5e-3 --bf16 --seed 7
-	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(TAPS)
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --one-tap stsr --validation data/validation.npz --intervals $(TAPS) --trust checkpoints/trust.json --int8 $(TAPS)
-	$(BIN)/python -m train.freeze edge/models --data $(TAPS)
+models: $(VENV)/.dev $(PRESSES) $(FIGURES) data/validation.npz  ## train the bundled models on, and export them again
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(PRESSES) $(FIGURES) --validation data/validation.npz
+	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(PRESSES)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) --trust checkpoints/trust.json
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) --trust checkpoints/trust.json --int8 $(PRESSES)
+	$(BIN)/python -m train.freeze edge/models --data $(PRESSES)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
 REPORT := nice $(BIN)/python
@@ -58,31 +57,25 @@ reports-stale: $(VENV)/.dev  ## a line for each report: fresh, or stale and why
 	@$(BIN)/python -m edge.bench.provenance
 
 data/gripped.npz: $(VENV)/.dev  ## presses of every family, on pads of their own
-	$(BIN)/python -m train.data.make_presses $@ --count 100000 --seed 1
-
-data/gripped4.npz: $(VENV)/.dev  ## the same, four taps each, turned by 5 degrees
-	$(BIN)/python -m train.data.make_presses $@ --count 6000 --taps 4 --schedule turns --seed 2
+	$(BIN)/python -m train.data.make_presses $@ --count 24000 --per-pad 48 --seed 67
 
 data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
-	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 3
+	$(BIN)/python -m train.data.make_presses $@ --count 8000 --taps 4 --seed 66
 
 data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
-	$(BIN)/python -m train.data.make_presses $@ --count 8000 --taps 7 --seed 4
-
-data/more4.npz: $(VENV)/.dev  ## as many again
-	$(BIN)/python -m train.data.make_presses $@ --count 40000 --taps 4 --seed 5
-
-data/more7.npz: $(VENV)/.dev
-	$(BIN)/python -m train.data.make_presses $@ --count 10000 --taps 7 --seed 6
+	$(BIN)/python -m train.data.make_presses $@ --count 2500 --taps 7 --seed 65
 
 data/named4.npz: $(VENV)/.dev  ## the paper's figures, four taps each
-	$(BIN)/python -m train.data.make_presses $@ --families paper --count 20000 --taps 4 --seed 41
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 5000 --taps 4 --seed 63
 
 data/named7.npz: $(VENV)/.dev  ## the same, seven taps each
-	$(BIN)/python -m train.data.make_presses $@ --families paper --count 2500 --taps 7 --seed 42
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 1500 --taps 7 --seed 64
 
 data/nominal4.npz: $(VENV)/.dev  ## the same as the paper has it: one pad, turned by 5 degrees from tap to tap
-	$(BIN)/python -m train.data.make_presses $@ --families paper --count 5000 --taps 4 --schedule turns --spread 0 --seed 43
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 3000 --taps 4 --schedule turns --spread 0 --seed 61
+
+data/nominal7.npz: $(VENV)/.dev  ## the same, seven taps each
+	$(BIN)/python -m train.data.make_presses $@ --families paper --count 2000 --taps 7 --schedule turns --spread 0 --seed 62
 
 data/validation.npz: $(VENV)/.dev  ## as many of each family, on other pads, to set things by
 	$(BIN)/python -m train.data.make_presses $@ --families even --count 2520 --per-pad 10 --taps 7 --seed 1000001

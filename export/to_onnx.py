@@ -1,6 +1,6 @@
 """Checkpoints to ONNX: one file a model, fixed shapes, the contract inside, parity checked before it is written.
 
-python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr4.pt --out edge/models
+python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr.pt --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --int8 data/gripped.npz --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 
@@ -22,6 +22,7 @@ from edge.errors import EdgeError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
+from edge.inference.trust import Trust
 from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.graphs.graph import known_width, outputs, to_model
@@ -39,7 +40,7 @@ from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_fit import half_width_mm
-from train.learning.trust_limits import TrustFit, load_trust
+from train.learning.trust_limits import load_trust
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
@@ -94,6 +95,7 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
         traction_scale=given[2].shape[-1] // pad.cols if len(given) > 2 else None,
         takes_poses=net.takes_poses,
         reach_mm=REACH_MM if net.takes_poses else 0.0,
+        unposed_taps=1 if net.takes_poses else net.taps,
     )
 
 
@@ -105,9 +107,8 @@ def export(
     batch: int | str = 1,
     calibration: PressSet | None = None,
     validation: Sequence[FrozenSet] = (),
-    trust: TrustFit | None = None,
+    trust: Trust | None = None,
     intervals: IntervalData | None = None,
-    one_tap: str | None = None,
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
@@ -122,7 +123,6 @@ def export(
         validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
         trust: forward model and checks for the contract; None for none.
         intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
-        one_tap: name of the model in `folder` by which one that takes poses infers single taps; None for its own.
     """
     net, report = load_network(checkpoint)
     write_out(net)
@@ -131,9 +131,7 @@ def export(
     level = contract.contact_level
     if intervals is not None and contract.interval_factor is not None:
         report = {**report, "options": {**report["options"], "intervals": True}}
-    writer = Writer(folder, frozen, validation, report, trust, one_tap)
-    if one_tap is not None and net.takes_poses:  # before minutes of tracing
-        writer.model_of_one_tap("float32" if calibration is None else "int8")
+    writer = Writer(folder, frozen, validation, report, trust)
     if intervals is not None:
         found = intervals.corrected(net, level)
         net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
@@ -188,15 +186,11 @@ def main(arguments: list[str] | None = None) -> None:
     add("--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them")
     help_of_intervals = "training presses on which intervals are fitted"
     add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
-    add("--trust", type=Path, metavar="FILE", help="with --validation: forward model and checks of train.trust")
-    help_of_one_tap = "model in --out by which networks that take poses infer single taps (default: the network itself)"
-    add("--one-tap", metavar="NAME", help=help_of_one_tap)
+    add("--trust", type=Path, metavar="FILE", help="checks of train.trust, with --validation, or those of a model")
     add("--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training")
     help_of_int8 = "write NAME-int8.onnx too, with ranges from these taps"
     add("--int8", type=Path, nargs="+", metavar="DATA", help=help_of_int8)
     options = parser.parse_args(arguments)
-    if options.trust is not None and options.validation is None:
-        parser.error("--trust needs --validation, on which limits are set")
     if options.intervals is not None and options.validation is None:
         parser.error("--intervals needs --validation")
     lines: list[str] = []
@@ -204,7 +198,7 @@ def main(arguments: list[str] | None = None) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
-        trust = intervals = None
+        presses = intervals = None
         if options.validation is None:
             validation = confidence_sets(paper_taps("validation"), frozen.scale)
         else:
@@ -212,8 +206,7 @@ def main(arguments: list[str] | None = None) -> None:
             validation = [freeze_presses(presses, SEED).as_frozen_set()]
             training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
             intervals = IntervalData(presses, training)
-            if options.trust is not None:
-                trust = load_trust(options.trust, presses)
+        trust = None if options.trust is None else load_trust(options.trust, presses)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
                 checkpoint,
@@ -224,7 +217,6 @@ def main(arguments: list[str] | None = None) -> None:
                 validation=validation,
                 trust=trust,
                 intervals=intervals,
-                one_tap=options.one_tap,
             )
             sys.stdout.write(line + "\n")
             lines.append(line)

@@ -29,8 +29,7 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
-from export.graphs.graph import ONE_TAP, contract_in, in_float, network_of, origin_of, outputs
-from export.graphs.joined import branches
+from export.graphs.graph import contract_in, in_float, outputs
 from export.graphs.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
@@ -45,10 +44,10 @@ from export.graphs.parity import (
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
-from train.errors import TrainError
+from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import load_network
 from train.networks.blocks import PatternNet
-from train.networks.fusion import OneOrMoreNet
+from train.networks.graph_weights import network_of, origin_of
 
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
@@ -106,12 +105,12 @@ def verify(
     try:
         contract = contract_in(model)
         net = _network(path, model, contract, checkpoints)
-    except (ModelError, ExportError) as error:
+    except (ModelError, ExportError, CheckpointError) as error:
         raise type(error)(f"{path}: {error}") from error
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
     if recordings is not None:
         groups["recordings"] = recorded_windows(recordings, contract)
-    if contract.takes_poses:  # a single tap may have a graph of its own
+    if contract.takes_poses:
         groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
     expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
@@ -177,8 +176,6 @@ def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints
         source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
         net, report = load_network(source)
         trained = report.get("training_sha256")
-        if branches(model) is not None:
-            net = OneOrMoreNet(load_network(checkpoints / f"{origin_of(model)[ONE_TAP]['name']}.pt")[0], net)
     else:
         source = in_float(path)
         if not source.exists():

@@ -1,13 +1,13 @@
-"""Train the bundled networks from nothing to their final error, or one network by name; in one seeded run.
+"""Train the bundled networks on from their bundled weights, or one network by name; in one seeded run.
 
     python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
     torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
     python -m train.fit checkpoints --data data/nominal4.npz --network mtsr2 --start-from seed-stsr --steps 5000
 
-The network of one tap and the small one are trained from nothing, those of several taps from the one of one. Older taps
-and the pads' constants are dropped at random in training, so that a network works with fewer taps than it takes and
-without constants. An interrupted run resumes with the same command. `tensorboard --logdir checkpoints/logs` shows its
-progress.
+The bundled networks are trained for as many steps, that of one tap and that of several taps, so that taps alone tell
+them apart. Older taps and the pads' constants are dropped at random in training, so that a network works with fewer
+taps than it takes and without constants. An interrupted run resumes with the same command.
+`tensorboard --logdir checkpoints/logs` shows its progress.
 """
 
 import argparse
@@ -28,19 +28,25 @@ from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
 from train.physics.pad_draws import KNOWN
 from train.physics.sensor_noise import Nuisances
+from train.surfaces.poses import MAX_TAPS
 
-GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.06, 0.12, 0.14, 0.42, 0.05, 0.05, 0.16)}
+GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.3, 0.14, 0.1, 0.25, 0.04, 0.04, 0.13)}
 """Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses."""
 
 _KNOWN: Final = {"known": KNOWN}
 _COMPACT: Final = ("compact-", "small-", "fusion-")
 """Networks that take constants of the pad and give deviations."""
+
+
+def _trained_on(name: str, network: str, taps: int = 1) -> Training:
+    recipe = Recipe(steps=10_000, learning_rate=1e-3, given=GIVEN[taps], bf16=True)
+    return Training(name, network, recipe, start=f"{name}.onnx", options=_KNOWN)
+
+
 BUNDLED: Final = (
-    Training("stsr", "compact-stsr", Recipe(steps=24_000, learning_rate=3e-3), options=_KNOWN),
-    Training("stsr-small", "small-stsr", Recipe(steps=8000, learning_rate=3e-3), options=_KNOWN),
-    Training("mtsr4", "compact-mtsr4", Recipe(3000, learning_rate=7e-4, given=GIVEN[4]), start="stsr", options=_KNOWN),
-    Training("mtsr2", "compact-mtsr2", Recipe(1000, learning_rate=4e-4, given=GIVEN[2]), start="mtsr4", options=_KNOWN),
-    Training("mtsr7-wide", "fusion-mtsr7", Recipe(steps=56_000, given=GIVEN[7]), start="stsr", options=_KNOWN),
+    _trained_on("stsr", "compact-stsr"),
+    _trained_on("stsr-small", "small-stsr"),
+    _trained_on("mtsr", "fusion-mtsr7", MAX_TAPS),
 )
 
 
@@ -52,7 +58,7 @@ def given_taps(taps: int) -> tuple[float, ...]:
 
 
 def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
-    """Train the bundled networks, one from another; `shorten` divides their steps, for tests.
+    """Train the bundled networks on; `shorten` divides their steps, for tests.
 
     Raises:
         DatasetError: no sequence has as many taps as a network takes.
@@ -137,7 +143,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
     one("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
     one("--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)")
-    one("--start-from", metavar="NAME", help="checkpoint in the same folder to start from")
+    one("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
     one("--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)")
     one("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
     one("--steps", type=int, default=9000)

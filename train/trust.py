@@ -1,6 +1,6 @@
 """Fit the forward model and the checks by which a model states which patterns are not to be believed, into one file.
 
-    python -m train.trust checkpoints/trust.json --data data/gripped.npz data/gripped4.npz
+    python -m train.trust checkpoints/trust.json --data data/gripped.npz data/taps4.npz
 
 `export.to_onnx` puts them into the contract of every model of the same folder, with limits set on validation presses.
 """
@@ -17,29 +17,23 @@ from firmware_bridge.in_place import write_in_place
 from train.data.presses import PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
 from train.learning.contact_check import fit_contact_network
-from train.learning.tap_checks import fit_posed_tap_network, fit_tap_network
+from train.learning.tap_checks import fit_tap_network
 from train.learning.trust_limits import fit_forward_model
 
 
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
-    """Fit forward model, check of contacts, and checks of earlier taps by schedule and by pose; limits come at export.
+    """Fit forward model, check of contacts, and check of earlier taps by their poses; limits come at export.
 
     Raises:
-        DatasetError: no sequence has several taps that were only turned.
+        DatasetError: no sequence has several taps.
     """
     several = presses.pick(np.flatnonzero(presses.counts.any(axis=(2, 3, 4)).sum(axis=1) > 1))
-    turned = several.only_turned()
-    taps = turned.counts.any(axis=(2, 3, 4)).sum(axis=1)
-    if not len(taps):
-        raise DatasetError("no sequences of turned taps: add a file of 'make_presses --taps 4 --schedule turns'")
-    most = int(np.bincount(taps).argmax())  # sequences of one length, of which there are the most
-    turned = turned.pick(np.flatnonzero(taps == most)).with_taps(most)
-    steps = max(20_000 // shorten, 1)
+    if not len(several):
+        raise DatasetError("no sequences of several taps: add a file of 'make_presses --taps 4'")
     return {
         "forward": fit_forward_model(presses).to_json(),
         "contact": fit_contact_network(presses, seed, max(40_000 // shorten, 1)).to_json(),
-        "tap": fit_tap_network(turned, seed, steps).to_json(),
-        "posed_tap": fit_posed_tap_network(several, seed, steps).to_json(),
+        "tap": fit_tap_network(several, seed, max(20_000 // shorten, 1)).to_json(),
         "data_sha256": presses.sha256(),
     }
 

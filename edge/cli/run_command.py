@@ -75,9 +75,9 @@ def run(
         name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
         model = None
         if not stop.is_set():
-            path = find_model(name)  # first, or a name with a slip would wait for links that are slow to open
+            find_model(name)  # first, or a name with a slip would wait for links that are slow to open
             source.begin()  # its links open while the model loads
-            model = load_model(path, stop=stop)
+            model = load_model(name, stop=stop)
         if model is None:
             return
         scores = sys.stderr if stdout_taken else sys.stdout

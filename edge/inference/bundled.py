@@ -1,5 +1,6 @@
 """Models and demo recording that come with the package."""
 
+import re
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +14,10 @@ CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
 DEFAULT_MODEL: Final = "stsr-int8"
 """Model that assumes nothing of earlier taps."""
 INT8_SUFFIX: Final = "-int8"
-POSED_MODEL: Final = "mtsr7-int8"
-"""Default where poses of the pad come: it combines up to 7 taps, and gives for one alone what DEFAULT_MODEL gives."""
+POSED_MODEL: Final = "mtsr-int8"
+"""Default where poses of the pad come: it combines up to 7 taps."""
+_OF_TAPS: Final = re.compile(r"(?<=^mtsr)[2-7](?=-int8$|$)")
+"""Number of taps in the paper's names: mtsr4 is mtsr, given four taps at most."""
 
 
 def bundled_models() -> list[Path]:
@@ -26,7 +29,7 @@ def find_model(name: str | Path) -> Path:
     """Return the file of a model: a path, or a bundled name, with or without .onnx.
 
     A name without its precision is the best file there is: that in float32, or where an installation lacks it, such as
-    the wheel, that in 8-bit integers.
+    the wheel, that in 8-bit integers. The names mtsr2 to mtsr7 mean the file mtsr, see `taps_of`.
 
     Raises:
         ModelError: there is none; the message lists the bundled ones.
@@ -34,13 +37,24 @@ def find_model(name: str | Path) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    stem = path.name.removesuffix(".onnx")
+    stem = _stem(name)
     folder = path.parent if path.parent.name else BUNDLE_DIR
-    for file in (folder / f"{stem}.onnx", folder / f"{stem}{INT8_SUFFIX}.onnx"):
-        if stem and file.is_file():
-            return file
+    for of_taps in (stem, _OF_TAPS.sub("", stem)):
+        for file in (folder / f"{of_taps}.onnx", folder / f"{of_taps}{INT8_SUFFIX}.onnx"):
+            if stem and file.is_file():
+                return file
     bundled = ", ".join(model.name for model in bundled_models()) or "none"
     raise ModelError(f"no model '{name}': neither a file nor bundled (bundled: {bundled})")
+
+
+def taps_of(name: str | Path) -> int | None:
+    """Return the number of taps that a bundled name states and its file does not: 4 of mtsr4; None of all others."""
+    stated = _OF_TAPS.search(_stem(name))
+    return int(stated[0]) if stated and not _OF_TAPS.search(find_model(name).stem) else None
+
+
+def _stem(name: str | Path) -> str:
+    return Path(name).name.removesuffix(".onnx")
 
 
 def demo_recording() -> Path:

@@ -17,7 +17,7 @@ from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
-CONTRACT_VERSION: Final = 8
+CONTRACT_VERSION: Final = 9
 TAP_ORDER: Final = "newest first"
 INPUT_NAME: Final = "window"
 PAD_NAME: Final = "pad"
@@ -85,6 +85,7 @@ class Contract:
     interval_levels: dict[str, list[float]] = field(default_factory=dict)
     takes_poses: bool = False
     reach_mm: float = 0.0
+    unposed_taps: int = 1
 
     @property
     def window_shape(self) -> Shape:
@@ -176,7 +177,7 @@ class Contract:
 
     def read_trust(self) -> Trust | None:
         """Return the forward model and the checks; None if the model has none."""
-        return trust_of(self.trust, len(self.pad_inputs), poses=self.takes_poses)
+        return trust_of(self.trust, len(self.pad_inputs))
 
     def scale_window(
         self, deformation_counts: NDArray[np.float32], gains: NDArray[np.float32] | None = None
@@ -240,7 +241,7 @@ def _check(values: Mapping[str, Any]) -> None:
         if not is_kept:
             raise ModelError(f"contract key '{key}' is {_shown(values[key])}, expected {expected}")
     try:
-        trust = trust_of(values["trust"], len(values["pad_inputs"]), poses=values["takes_poses"])
+        trust = trust_of(values["trust"], len(values["pad_inputs"]))
         readings = len(AXES) * values["rows"] * values["cols"]
         if trust is not None and trust.forward.operator.shape[1] != readings:
             raise ValueError(f"for {trust.forward.operator.shape[1]} readings, the sensor has {readings}")
@@ -292,6 +293,7 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     yield "traction_scale", is_scale, f"a whole number from 1 to {most}, or null for a model without traction"
     numbers = len(AXES) * taxels * (scale or 0) ** 2
     yield "traction_scale", numbers <= MOST_PIXELS, f"tractions of at most {MOST_PIXELS} numbers"
+    yield "unposed_taps", _is_whole(values["unposed_taps"], values["taps"]), "a whole number from 1 to `taps`"
     least_mm = LEAST_UNIT if values["takes_poses"] else 0
     reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
     yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach

@@ -1,8 +1,8 @@
 """Check of a model file before onnxruntime reads it: one plain graph with its own weights, of bounded size.
 
-onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever: only the two
-branches of an If may be such. The walk covers the fields that lead to them and to the operators, skips all else, and
-refuses what it does not understand. Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
+covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
+Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
 Gather GatherElements Gelu Gemm GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual GridSample GroupNormalization
-HardSigmoid HardSwish Identity If InstanceNormalization LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
+HardSigmoid HardSwish Identity InstanceNormalization LayerNormalization LeakyRelu Less LessOrEqual Log LogSoftmax
 MatMul MatMulInteger Max MaxPool Mean Min Mish Mul Neg Not Or PRelu Pad Pow QLinearConv QLinearMatMul QuantizeLinear
 Reciprocal ReduceL2 ReduceMax ReduceMean ReduceMin ReduceSum ReduceSumSquare Relu Reshape Resize Round Selu Shape
 Sigmoid Sign Sin Slice Softmax Softplus Softsign SpaceToDepth Split Sqrt Squeeze Sub Sum Tanh Tile Transpose Unsqueeze
@@ -41,7 +41,7 @@ _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
 
 _SIDE_FILE: Final = "keeps its weights in a side file, expected one file"
-_NESTED: Final = "has graphs within its graph, expected one plain graph, or the branches of an If"
+_NESTED: Final = "has graphs within its graph, expected one plain graph"
 _BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX file"
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
@@ -52,10 +52,7 @@ _LOCATION: Final = 14
 _OPERATOR: Final = 4
 _DOMAIN: Final = 7
 _TENSOR: Final[_Message] = {13: _SIDE_FILE}
-_IN_BRANCH: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
-_BRANCH_NODE: Final[_Message] = {5: _IN_BRANCH}
-_BRANCH: Final[_Message] = {1: _BRANCH_NODE, 5: _TENSOR, 15: _SPARSE}
-_ATTRIBUTE: Final[_Message] = {**_IN_BRANCH, 6: _BRANCH}
+_ATTRIBUTE: Final[_Message] = {5: _TENSOR, 6: _NESTED, 10: _TENSOR, 11: _NESTED, 22: _SPARSE, 23: _SPARSE}
 _NODE: Final[_Message] = {5: _ATTRIBUTE}
 _GRAPH: Final[_Message] = {1: _NODE, 5: _TENSOR, 15: _SPARSE}
 _MODEL: Final[_Message] = {7: _GRAPH, 20: _NESTED, 25: _NESTED}
@@ -99,7 +96,7 @@ def check_plain(content: bytes) -> None:
     fields = nodes = 0
     while waiting:
         message, start, end = waiting.pop()
-        nodes += message is _NODE or message is _BRANCH_NODE
+        nodes += message is _NODE
         if nodes > MOST_NODES:
             raise ModelError(f"has more than {MOST_NODES} operators, expected a smaller graph")
         dims: list[int] = []
@@ -117,7 +114,7 @@ def check_plain(content: bytes) -> None:
                     raise ModelError(_SIDE_FILE)
                 if field.number == _DIMS:
                     dims += _dims(content, field)
-            if (message is _NODE or message is _BRANCH_NODE) and field.number in (_OPERATOR, _DOMAIN):
+            if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
         # Four bits are the least that an element takes.
         if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):

@@ -4,6 +4,7 @@ import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,13 +62,16 @@ class ModelSession:
         traction: of the last run, (3, h, w) or (n, 3, h, w) float32 in [kPa], as `deviation`.
     """
 
-    def __init__(self, path: Path, threads: int = 1, stop: threading.Event | None = None) -> None:
+    def __init__(
+        self, path: Path, threads: int = 1, stop: threading.Event | None = None, *, taps: int | None = None
+    ) -> None:
         """Load, check and warm up.
 
         Args:
             path: of the model.
             threads: number of threads that share the work of one run.
             stop: event that ends the loading early.
+            taps: most taps that are given to a model that takes more, with poses; the name then states them.
 
         Raises:
             ModelError: the file is no model that is allowed, its graph does not keep its contract, or loading takes
@@ -89,6 +93,9 @@ class ModelSession:
             raise ModelError(f"{path}: {error}") from error
         except UnicodeDecodeError as error:
             raise ModelError(f"{path}: its names or its contract are not UTF-8: export it again") from error
+        if taps is not None:
+            self.contract = replace(self.contract, taps=taps, unposed_taps=taps)
+            self.name = self.name.replace("mtsr", f"mtsr{taps}", 1)
         self._runs: dict[tuple[int, int], BoundRun] = {}
         self._options = onnxruntime.RunOptions()
         # onnxruntime looks this entry up at every run, and where it is missing throws and catches an exception.
@@ -143,8 +150,7 @@ class ModelSession:
     ) -> NDArray[np.float32]:
         """Infer the patterns (n, H, W) of several windows, of different sensors, in one call; see `run`.
 
-        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps;
-        those of a single tap are a call of their own, because a model may have a graph of its own for them.
+        A graph of one window a run is called once for each. With poses, windows may have different numbers of taps.
         """
         for window in windows:
             self._check_window(window)
@@ -179,24 +185,8 @@ class ModelSession:
         for window, row in zip(windows, rows, strict=True):
             _check_poses(row, len(window))
         present = [_present(window) for window in windows]
-        groups = [[index for index, taps in enumerate(present) if (taps == 1) is alone] for alone in (True, False)]
-        found = [
-            self._called(
-                [windows[index][: present[index]] for index in group],
-                [pads[index] for index in group],
-                [rows[index][: present[index]] for index in group],
-            ).outputs
-            for group in groups
-            if group
-        ]
-        if len(found) == 1:
-            return found[0]
-        order = np.argsort(np.concatenate(groups))
-        pattern, deviation, traction = (
-            None if any(part is None for part in parts) else np.concatenate(parts)[order]
-            for parts in zip(*found, strict=True)
-        )
-        return pattern, deviation, traction  # pyright: ignore[reportReturnType]  # every run has patterns
+        given, stated = ([one[:taps] for one, taps in zip(all_, present, strict=True)] for all_ in (windows, rows))
+        return self._called(given, pads, stated).outputs
 
     def _called(
         self,

@@ -5,7 +5,6 @@ not depend on the force but for its size. Networks and limits travel in a model'
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -74,53 +73,35 @@ def contact_features(tap: NDArray[np.float32], pad_row: NDArray[np.float32]) -> 
     return features
 
 
-def pair_width(readings: int, *, poses: bool) -> int:
+def pair_width(readings: int) -> int:
     """Return the number of features of a pair of taps with so many readings each."""
-    return 2 * readings + 2 + (_POSE_FEATURES if poses else 2)
-
-
-def tap_features(window: NDArray[np.float32], steps: Sequence[int] | None = None) -> NDArray[np.float32]:
-    """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
-
-    Args:
-        window: (K, 3, rows, cols) in network units, newest tap first.
-        steps: turns of the schedule from the newest tap to each earlier one; by default 1, 2, ...
-    """
-    features = _pair_features(window, pair_width(window[0].size, poses=False))
-    features[:, -2] = np.arange(1, len(window)) if steps is None else steps
-    np.square(features[:, -2], out=features[:, -1])
-    return features
+    return 2 * readings + 2 + _POSE_FEATURES
 
 
 def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the features (K - 1, inputs) of the earlier taps of a window with poses, each beside the newest one.
+    """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
 
-    The pose stands in place of the turns of the schedule: place, sine and cosine of the turn, and the errors of both.
+    They are the newest tap, its difference to the earlier one, the sizes of both, and the earlier tap's pose: place,
+    cosine and sine of the turn, and the errors of both.
 
     Args:
         window: (K, 3, rows, cols) in network units, newest tap first.
         poses: (K, 5), as edge.inference.pose_input makes them.
     """
-    features = _pair_features(window, pair_width(window[0].size, poses=True))
-    posed, earlier = features[:, -_POSE_FEATURES:], poses[1:]
-    turn = np.radians(earlier[:, 2])
-    np.multiply(earlier[:, :2], 1 / PLACE_MM, out=posed[:, :2])
-    np.cos(turn, out=posed[:, 2])
-    np.sin(turn, out=posed[:, 3])
-    np.minimum(earlier[:, 3:] / ERROR_UNITS, MOST_ERROR, out=posed[:, 4:])
-    return features
-
-
-def _pair_features(window: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Return features (K - 1, width) with the newest tap, its difference to each earlier one, and the sizes of both."""
     readings = window[0].size
-    features = np.empty((len(window) - 1, width), dtype=np.float32)
+    features = np.empty((len(window) - 1, pair_width(readings)), dtype=np.float32)
     newest, differences = features[:, :readings], features[:, readings : 2 * readings]
     features[:, 2 * readings] = math.log(_put_shape(window[0], newest[0]))
     newest[1:] = newest[0]
     for row, tap in enumerate(window[1:]):
         features[row, 2 * readings + 1] = math.log(_put_shape(tap, differences[row]))
     differences -= newest
+    posed, earlier = features[:, -_POSE_FEATURES:], poses[1:]
+    turn = np.radians(earlier[:, 2])
+    np.multiply(earlier[:, :2], 1 / PLACE_MM, out=posed[:, :2])
+    np.cos(turn, out=posed[:, 2])
+    np.sin(turn, out=posed[:, 3])
+    np.minimum(earlier[:, 3:] / ERROR_UNITS, MOST_ERROR, out=posed[:, 4:])
     return features
 
 
@@ -151,13 +132,12 @@ class Trust:
         return {name: getattr(self, name).to_json() for name in _KEYS}
 
 
-def trust_of(value: Any, constants: int, *, poses: bool = False) -> Trust | None:
+def trust_of(value: Any, constants: int) -> Trust | None:
     """Return what `Trust.to_json` has made of it, for a model that takes so many constants; None if it is empty.
 
     Args:
         value: as read from a file.
         constants: of the pad that the model takes.
-        poses: True for a model that takes poses, whose check of earlier taps takes them, too.
 
     Raises:
         ValueError: it is damaged, or of other constants; the message names the part.
@@ -169,7 +149,7 @@ def trust_of(value: Any, constants: int, *, poses: bool = False) -> Trust | None
     forward = forward_model(value["forward"], constants)
     contact, tap = check_of(value["contact"]), check_of(value["tap"])
     readings = forward.operator.shape[1]
-    expected = {"contact": (contact, readings + 1 + 2 * constants + 1), "tap": (tap, pair_width(readings, poses=poses))}
+    expected = {"contact": (contact, readings + 1 + 2 * constants + 1), "tap": (tap, pair_width(readings))}
     for name, (check, inputs) in expected.items():
         if check.network.inputs != inputs:
             raise ValueError(f"{name} takes {check.network.inputs} features, expected {inputs}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
 from edge.inference.expected_error import doubt
-from edge.inference.trust import Trust, contact_features, pose_tap_features, tap_features
+from edge.inference.trust import Trust, contact_features, pose_tap_features
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]
@@ -122,11 +122,11 @@ class PatternCheck:
         """Return how little each earlier tap belongs to the newest one: 0 to 1, and from 0.5 it does not.
 
         The window is (K, 3, rows, cols) in network units, newest first, of so many taps; poses (K, 5) as model input.
+        Taps of a model that takes no poses are not checked.
         """
-        check = self._trust.tap
-        if taps < 2:
+        if taps < 2 or poses is None:
             return []
-        features = tap_features(window[:taps]) if poses is None else pose_tap_features(window[:taps], poses[:taps])
+        check, features = self._trust.tap, pose_tap_features(window[:taps], poses[:taps])
         return [_share(score - check.limit) for score in check.network(features)]
 
     def judge(

@@ -35,7 +35,7 @@ class Check:
         `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
-        if self._check is None or window.taps < 2 or step.doubted:
+        if self._check is None or window.taps < 2 or window.poses is None or step.doubted:
             return every, None
         belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
         posed = step.pose is not None and window.poses is not None

@@ -112,7 +112,7 @@ class Taps:
         self._most = contract.taps if options.taps is None else options.taps
         self._on_counts = options.contact_on_counts
         posed = contract.takes_poses
-        self._poses = TapPoses(contract, options.taps or 1, report) if posed else None
+        self._poses = TapPoses(contract, options.taps or contract.unposed_taps, report) if posed else None
         self.advice = TapAdvice(contract.reach_mm, self._most) if posed else None
 
     def __call__(self, step: Step, track: PoseTrack | None) -> None:

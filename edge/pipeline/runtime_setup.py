@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from edge.inference.bundled import TAXELS, find_model
+from edge.inference.bundled import TAXELS, find_model, taps_of
 from edge.inference.model_interface import Model
 from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
@@ -26,7 +26,7 @@ def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None
     """Load a model and its contract.
 
     Args:
-        model: a file, or the name of a bundled one.
+        model: a file, or the name of a bundled one; mtsr2 to mtsr7 take as many taps at most.
         threads: number of threads that share the work of one run.
         stop: event that ends the loading early.
 
@@ -37,7 +37,7 @@ def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None
     check_whole("threads", threads, 1)
     from edge.inference.onnx_session import ModelSession
 
-    return ModelSession(find_model(model), threads, stop)
+    return ModelSession(find_model(model), threads, stop, taps=taps_of(model))
 
 
 def open_runtime(

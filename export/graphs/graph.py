@@ -1,20 +1,17 @@
-"""Networks to ONNX graphs and back: fixed shapes except for the batch, one file, without traces of the machine.
+"""Networks to ONNX graphs: fixed shapes except for the batch, one file, without traces of the machine.
 
 A float32 graph has the weights under the network's own names, and next to its contract the name of the network, so that
-parity can be checked without the checkpoint. Networks whose batch normalisation was folded into the weights, those of
+train.networks.graph_weights can restore it. Networks whose batch normalisation was folded into the weights, those of
 the paper, need their checkpoint.
 """
 
-import json
 import logging
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import onnx
 import torch
-from onnx import numpy_helper
 from torch import Tensor, nn
 
 from edge.inference.bundled import INT8_SUFFIX
@@ -30,22 +27,14 @@ from edge.inference.contract import (
 )
 from edge.inference.pose_input import POSE_WIDTH
 from export.errors import ExportError
-from export.graphs.joined import branches
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.blocks import PatternNet
-from train.networks.fusion import OneOrMoreNet
-from train.networks.registry import build
-from train.networks.symmetric import write_out
 
 OPSET: Final = 18
 _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
 """Argument of a network's forward for each input of its graph."""
 _TRACED: Final = 2
 """Windows with which a graph of any batch is traced: with one window, the tracer would take the size 1 as fixed."""
-
-ORIGIN_KEY: Final = "tactile.origin"
-ONE_TAP: Final = "one_tap"
-"""Key of the origin of a graph's branch for a single tap, with the name of that model."""
 
 
 def to_model(net: PatternNet, batch: int | str = 1, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
@@ -127,55 +116,3 @@ def contract_in(model: onnx.ModelProto) -> Contract:
 def in_float(path: Path) -> Path:
     """Return the path of the float32 graph of NAME-int8.onnx; for NAME.onnx its own."""
     return path.with_name(path.stem.removesuffix(INT8_SUFFIX) + path.suffix)
-
-
-def origin(report: Mapping[str, Any]) -> dict[str, str]:
-    """Return the metadata that identify a graph's network, from a checkpoint's report.
-
-    Fine-tuning for int8 changes the weights, and so makes another network.
-    """
-    stated = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
-    stated |= {ONE_TAP: report[ONE_TAP]} if ONE_TAP in report else {}
-    return {ORIGIN_KEY: json.dumps(stated, sort_keys=True)}
-
-
-def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
-    """Return the metadata that identify a graph's network.
-
-    Raises:
-        ExportError: the metadata are missing.
-    """
-    stated = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
-    if stated is None:
-        raise ExportError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
-    return json.loads(stated)
-
-
-def network_of(model: onnx.ModelProto) -> PatternNet:
-    """Return the network of a float32 graph, in evaluation mode.
-
-    Raises:
-        ExportError: the graph does not identify its network, or lacks its weights.
-    """
-    made, parts = origin_of(model), branches(model)
-    if parts is None:
-        return _restored(made, model.graph)
-    if ONE_TAP not in made:
-        raise ExportError(
-            f"the graph has a branch for a single tap, but '{ORIGIN_KEY}' no '{ONE_TAP}': export it again"
-        )
-    one, more = parts
-    return OneOrMoreNet(_restored(made[ONE_TAP], one), _restored(made, more)).eval()
-
-
-def _restored(made: Mapping[str, Any], graph: onnx.GraphProto) -> PatternNet:
-    net = build(made["network"], made["scale"], **made["options"])
-    write_out(net)
-    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in graph.initializer}
-    lacking = [name for name in net.state_dict() if name not in held]
-    if lacking:
-        raise ExportError(
-            f"the graph does not hold {lacking[0]} and {len(lacking) - 1} more weights: name its checkpoint"
-        )
-    net.load_state_dict({name: held[name].reshape(value.shape) for name, value in net.state_dict().items()})
-    return net.eval()

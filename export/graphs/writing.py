@@ -11,16 +11,13 @@ import onnx
 
 from edge.evaluation.evaluate import judge_model, mean_error
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session
+from edge.inference.trust import Trust
 from edge.terminal.progress_bar import tracked
-from export.errors import ExportError
-from export.graphs.graph import ONE_TAP, contract_in, origin, origin_of
-from export.graphs.joined import joined, with_one_tap
 from firmware_bridge.in_place import write_in_place
 from train.learning.expected_error_table import fit_confidence
-from train.learning.trust_limits import TrustFit
+from train.networks.graph_weights import origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +32,7 @@ class Writer:
     frozen: FrozenSet
     validation: Sequence[FrozenSet]
     report: Mapping[str, Any]
-    trust: TrustFit | None = None
-    one_tap: str | None = None
+    trust: Trust | None = None
 
     def error(self, single: onnx.ModelProto, contract: Contract) -> dict[str, float]:
         """Return the mean errors of a graph of one window or any number, with all taps; empty if it is not judged."""
@@ -44,29 +40,10 @@ class Writer:
             return {}
         return mean_error(judge_model(self._session("judged", single, contract), self.frozen))
 
-    def model_of_one_tap(self, arithmetic: str) -> onnx.ModelProto:
-        """Return the model that infers single taps.
-
-        Raises:
-            ExportError: it cannot be read.
-        """
-        path = self.folder / f"{self.one_tap}{INT8_SUFFIX if arithmetic == 'int8' else ''}.onnx"
-        try:
-            return onnx.load(path)
-        except OSError as error:
-            raise ExportError(
-                f"{path}: {error.strerror}: export the model for single taps to this folder first"
-            ) from error
-
     def write(
         self, name: str, model: onnx.ModelProto, single: onnx.ModelProto, contract: Contract, facts: Sequence[str]
     ) -> str:
         """Write NAME.onnx, and return the line that describes it."""
-        stated = {**self.report, "training_sha256": contract.training_sha256}
-        if self.one_tap is not None and contract.takes_poses:
-            one = self.model_of_one_tap(contract.arithmetic)
-            stated[ONE_TAP] = origin_of(one) | {"name": self.one_tap}
-            model, contract = joined(one, model), with_one_tap(contract, contract_in(one))
         # The evaluated graph is the written one wherever the runtime can run it.
         session = self._session(name, model if contract.batch == ANY_BATCH else single, contract)
         parts = [f"x{contract.scale}"]
@@ -83,8 +60,8 @@ class Writer:
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
         if self.trust is not None and contract.pad_inputs and contract.traction_scale:
-            contract.trust.update(self.trust.of(contract).to_json())
-        content = _content(model, contract, origin(stated))
+            contract.trust.update(self.trust.to_json())
+        content = _content(model, contract, origin(self.report))
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
         write_in_place(self.folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
         return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*parts, *facts])}"

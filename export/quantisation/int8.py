@@ -26,7 +26,6 @@ from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from edge.inference.pose_input import scheduled_rows
 from export.errors import ExportError
-from export.graphs.joined import branches
 from export.graphs.parity import batches
 from export.quantisation.integer_nodes import PASSING_ON, integer_nodes, newest_values, takes_poses
 from firmware_bridge.pad_geometry import AXES
@@ -166,8 +165,7 @@ def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
         options.optimized_model_filepath = str(path)
         onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
         optimised = onnx.load(path)
-    nodes = [node for graph in branches(optimised) or [optimised.graph] for node in graph.node]
-    kinds = [node.op_type for node in nodes if "Conv" in node.op_type]
+    kinds = [node.op_type for node in optimised.graph.node if "Conv" in node.op_type]
     return kinds.count("QLinearConv"), len(kinds)
 
 

@@ -24,7 +24,7 @@ from edge.inference.bundled import BUNDLE_DIR, find_model
 from edge.inference.onnx_session import ModelSession
 
 FROZEN = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-MTSR2 = Subject("mtsr2", str(find_model("mtsr2")))
+MTSR = Subject("mtsr", str(find_model("mtsr")))
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +77,8 @@ def test_the_page_is_what_was_shown_with_a_head(bench):
 
 
 def test_the_error_is_that_of_the_contract():
-    contract = ModelSession(find_model("mtsr2")).contract
-    rows = list(error_rows(MTSR2, FROZEN))
+    contract = ModelSession(find_model("mtsr")).contract
+    rows = list(error_rows(MTSR, FROZEN))
     assert [row.given for row in rows] == [1, 2]
     for row in rows:
         expected = contract.test_error[str(row.given)]
@@ -98,12 +98,12 @@ def test_force_is_what_patterns_sum_up_to_by_the_true_patterns_own_factor():
 def test_a_model_of_another_scale_is_refused():
     coarse = replace(FROZEN, unit_patterns=FROZEN.unit_patterns[:, :16, :16])
     with pytest.raises(ModelError, match="'scale' is 10, the test set's is 4"):
-        list(error_rows(MTSR2, coarse))
+        list(error_rows(MTSR, coarse))
 
 
 def test_all_that_is_bundled_is_measured():
     names = [subject.name for subject in subjects(10, None, print)]
-    assert names[:3] == ["bilinear", "linear map", "bicubic"] and {"stsr", "mtsr4", "stsr-int8"} <= set(names)
+    assert names[:3] == ["bilinear", "linear map", "bicubic"] and {"stsr", "mtsr", "stsr-int8"} <= set(names)
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_the_taps_in_miniature(tmp_path, tmp_path_factory):
     assert [row["off mm"] for row in tables["wrong-poses"]][:4] == ["0.2", "0.5", "1.0", "2.0"]
     assert all(row["over one tap, not stated"] and row["left out %, stated"] for row in tables["wrong-poses"])
     paper = [(row["model"], row["taps"]) for row in tables["paper"]]
-    assert paper == [("stsr-int8", "1"), ("mtsr4-int8", "4"), ("mtsr7-int8", "4"), ("mtsr7-int8", "7")]
+    assert paper == [("stsr-int8", "1"), ("mtsr-int8", "2"), ("mtsr-int8", "4"), ("mtsr-int8", "7")]
     found = [row["PSNR dB"] for row in tables["paper"]]
     assert all(one != other for one, other in pairwise(found)), "each sees something else"
     assert [bool(row["over one tap"]) for row in tables["paper"]] == [False, True, True, True]

@@ -25,13 +25,14 @@ from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
 from export.errors import ExportError, ParityError
-from export.graphs.graph import network_of, origin_of, to_model
+from export.graphs.graph import to_model
 from export.graphs.parity import GraphRun, differences, read_windows
 from export.to_onnx import export, main
 from train.errors import CheckpointError
 from train.learning.checkpoint import infer, load_network
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
+from train.networks.graph_weights import network_of, origin_of
 from train.networks.registry import build
 from train.networks.symmetric import write_out
 

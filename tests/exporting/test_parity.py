@@ -16,8 +16,7 @@ from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import scheduled_rows
 from export import verify as verify_module
-from export.errors import ExportError, ParityError
-from export.graphs.graph import network_of
+from export.errors import ParityError
 from export.graphs.parity import (
     LEVELS,
     GraphRun,
@@ -29,6 +28,8 @@ from export.graphs.parity import (
 from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
+from train.errors import CheckpointError
+from train.networks.graph_weights import network_of
 
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
@@ -101,7 +102,7 @@ def test_most_convolutions_run_in_integers(name):
     integer, every = convolutions(model)
     # Of the largest grid: all but the three that give the outputs.
     # Of the network with poses what encodes earlier taps as well, and those of its graph of one tap.
-    assert (integer, every) == {"stsr-small-int8": (10, 22), "mtsr7-int8": (34, 62)}.get(name, (14, 26))
+    assert (integer, every) == {"stsr-small-int8": (10, 22), "mtsr-int8": (20, 36)}.get(name, (14, 26))
     assert convolutions(graph_of(name.removesuffix("-int8"))[0])[0] == 0
     assert {output.type.tensor_type.elem_type for output in model.graph.output} == {onnx.TensorProto.FLOAT}
 
@@ -151,14 +152,14 @@ def test_the_network_is_made_again_from_its_graph(name):
     net = network_of(model)
     assert (net.taps, net.scale, net.training) == (contract.taps, contract.scale, False)
     del model.metadata_props[:]
-    with pytest.raises(ExportError, match=r"'tactile\.origin' is missing"):
+    with pytest.raises(CheckpointError, match=r"'tactile\.origin' is missing"):
         network_of(model)
 
 
 def test_a_graph_without_its_weights_asks_for_the_checkpoint():
     model, _ = graph_of("stsr")
     model.graph.initializer[0].name = "folded"
-    with pytest.raises(ExportError, match=r"does not hold .* name its checkpoint"):
+    with pytest.raises(CheckpointError, match=r"does not hold .* name its checkpoint"):
         network_of(model)
 
 
@@ -204,7 +205,7 @@ def test_integers_that_say_something_else_break_the_bound(monkeypatch, pattern_f
 @pytest.mark.parametrize(
     ("beside", "complaint"),
     [
-        ({"stsr.onnx": "mtsr2"}, r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"),
+        ({"stsr.onnx": "stsr-small"}, r"stsr-int8\.onnx: .*stsr\.onnx is of another training than the model"),
         ({}, r"the float32 model stsr\.onnx is not in the folder of its int8 model"),
     ],
 )
@@ -237,7 +238,7 @@ def test_a_difference_is_a_share_of_full_scale_or_of_what_is_larger():
 
 
 def test_windows_are_of_every_force_and_stiff_ones_beside():
-    _, contract = graph_of("mtsr4")
+    _, contract = graph_of("mtsr")
     step = read_windows(frozen(), contract)
     assert step.shape[1:] == (12, 4, 4) and 50 < len(step) < 250 < len(read_windows(frozen(), contract, None))
     stiff = extreme_windows(contract)

@@ -134,7 +134,7 @@ def commands_and_poses(folder: Path) -> Outcome:
     write_csv(folder / "press.csv", pressed([PRESSES[0]] * 4))
     results = []
     with api.open_recording(folder / "press.csv", rate_hz=100.0) as source:
-        runtime = api.open_runtime("mtsr7-int8", source)
+        runtime = api.open_runtime("mtsr-int8", source)
         for result in api.Stream(source, runtime):
             number = result.scan.number
             if number % 40 == 0 and number > 100:

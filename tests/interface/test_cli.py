@@ -29,7 +29,7 @@ def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_po
     recording = tmp_path / "rest.csv"
     header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
     recording.write_text("\n".join([header, *[",".join(["30000.0"] * 48)] * 3, ""]))
-    for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr7-int8")):
+    for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr-int8")):
         done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
         assert {record["model"] for record in records(done.stdout)} == {model}
 

@@ -91,7 +91,7 @@ class TestBundle:
         assert bundle.find_model("mtsr4") == models / "mtsr4.onnx" and bundle.find_model("stsr").read_text() == "mine"
 
     def test_what_is_missing_is_told(self, models):
-        for name in ("mtsr", "mtsr4.onn", "", "none/mtsr4.onnx"):
+        for name in ("mtsr9", "mtsr4.onn", "", "none/mtsr4.onnx"):
             with pytest.raises(ModelError, match=r"no model.*bundled: mtsr4.onnx, stsr.onnx"):
                 bundle.find_model(name)
         with pytest.raises(UsageError, match=r"demo.npz is missing"):

@@ -5,6 +5,7 @@ import pytest
 from edge_samples import FakeModel
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
+from edge.inference.pose_input import scheduled_rows
 from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, strangers
 
 CONTRACT = make_trusted_contract()
@@ -179,11 +180,13 @@ class TestBelonging:
         window = np.zeros((4, 3, 4, 4), dtype=np.float32)
         window[:, 2].reshape(4, -1)[:, FOREIGN_TAXEL] = 3, 3, 0, 3
         window[2, 2, 3, 3] = 3
-        shares = make_check().belonging(window, 4)
+        check, poses = make_check(), scheduled_rows(4, 5.0)
+        shares = check.belonging(window, 4, poses)
         assert [share >= 0.5 for share in shares] == [False, True, False] and all(0 <= one <= 1 for one in shares)
-        assert len(make_check().belonging(window, 3)) == 2 and make_check().belonging(window, 1) == []
+        assert len(check.belonging(window, 3, poses)) == 2 and check.belonging(window, 1, poses) == []
+        assert check.belonging(window, 4) == [], "a model that takes no poses has no such check"
         window[1, 0, 0, 0] = np.nan
-        assert make_check().belonging(window, 4)[0] >= 0.5
+        assert check.belonging(window, 4, poses)[0] >= 0.5
 
     @pytest.mark.parametrize(
         ("shares", "alone", "with_those_before"),

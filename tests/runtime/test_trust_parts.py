@@ -27,7 +27,7 @@ from edge.inference.small_network import (
     small_network,
     unpacked,
 )
-from edge.inference.trust import check_of, contact_features, tap_features, trust_of
+from edge.inference.trust import check_of, contact_features, trust_of
 
 GAIN_ERROR = 0.075
 
@@ -82,7 +82,7 @@ class TestTrust:
         made = make_trust()
         again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
         assert again is not None
-        row = np.linspace(-1, 1, 100, dtype=np.float32)
+        row = np.linspace(-1, 1, 104, dtype=np.float32)
         assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
         assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
         for name in ("operator", "noise", "model_error"):
@@ -247,12 +247,3 @@ class TestFeatures:
         assert (light[49:] == pad).all() and (firm[49:] == pad).all()
         tap[:], tap[0, 0, 0] = 0, 1e6
         assert np.abs(contact_features(tap, pad)[0, :48]).max() <= 12, "a large reading beside none is bounded"
-
-    def test_those_of_a_pair_are_of_shapes_and_steps(self):
-        one, other = np.random.default_rng(0).uniform(1, 3, (2, 3, 4, 4)).astype(np.float32)
-        (found,) = tap_features(np.stack([one, other]), (3,))
-        assert found.shape == (100,) and found[98:].tolist() == [3, 9]
-        assert tap_features(np.stack([one, one]))[0, 48:96] == pytest.approx(0, abs=1e-6)
-        assert tap_features(np.stack([one, 10 * other]), (3,))[0, :96] == pytest.approx(found[:96], abs=0.05)
-        earlier, one_more = tap_features(np.stack([one, other, one]))
-        assert earlier[98:].tolist() == [1, 1] and one_more[98:].tolist() == [2, 4]

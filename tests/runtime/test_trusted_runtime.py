@@ -10,6 +10,7 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, WrongModel, make_trusted_contract
 
 from edge.errors import EdgeError
+from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.pad_geometry import USPA44, USPA46
@@ -22,7 +23,8 @@ ELSEWHERE = 10
 
 
 def make_pad(model=None, options=EVERY, **settings):
-    model = model or FakeModel(make_trusted_contract())
+    posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+    model = model or FakeModel(make_trusted_contract(**posed))
     return Pushed(make_runtime(model, options=options, **settings), taxel=FOREIGN_TAXEL, noise=3)
 
 

@@ -105,10 +105,9 @@ def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> P
 
 
 def posed_models(folder: Path) -> None:
-    """Write fused.onnx, which takes poses, and one.onnx, by which it infers single taps."""
+    """Write fused.onnx, which takes poses."""
     validation = freeze_presses(POSED_PRESSES, 1).as_frozen_set()
     fit_network(FUSED, POSED_PRESSES, validation, folder)
-    fit_network(Training("one", "compact-stsr", Recipe(3, batch=8), options=OPTIONS), POSED_PRESSES, validation, folder)
     net, _ = load_network(folder / "fused.pt")
     torch.manual_seed(0)
     assert isinstance(net, FusionNet)
@@ -119,5 +118,4 @@ def posed_models(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_fit, "_STEPS", 50)
         intervals = IntervalData(POSED_PRESSES, POSED_PRESSES)
-        for name in ("one", "fused"):
-            export(folder / f"{name}.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals, one_tap="one")
+        export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals)

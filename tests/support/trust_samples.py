@@ -40,14 +40,14 @@ def make_forward() -> ForwardModel:
 def make_trust() -> Trust:
     """Return checks: x on taxel 0 is unfamiliar, and so is an earlier tap that was less on the newest one's taxel 5."""
     contact = Check(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
-    tap = Check(linear(2 * 48 + 4, {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
+    tap = Check(linear(pair_width(48), {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
     return Trust(make_forward(), contact, tap)
 
 
 def make_posed_trust(farthest_mm: float) -> Trust:
     """Return checks of a model that takes poses: an earlier tap belongs up to a distance along x."""
     trust = make_trust()
-    width = pair_width(48, poses=True)
+    width = pair_width(48)
     tap = Check(linear(width, {width - POSE_WIDTH - 1: 20 * PLACE_MM}), 20 * farthest_mm)
     return Trust(trust.forward, trust.contact, tap)
 

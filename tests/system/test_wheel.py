@@ -98,7 +98,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
         "xela_controller",
     }, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
-        *("mtsr2-int8.onnx", "mtsr4-int8.onnx", "mtsr7-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
+        *("mtsr-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
         *("contacts.npz", "demo.npz", "taxels.npz"),
     }
 

@@ -11,7 +11,7 @@ from firmware_bridge.poses.pad_pose import PadPose
 from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.learning import tap_checks
-from train.learning.tap_checks import fit_posed_tap_network, posed_pair_features, posed_tap_check, relative
+from train.learning.tap_checks import fit_tap_network, pair_features, relative, tap_check
 
 TAPS = 4
 WIDE_MM = 4.0
@@ -45,18 +45,18 @@ def test_relative_poses_are_those_that_a_pad_is_seen_at():
 
 @pytest.fixture(scope="module")
 def network():
-    return fit_posed_tap_network(bumps(300, 0), seed=0, steps=300)
+    return fit_tap_network(bumps(300, 0), seed=0, steps=300)
 
 
 def shares_caught(network, presses, spoil):
     """Return the share of earlier taps that a check at a share of false alarms catches, after `spoil` of a pair."""
-    check = posed_tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
+    check = tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
     rng = np.random.default_rng(5)
     readings, poses = tap_checks._strong(presses, 5)
     pose = poses[:, 1]
     stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), (0.2, 1.0))
     pair, stated = spoil(readings[:, :2], stated)
-    return float((np.array(network(posed_pair_features(pair, stated))) > check.limit).mean())
+    return float((np.array(network(pair_features(pair, stated))) > check.limit).mean())
 
 
 def test_right_taps_are_seldom_dropped_and_wrong_ones_mostly(network):

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
+from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch, PosedBatches, PressBatches, network_input
 from train.data.presses import PressSet
@@ -31,11 +33,13 @@ from train.learning.training_loop import (
 )
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.graph_weights import network_of, origin_of
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
 _INFERRED_AT_ONCE: Final = 128
+_GRAPH: Final = ".onnx"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Training:
     network: str  # a name of train.networks.registry
     recipe: Recipe
     scale: int = 10  # pattern pixels per taxel pitch
-    start: str | None = None  # checkpoint whose weights it starts from
+    start: str | None = None  # checkpoint whose weights it starts from, or NAME.onnx of a bundled model
     seed: int = 1  # of weights and draws
     options: dict[str, Any] = field(default_factory=dict)  # further arguments of the network's class
     keep: float = 0.0  # share of the weights it starts from in the final ones
@@ -76,7 +80,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
     training_sha256 = training.sha256(data_sha256)
-    start_path = None if training.start is None else folder / f"{training.start}.pt"
+    start_path = None if training.start is None else _path_of(training.start, folder)
     start_sha256 = None if start_path is None else _file_sha256(start_path)
     made_of = {"training_sha256": training_sha256, "start_sha256": start_sha256}
     made_of["validation_sha256"] = validation.sha256()
@@ -155,18 +159,27 @@ def batches_of(data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: 
     return PressBatches(data.only_turned() if len(recipe.given) > 1 else data, recipe.given, recipe.batch, seed)
 
 
+def _path_of(start: str, folder: Path) -> Path:
+    return BUNDLE_DIR / start if start.endswith(_GRAPH) else folder / f"{start}.pt"
+
+
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
-    """Load the network of NAME.pt in evaluation mode, with its report from NAME.json.
+    """Load the network of NAME.pt in evaluation mode, with its report from NAME.json, or of a float32 NAME.onnx.
 
     Raises:
         CheckpointError: a file is missing, or the weights do not fit the configuration.
     """
     try:
+        if path.suffix == _GRAPH:
+            model = onnx.load(path)
+            return network_of(model), origin_of(model)
         report = json.loads(path.with_suffix(".json").read_text())
         net = build(report["network"], report["scale"], **report["options"])
         net.load_state_dict(torch.load(path, weights_only=True))
     except DAMAGES as error:
         said = reason(error)
+        if path.suffix == _GRAPH:
+            raise CheckpointError(f"{path} is no model to start from: {said}") from error
         raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
     return net.eval(), report
 

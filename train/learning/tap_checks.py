@@ -1,32 +1,27 @@
-"""Checks that separate earlier taps of a contact from taps of another one or at another pose, with poses or without."""
+"""Check that separates earlier taps of a contact from taps of another one or at another pose."""
 
-from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import permutations
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.small_network import SmallNetwork
-from edge.inference.trust import Check, pair_width, pose_tap_features, tap_features
+from edge.inference.trust import Check, pair_width, pose_tap_features
 from edge.perception.pattern_check import LEAST_COUNTS
 from train.data.press_batches import in_units, read_presses, stated_poses
 from train.data.presses import PressSet
-from train.learning.contact_check import fit_classifier, limited, moved
+from train.learning.contact_check import fit_classifier, limited
 from train.networks.symmetric import moved_scans
 from train.physics.sensor_noise import Nuisances
 
-_ROUNDS: Final = 4
-"""Readings of each sequence, and of its mirror image, each by another sensor."""
-_WEIGHT_DECAY: Final = 0.3
-"""So much, because sequences of several taps are few: with a hundredth of it limits rose to seven and more."""
 _DEPTHS: Final = (0.85, 1.15)
-_POSED_ROUNDS: Final = 3
+_ROUNDS: Final = 3
 """Readings of each sequence, each by another sensor, and half of them of mirror images."""
 _PAIRS: Final = 6
 """Pairs of taps of each reading of a sequence."""
 _WIDTHS: Final = (192, 96)
-_POSED_WEIGHT_DECAY: Final = 0.1
+_WEIGHT_DECAY: Final = 0.1
 _OFF_MM: Final = (1.5, 6.0)
 _OFF_DEG: Final = (10.0, 90.0)
 """Bounds of the errors of a pose that is wrong, or a tap that is there although the pad did not move."""
@@ -39,62 +34,10 @@ _MIRRORED_POSE: Final = np.array([-1, 1, -1], dtype=np.float32)
 
 
 def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
-    """Fit the network to taps turned as the schedule states, and to others."""
-    rng = np.random.default_rng([seed, 5])
-    both = presses, seen_in_a_mirror(presses)
-    right, wrong = [], []
-    for number in range(2 * _ROUNDS):
-        # Turns keep the direction of the schedule, mirror images alone would not.
-        windows = moved(rng, read_twice(both[number % 2], seed + number), mirror=False)
-        taps = presses.taps
-        for newest, earlier in combinations(range(taps), 2):
-            pair, claimed = (windows[:, newest], windows[:, earlier]), earlier - newest
-            right.append(pair_features(*pair, claimed))
-            wrong.append(pair_features(pair[0], pair[1][rng.permutation(len(windows))], claimed))
-            wrong.append(pair_features(pair[1], pair[0], claimed))  # turned back
-        for claimed in range(1, taps):
-            wrong.append(pair_features(windows[:, 0], windows[:, taps], claimed))  # not turned
-        for claimed, true in permutations(range(1, taps), 2):
-            if abs(claimed - true) > 1 or claimed == 1:
-                wrong.append(pair_features(windows[:, 0], windows[:, true], claimed))
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
-
-
-def seen_in_a_mirror(presses: PressSet) -> PressSet:
-    """Return the readings of the sequences' mirror images, the last tap first: so they turn as the schedule does."""
-    return replace(presses, counts=moved_scans(presses.counts[:, ::-1], _MIRROR), angle_deg=-presses.angle_deg[:, ::-1])
-
-
-def read_twice(presses: PressSet, seed: int) -> NDArray[np.float32]:
-    """Return windows (n, K + 1, 3, rows, cols) in counts; the last tap is the newest again, at another depth.
-
-    Only sequences whose taps are all strong enough are kept.
-    """
-    depth = np.random.default_rng([seed, 6]).uniform(*_DEPTHS, (len(presses), 1, 1, 1)).astype(np.float32)
-    counts = np.concatenate([presses.counts, (presses.counts[:, 0] * depth)[:, None]], axis=1)
-    angles = np.concatenate([presses.angle_deg, presses.angle_deg[:, :1]], axis=1)
-    windows = read_presses(replace(presses, counts=counts, angle_deg=angles), Nuisances(), seed)
-    return windows[(windows[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS).all(axis=1)]
-
-
-def pair_features(newest: NDArray[np.float32], earlier: NDArray[np.float32], steps: int) -> NDArray[np.float32]:
-    """Return the features (n, inputs) of pairs of taps, both (n, 3, rows, cols) in counts."""
-    pairs = in_units(np.stack([newest, earlier], axis=1))
-    return np.concatenate([tap_features(pair, (steps,)) for pair in pairs])
-
-
-def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
-    """Return the check whose limit a share of the earlier taps of these presses exceeds."""
-    windows = read_twice(presses, seed)
-    rows = [pair_features(windows[:, 0], windows[:, steps], steps) for steps in range(1, presses.taps)]
-    return limited(network, np.concatenate(rows), false_alarms)
-
-
-def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
     """Fit the network to pairs of taps at poses as stated, and to others."""
     rng = np.random.default_rng([seed, 7])
     right, wrong = [], []
-    for number in range(_POSED_ROUNDS):
+    for number in range(_ROUNDS):
         readings, poses = _strong(presses, seed + number, mirror=number % 2 == 1)
         for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:_PAIRS]:
             there = readings[:, [newest, earlier]].any(axis=(2, 3, 4)).min(axis=1)
@@ -104,12 +47,12 @@ def fit_posed_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetw
             # What is astray in the network's training, by more than a few of its errors, is wrong here.
             off = np.abs(stated[:, 1, :3] - pose)
             near = (np.hypot(*off[:, :2].T) <= _FAR * stated[:, 1, 3]) & (off[:, 2] <= _FAR * stated[:, 1, 4])
-            right.append(posed_pair_features(pair[near], stated[near]))
-            wrong += [posed_pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _POSED_WEIGHT_DECAY)
+            right.append(pair_features(pair[near], stated[near]))
+            wrong += [pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
 
 
-def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
     """Return the check whose limit a share of the earlier taps of these presses exceeds, with usual errors of poses."""
     rng = np.random.default_rng([seed, 8])
     readings, poses = _strong(presses, seed)
@@ -117,13 +60,13 @@ def posed_tap_check(network: SmallNetwork, presses: PressSet, false_alarms: floa
     for earlier in range(1, presses.taps):
         there = readings[:, earlier].any(axis=(1, 2, 3))
         pair, pose = readings[there][:, [0, earlier]], poses[there][:, earlier]
-        rows.append(posed_pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
+        rows.append(pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
     return limited(network, np.concatenate(rows), false_alarms)
 
 
-def posed_pair_features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
+def pair_features(pairs: NDArray[np.float32], poses: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features (n, inputs) of pairs of taps (n, 2, 3, rows, cols) in counts, with poses (n, 2, 5)."""
-    none = np.empty((0, pair_width(int(np.prod(pairs.shape[2:])), poses=True)), np.float32)
+    none = np.empty((0, pair_width(int(np.prod(pairs.shape[2:])))), np.float32)
     return np.concatenate([none, *(pose_tap_features(*one) for one in zip(in_units(pairs), poses, strict=True))])
 
 

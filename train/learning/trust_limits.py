@@ -2,24 +2,25 @@
 
 import json
 import math
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from edge.errors import ModelError
 from edge.inference.contract import Contract
 from edge.inference.forward_model import ForwardModel, condensed, features, forward_model
 from edge.inference.small_network import small_network
-from edge.inference.trust import QUIET_UNITS, Check, Trust
+from edge.inference.trust import QUIET_UNITS, Trust
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.contact_check import contact_check
-from train.learning.tap_checks import posed_tap_check, tap_check
+from train.learning.tap_checks import tap_check
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import Nuisances
 
@@ -29,42 +30,32 @@ FOREIGN: Final = 0.01
 """Share of earlier taps that are dropped although they belong."""
 
 
-@dataclass(frozen=True)
-class TrustFit:
-    """Forward model and checks of `train.trust`, and presses to set their limits by."""
+def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
+    """Return the forward model and checks of a file of train.trust, or of a model, which has the limits of the checks.
 
-    fitted: dict[str, Any]  # content of trust.json
-    validation: PressSet  # of several taps, on pads of their own
-
-    @cached_property
-    def _checks(self) -> tuple[Check, Check, Check]:
-        contact = contact_check(small_network(self.fitted["contact"]), self.validation, UNFAMILIAR)
-        tap = tap_check(small_network(self.fitted["tap"]), self.validation.only_turned(), FOREIGN)
-        posed = posed_tap_check(small_network(self.fitted["posed_tap"]), self.validation, FOREIGN)
-        return contact, tap, posed
-
-    def of(self, contract: Contract) -> Trust:
-        """Return forward model and checks for a model of that contract, the same for all but for those of taps."""
-        contact, tap, posed_tap = self._checks
-        forward = forward_model(self.fitted["forward"], len(contract.pad_inputs))
-        return Trust(forward, contact, posed_tap if contract.takes_poses else tap)
-
-
-def load_trust(path: Path, validation: PressSet) -> TrustFit:
-    """Load the file of train.trust.
+    Args:
+        path: of the file, or NAME.onnx.
+        validation: presses of several taps, on pads of their own, by which limits are set.
 
     Raises:
-        CheckpointError: absent or damaged.
+        CheckpointError: absent or damaged, or without presses to set limits by.
     """
     try:
+        if path.suffix == ".onnx":
+            model = onnx.load(path, load_external_data=False)
+            trust = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props}).read_trust()
+            if trust is None:
+                raise ValueError("this model has no checks")
+            return trust
         fitted = json.loads(path.read_text())
-        forward_model(fitted["forward"], len(INPUTS))
-        for name in ("contact", "tap", "posed_tap"):
-            small_network(fitted[name])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        forward = forward_model(fitted["forward"], len(INPUTS))
+        contact, tap = (small_network(fitted[name]) for name in ("contact", "tap"))
+    except (OSError, ValueError, KeyError, TypeError, DecodeError, ModelError) as error:
         reason = getattr(error, "strerror", None) or error
         raise CheckpointError(f"{path}: {reason}; make it with 'python -m train.trust {path} --data ...'") from error
-    return TrustFit(fitted, validation)
+    if validation is None:
+        raise CheckpointError(f"{path}: its limits are set by presses: give --validation, or a model that has checks")
+    return Trust(forward, contact_check(contact, validation, UNFAMILIAR), tap_check(tap, validation, FOREIGN))
 
 
 _RIDGE: Final = 1e-6

@@ -85,7 +85,8 @@ class FusionNet(CompactNet):
     def take_over(self, start: PatternNet) -> None:
         """Copy a network of one tap, or another one of this kind; what encodes earlier taps starts as its entrance."""
         if isinstance(start, FusionNet):
-            self.load_state_dict(start.state_dict())
+            kept = {name: value for name, value in start.state_dict().items() if not name.startswith("intervals.")}
+            self.load_state_dict(kept)
             return
         super().take_over(start)
         weight = torch.zeros_like(self.enter_earlier.weight)
@@ -99,6 +100,12 @@ class FusionNet(CompactNet):
         for name, variance in zip(("reach_to", "reach_from"), torch.exp(2 * self.log_reach.detach()), strict=True):
             self.register_buffer(name, variance.clone())
         del self.log_reach
+
+    def read_back(self, written: dict[str, Tensor]) -> None:
+        """Add the logarithms of the reaches to the weights of a network that was written out."""
+        if {"reach_to", "reach_from"} <= written.keys():
+            reaches = torch.stack([written["reach_to"].reshape(()), written["reach_from"].reshape(())])
+            written["log_reach"] = torch.log(reaches) / 2
 
     def _reaches(self) -> Sequence[Tensor]:
         if hasattr(self, "reach_to"):
@@ -249,23 +256,3 @@ def _geometry(rows: int, cols: int) -> tuple[NDArray[np.float32], NDArray[np.flo
         ]
     ).reshape(8, -1)
     return here.astype(np.float32), course.astype(np.float32), np.stack([one, away]).astype(np.float32)
-
-
-class OneOrMoreNet(PatternNet):
-    """Network that gives windows of one tap to one network and all others to another, which takes poses."""
-
-    takes_poses = True
-
-    def __init__(self, one: PatternNet, more: PatternNet) -> None:
-        super().__init__()
-        self.one, self.more = one, more
-        self.taps, self.scale, self.known = more.taps, more.scale, getattr(more, "known", 0)
-
-    def forward(
-        self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the outputs of the network for so many taps; arguments as `FusionNet.forward`."""
-        apart = window.ndim == _APART
-        if window.shape[1] == (1 if apart else 3):
-            return self.one(window[:, 0] if apart else window, pad)
-        return self.more(window, pad, poses)

@@ -6,8 +6,7 @@ The bundled models are these, at scale 10:
 |---|---|---|---|
 | stsr | compact-stsr | 64 | 6 |
 | stsr-small | small-stsr | 32 | 4 |
-| mtsr2, mtsr4 | compact-mtsr2, compact-mtsr4 | 64 | 6 |
-| mtsr7 | fusion-mtsr7, and stsr for a window of one tap | 64 | 6 |
+| mtsr | fusion-mtsr7 | 64 | 6 |
 """
 
 from collections.abc import Callable
@@ -29,7 +28,7 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"compact-{name}": (CompactNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items()},
     **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},
-    **{f"small-{name}": (CompactNet, {"taps": taps} | _SMALL) for name, taps in _TAPS.items()},
+    "small-stsr": (CompactNet, {"taps": 1} | _SMALL),
 }
 """Class of each network, and the arguments that options may replace, by name."""
 

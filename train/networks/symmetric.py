@@ -8,7 +8,7 @@ convolution, at the same cost.
 Source: Cohen and Welling 2016, group equivariant convolutional networks, p4 and p4m.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
 from typing import Any, Final, Literal
@@ -180,6 +180,25 @@ def write_out(net: nn.Module) -> nn.Module:
         else:
             write_out(part)
     return net
+
+
+def read_back(net: nn.Module, written: Mapping[str, Tensor]) -> list[str]:
+    """Set a network's weights to those of its copy that was written out, by name, and return the names that lack.
+
+    A part that computes with its parameters before it uses them has a `read_back` of its own.
+    """
+    given = dict(written)
+    for name, part in net.named_modules():
+        if (own := getattr(part, "read_back", None)) is not None:
+            own(given)
+        if isinstance(part, SymmetricConv2d) and {f"{name}.weight", f"{name}.bias"} <= given.keys():
+            part.assign(given[f"{name}.weight"], given[f"{name}.bias"])
+            given |= {f"{name}.{free}": getattr(part, free).detach() for free in ("weight_free", "bias_free")}
+    state = net.state_dict()
+    lacking = [name for name in state if name not in given]
+    if not lacking:
+        net.load_state_dict({name: given[name].reshape(value.shape) for name, value in state.items()})
+    return lacking
 
 
 def symmetries(group: Group) -> list[Callable[[NDArray[np.generic]], NDArray[np.generic]]]:
