@@ -173,11 +173,9 @@ class TestLayout:
 
     @pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc")
     def test_the_documented_reader_in_c_reads(self, sink, name, tmp_path):
-        page = (ROOT / "docs" / "middleware.md").read_text()
-        (tmp_path / "read.c").write_text(page.partition("```c\n")[2].partition("```")[0])
         if subprocess.run(["gcc", "-E", "-"], input=b"#include <zlib.h>", capture_output=True).returncode:
             pytest.skip("there is no zlib.h")
-        command = ["gcc", "-Wall", "-Wextra", "-Werror", "-O2", "read.c", "-lz", "-o", "read"]
+        command = ["gcc", "-Wall", "-Wextra", "-Werror", "-O2", ROOT / "examples" / "shm_read.c", "-lz", "-o", "read"]
         subprocess.run(command, cwd=tmp_path, check=True)
 
         def read(sensor, number, *words, age_ns=0, **changes):

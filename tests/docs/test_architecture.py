@@ -1,0 +1,84 @@
+"""The drawing on the page of the architecture is that of the imports; files, names and values on the page are there."""
+
+import ast
+import re
+from functools import cache
+
+import grimp
+import pytest
+from edge_samples import ROOT
+
+PACKAGES = ("export", "train", "edge", "firmware_bridge")
+WITH_ROOMS = ("edge", "firmware_bridge")
+PAGE = (ROOT / "docs" / "architecture.md").read_text()
+DRAWING = PAGE.partition("```text\n")[2].partition("```")[0].splitlines()
+STEPS, QUESTIONS = (re.findall(start, PAGE, re.MULTILINE) for start in (r"^\d+\. .*(?:\n  .*)*", r"^\| .*`.*"))
+
+
+def drawn():
+    """Return packages and rooms from the top, as package or package.room, and the arrows between them."""
+    places, arrows = [], []
+    for line in DRAWING:
+        left, _, led_to = line.partition("-> ")
+        if names := left.partition(":")[0].split() if ":" in left else left.split()[:1]:
+            package = places[-1].partition(".")[0] if left.startswith(" ") else ""
+            places += [f"{package}.{name}".lstrip(".") for name in names]
+        package = f"{places[-1].partition('.')[0]}." if "." in places[-1] else ""
+        arrows += [(places[-1], package + name) for name in led_to.split()]
+    return places, arrows
+
+
+def imported():
+    """Return packages and rooms that there are, and the arrows that imports make."""
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    places, arrows = set(PACKAGES), set()
+    for module in graph.modules:
+        for other in (module, *graph.find_modules_directly_imported_by(module)):
+            one, two = (name.split(".")[:2] for name in (module, other))
+            if one[0] != two[0]:
+                arrows.add((one[0], two[0]))
+            elif one[0] in WITH_ROOMS and len(one) == len(two) == 2:
+                places.add(".".join(one))
+                arrows |= {(".".join(one), ".".join(two))} if one != two else set()
+    return places, arrows
+
+
+def test_each_room_and_each_import_between_rooms_is_drawn_and_no_other():
+    (places, arrows), (there, made) = drawn(), imported()
+    assert sorted(places) == sorted(there)
+    assert sorted(arrows) == sorted(made)
+    assert [arrow for arrow in arrows if places.index(arrow[0]) > places.index(arrow[1])] == []  # all lead down
+
+
+@cache
+def inside(path):
+    """Return the names in a file, the methods of its classes, and the values that it assigns at its top level."""
+    tree = ast.parse((ROOT / path).read_text())
+    names = {getattr(node, key, None) for node in ast.walk(tree) for key in ("name", "id")}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    methods = {f"{one.name}.{part.name}" for one in classes for part in one.body if isinstance(part, ast.FunctionDef)}
+    return names, methods, {node.target.id: node.value for node in tree.body if isinstance(node, ast.AnnAssign)}
+
+
+@cache
+def all_methods():
+    return {method for package in PACKAGES for path in (ROOT / package).rglob("*.py") for method in inside(path)[1]}
+
+
+@pytest.mark.parametrize("text", STEPS + QUESTIONS)
+def test_each_file_is_there_with_what_is_named_after_it(text):
+    path = None
+    for word in re.findall(r"`([^`\n]+)`", text):
+        name, equals, value = word.partition(" = ")
+        if "/" in word:
+            assert (ROOT / word).exists(), word
+            path = word
+        elif equals:
+            assert ast.literal_eval(inside(path)[2][name]) == ast.literal_eval(value), f"{path}: {word}"
+        elif re.fullmatch(r"\w+(\.\w+)?", word):
+            assert word.partition(".")[0] in inside(path)[0], f"{path}: {word}"
+            assert "." not in word or word in all_methods(), f"{path}: {word}"
+
+
+def test_a_scan_takes_twenty_steps_and_every_row_of_the_index_is_read():
+    assert (len(STEPS), len(QUESTIONS)) == (20, PAGE.partition("| question")[2].count("\n|") - 1)
