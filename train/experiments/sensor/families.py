@@ -31,7 +31,7 @@ from train.physics.gripped import MAX_INDENTATION_MM, SCALE
 from train.physics.sensor_noise import Nuisances
 from train.report import Report, Row, with_interval
 
-TRAINING: Final = World(count=100_000, seed=1)
+TRAINING: Final = World(count=24_000, per_pad=48, seed=67)
 VALIDATION: Final = World(count=2520, taps=7, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
 """Settings of data/gripped.npz and data/validation.npz in the Makefile."""
 _MODEL: Final = (NOTHING, ALL)
