@@ -1,16 +1,14 @@
 """`edge-sr convert`: a recording in another format, with what was recorded of it; nothing is computed."""
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from edge.errors import SinkError, UsageError
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.errors import harmless
 from firmware_bridge.in_place import check_writable, write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -31,7 +29,7 @@ _WITHOUT: Final = {
 """Parts of a recording that are not in the new file, by the endings of both."""
 
 
-def convert(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Write a recording in the format that the new name ends in, or for a CSV a file for each sensor.
 
     Of a new file that cannot be written nothing is left.
@@ -47,7 +45,7 @@ def convert(options: argparse.Namespace) -> None:
     _check_new(target)
     replay = ReplayLink([source], options.rate_hz, paced=False)
     for notice in replay.notices():
-        sys.stderr.write(f"edge-sr: {harmless(notice.text)}\n")
+        err.write(f"edge-sr: {notice.text}\n")
     sensors = [track.sensor for track in replay.recordings[0].tracks]
     files: dict[Path, str | None] = {target: None}
     if ending == ".csv" and len(sensors) > 1:
@@ -58,12 +56,12 @@ def convert(options: argparse.Namespace) -> None:
     for path in files:
         _check_new(path)
     for path, sensor in files.items():
-        _write(replay, path, sensor)
-    _tell(f"not in it: {_WITHOUT[was, ending]}")
+        out.writelines(f"{line}\n" for line in _write(replay, path, sensor))
+    out.write(f"not in it: {_WITHOUT[was, ending]}\n")
 
 
-def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
-    """Write one file, read it back before it gets its name, and report it."""
+def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
+    """Write one file, read it back before it gets its name, and yield what is in it."""
     made: list[Recording] = []
     write = partial(_WRITERS[path.suffix.lower()], replay, sensor=sensor)
     try:
@@ -79,13 +77,9 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
     lasting_s = max(float(replay.times_ns(track.sensor)[-1]) for track in tracks) / 1e9
     emulated = ", EMULATED" if recording.origin == "emulated" else ""
     size_mb = path.stat().st_size / 1e6
-    _tell(f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}")
+    yield f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}"
     if scans < expected:
-        _tell(f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell")
-
-
-def _tell(text: str) -> None:
-    sys.stdout.write(f"{harmless(text)}\n")
+        yield f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell"
 
 
 def _check_new(path: Path) -> None:
