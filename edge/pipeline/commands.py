@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from edge.pipeline.pose_queue import PoseQueue
 from firmware_bridge.scans.scan import is_sensor_name
+
+if TYPE_CHECKING:
+    from edge.perception.runtime import Runtime
 
 READ_BYTES: Final = 1 << 16
 """Bytes of one read: all that a pipe holds, some 500 poses."""
@@ -104,19 +107,7 @@ class Commands:
         return commands
 
 
-class Controlled(Protocol):
-    """Runtime as seen by commands."""
-
-    def reset(self) -> None:
-        """Forget earlier taps."""
-        ...
-
-    def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero one sensor again, or all."""
-        ...
-
-
-def obey(commands: Commands, runtime: Controlled, may_come: Callable[[str], bool] = lambda name: False) -> None:
+def obey(commands: Commands, runtime: "Runtime", may_come: Callable[[str], bool] = lambda name: False) -> None:
     """Carry out the commands that were put since the last call; one for a sensor that `may_come` yet waits for it."""
     for command in commands.poll():
         if command.name == "reset":

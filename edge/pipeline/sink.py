@@ -52,8 +52,7 @@ class Sink(Protocol):
         """Do what is due, several times a second while no scan comes; raises as `write` does."""
 
     def close(self) -> None:
-        """Finish the written records, or raise a SinkError."""
-        ...
+        """Finish the written records, or raise a SinkError; there may be nothing to finish."""
 
 
 @dataclass(frozen=True, slots=True)
