@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, Final, TextIO
 
 from edge.errors import SinkError, UsageError
+from edge.pipeline.sink import RunFacts, check_new
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
@@ -42,7 +43,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
-    _check_new(target)
+    check_new(target)
     replay = ReplayLink([source], options.rate_hz, paced=False)
     for notice in replay.notices():
         err.write(f"edge-sr: {notice.text}\n")
@@ -54,7 +55,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
             parts = [str(number) for number in range(1, len(parts) + 1)]
         files = {target.with_stem(f"{target.stem}-{part}"): name for part, name in zip(parts, sensors, strict=True)}
     for path in files:
-        _check_new(path)
+        check_new(path)
     for path, sensor in files.items():
         out.writelines(f"{line}\n" for line in _write(replay, path, sensor))
     out.write(f"not in it: {_WITHOUT[was, ending]}\n")
@@ -80,15 +81,6 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
     yield f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}"
     if scans < expected:
         yield f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell"
-
-
-def _check_new(path: Path) -> None:
-    if path.exists() or path.is_symlink():
-        raise SinkError(f"{path} exists: give another name, or delete it first")
-    try:
-        check_writable(path)
-    except OSError as error:
-        raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
@@ -120,7 +112,6 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.pipeline.sink import RunFacts
     from edge.sinks.mcap import McapScans
 
     recording = replay.recordings[0]

@@ -2,8 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TextIO
 
 import numpy as np
@@ -48,8 +47,13 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
         out.write(f"{cells}{figures}{times}{default}\n")
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
-    if measure:
-        out.writelines(_notes(paths, took_us))
+    if not measure:
+        return
+    out.write(f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
+    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
+    if uneven:
+        named = ", ".join(uneven)
+        out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
 
 
 def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
@@ -74,10 +78,3 @@ def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
                 bar.advance(ROUND_TICKS)  # not while it measures
     both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
     return [(float(p50), float(p99)) for p50, p99 in both.T]
-
-
-def _notes(paths: list[Path], took_us: list[tuple[float, float]]) -> Iterator[str]:
-    yield f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n"
-    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
-    if uneven:
-        yield f"those of {', '.join(uneven)} are uneven, as on a busy machine: measure again when it is quiet\n"

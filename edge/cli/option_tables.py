@@ -7,8 +7,9 @@ from typing import Any, Final
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.mapping.footprint import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import DEFAULTS
-from edge.terminal.argument_types import counts_per_newton, not_negative, port, positive, whole
+from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
+from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
@@ -79,8 +80,8 @@ RESULTS: Final = (
                "counts; some 1150 counts are 1 N (default %(default)g)", default=DEFAULTS.contact_on_counts),
         Option("--contact-off-counts N", positive, "a tap ends when they fall below N (default %(default)g)",
                default=DEFAULTS.contact_off_counts),
-        Option("--counts-per-newton C", counts_per_newton, "summed z readings for one newton, which gives forces in N; "
-               "edge-sr doctor --weight-g measures it"),
+        Option("--counts-per-newton C", lambda text: positive(text, *PAD_RANGES["counts_per_newton"]),
+               "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
         Option("--idle-reset-s T", positive, "forget earlier taps after T seconds without contact (default "
                "%(default)g)", default=DEFAULTS.idle_reset_s),
         Option("--taps K", whole(1), "combine at most K taps to a pattern (default: as many as the model takes; 1 if "
