@@ -75,8 +75,9 @@ if TYPE_CHECKING:
     from edge.pipeline.array_results import infer
     from edge.pipeline.baseline_capture import take_baselines
     from edge.pipeline.pairing import paired
+    from edge.pipeline.replay_setup import open_recording
     from edge.pose_sources.open_poses import PoseSource, open_poses
-    from firmware_bridge.links.discovery import Found
+    from firmware_bridge.links.discovery import devices
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
 _ON_USE: Final = {
@@ -86,8 +87,10 @@ _ON_USE: Final = {
     "infer": "edge.pipeline.array_results",
     "take_baselines": "edge.pipeline.baseline_capture",
     "paired": "edge.pipeline.pairing",
+    "open_recording": "edge.pipeline.replay_setup",
     "PoseSource": "edge.pose_sources.open_poses",
     "open_poses": "edge.pose_sources.open_poses",
+    "devices": "firmware_bridge.links.discovery",
 }
 __all__ = [
     "DEFAULT_MODEL",
@@ -210,35 +213,6 @@ def open_source(
     return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
 
 
-def open_recording(
-    path: str | Path,
-    *,
-    sensor: str | Path | None = None,
-    zero: bool = False,
-    paced: bool = False,
-    rate_hz: float | None = None,
-) -> Source:
-    """Open a recording as a source, to compute its results again as `edge-sr replay` does.
-
-    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording.
-
-    Args:
-        path: .mcap, .npz or .csv.
-        sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
-        zero: zero from the first 100 scans, instead of using the recorded baselines.
-        paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
-        rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
-
-    Raises:
-        RecordingError: the recording cannot be used.
-        SourceError: its rate is unknown or out of range.
-        SensorFileError: the sensor file cannot be used.
-    """
-    from edge.pipeline import replay_setup as recordings
-
-    return recordings.open_recording(path, sensor=sensor, zero=zero, paced=paced, rate_hz=rate_hz)
-
-
 def open_sink(
     text: str,
     contract: Contract,
@@ -275,10 +249,3 @@ def open_sink(
         fields=fields,
     )
     return forms.open_sink(text, contract, run)
-
-
-def devices() -> "tuple[list[Found], list[str]]":
-    """List what is plugged in with what prevents its use, and what could not be examined and why; opens nothing."""
-    from firmware_bridge.links import discovery as devices
-
-    return devices.devices()

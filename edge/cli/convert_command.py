@@ -1,17 +1,16 @@
 """`edge-sr convert`: a recording in another format, with what was recorded of it; nothing is computed."""
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from edge.errors import SinkError, UsageError
+from edge.pipeline.sink import RunFacts, check_new
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.errors import harmless
-from firmware_bridge.in_place import check_writable, write_in_place
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
@@ -31,7 +30,7 @@ _WITHOUT: Final = {
 """Parts of a recording that are not in the new file, by the endings of both."""
 
 
-def convert(options: argparse.Namespace) -> None:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Write a recording in the format that the new name ends in, or for a CSV a file for each sensor.
 
     Of a new file that cannot be written nothing is left.
@@ -44,10 +43,10 @@ def convert(options: argparse.Namespace) -> None:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
-    _check_new(target)
+    check_new(target)
     replay = ReplayLink([source], options.rate_hz, paced=False)
     for notice in replay.notices():
-        sys.stderr.write(f"edge-sr: {harmless(notice.text)}\n")
+        err.write(f"edge-sr: {notice.text}\n")
     sensors = [track.sensor for track in replay.recordings[0].tracks]
     files: dict[Path, str | None] = {target: None}
     if ending == ".csv" and len(sensors) > 1:
@@ -56,14 +55,14 @@ def convert(options: argparse.Namespace) -> None:
             parts = [str(number) for number in range(1, len(parts) + 1)]
         files = {target.with_stem(f"{target.stem}-{part}"): name for part, name in zip(parts, sensors, strict=True)}
     for path in files:
-        _check_new(path)
+        check_new(path)
     for path, sensor in files.items():
-        _write(replay, path, sensor)
-    _tell(f"not in it: {_WITHOUT[was, ending]}")
+        out.writelines(f"{line}\n" for line in _write(replay, path, sensor))
+    out.write(f"not in it: {_WITHOUT[was, ending]}\n")
 
 
-def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
-    """Write one file, read it back before it gets its name, and report it."""
+def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
+    """Write one file, read it back before it gets its name, and yield what is in it."""
     made: list[Recording] = []
     write = partial(_WRITERS[path.suffix.lower()], replay, sensor=sensor)
     try:
@@ -79,22 +78,9 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> None:
     lasting_s = max(float(replay.times_ns(track.sensor)[-1]) for track in tracks) / 1e9
     emulated = ", EMULATED" if recording.origin == "emulated" else ""
     size_mb = path.stat().st_size / 1e6
-    _tell(f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}")
+    yield f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}"
     if scans < expected:
-        _tell(f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell")
-
-
-def _tell(text: str) -> None:
-    sys.stdout.write(f"{harmless(text)}\n")
-
-
-def _check_new(path: Path) -> None:
-    if path.exists() or path.is_symlink():
-        raise SinkError(f"{path} exists: give another name, or delete it first")
-    try:
-        check_writable(path)
-    except OSError as error:
-        raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
+        yield f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell"
 
 
 def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
@@ -126,7 +112,6 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.pipeline.sink import RunFacts
     from edge.sinks.mcap import McapScans
 
     recording = replay.recordings[0]

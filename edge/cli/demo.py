@@ -358,9 +358,6 @@ class Demo(Sink):
             self._robot.add(result)
         self._scenes.add(result)
 
-    def close(self) -> None:
-        """Do nothing: the demo ends with its source."""
-
     def finish(self) -> None:
         """Print what was not printed while the demo went on."""
         for part in (self._score, self.map):

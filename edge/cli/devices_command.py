@@ -1,5 +1,6 @@
 """`edge-sr devices`: list what is plugged in, what to type to read it, and what prevents its use."""
 
+import argparse
 import json
 from collections.abc import Sequence
 from typing import TextIO
@@ -15,13 +16,13 @@ NOTHING = (
 SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 
-def run(*, as_json: bool, stdout: TextIO) -> None:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Print the devices, opening none, as JSON for programs; raises DeviceError if no adapter is among them."""
     found, notes = devices()
-    if as_json:
-        stdout.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+    if options.json:
+        out.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
     else:
-        stdout.write("".join(f"{line}\n" for line in page(found, notes, columns())))
+        out.write("".join(f"{line}\n" for line in page(found, notes, columns())))
     if not any(one.adapter for one in found):
         raise DeviceError(NOTHING)
 

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import errno
+import importlib
 import math
 import os
 import shlex
@@ -184,28 +185,9 @@ def _bench(arguments: Sequence[str]) -> int:
     return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
-def _models(options: argparse.Namespace) -> None:
-    from edge.cli.models_command import run
-
-    run(measure=options.measure, stdout=sys.stdout)
-
-
-def _devices(options: argparse.Namespace) -> None:
-    from edge.cli.devices_command import run
-
-    run(as_json=options.json, stdout=sys.stdout)
-
-
-def _doctor(options: argparse.Namespace) -> int:
-    from edge.doctor.command import run
-
-    return run(options, sys.stdout, sys.stderr)
-
-
-def _convert(options: argparse.Namespace) -> None:
-    from edge.cli.convert_command import convert
-
-    convert(options)
+def _apart(module: str) -> Callable[[argparse.Namespace], int | None]:
+    """Return the command that a module of its own runs, which is loaded when it is used."""
+    return lambda options: importlib.import_module(module).run(options, sys.stdout, sys.stderr)
 
 
 _ACTIONS: Final[dict[str, Callable[[argparse.Namespace], int | None]]] = {
@@ -213,12 +195,12 @@ _ACTIONS: Final[dict[str, Callable[[argparse.Namespace], int | None]]] = {
     "demo": _demo,
     "record": _record,
     "replay": _replay,
-    "convert": _convert,
+    "convert": _apart("edge.cli.convert_command"),
     "map": _map,
-    "models": _models,
+    "models": _apart("edge.cli.models_command"),
     "baseline": _baseline,
-    "devices": _devices,
-    "doctor": _doctor,
+    "devices": _apart("edge.cli.devices_command"),
+    "doctor": _apart("edge.doctor.command"),
 }
 COMMANDS: Final = (*filter(None, _ACTIONS), "bench")
 

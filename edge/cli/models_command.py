@@ -1,8 +1,8 @@
 """`edge-sr models`: the bundled models with their error, and with --measure their run time on this machine."""
 
+import argparse
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TextIO
 
 import numpy as np
@@ -26,16 +26,16 @@ UNEVEN: Final = 3.0
 """Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine."""
 
 
-def run(*, measure: bool, stdout: TextIO) -> None:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Print the bundled models; raises ModelError if there is none, or one cannot be used."""
     paths = bundled_models()
     if not paths:
         raise ModelError("no models are bundled with this installation")
     models = [load_model(path) for path in paths]
-    took_us = run_times_us(models) if measure else []
+    measure, took_us = options.measure, run_times_us(models) if options.measure else []
     widest = max(len(path.stem) for path in paths)
     times = " p50 us p99 us" if measure else ""
-    stdout.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
+    out.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
     for index, (path, model) in enumerate(zip(paths, models, strict=True)):
         contract = model.contract
         error = contract.test_error.get(str(contract.taps), {})
@@ -45,10 +45,15 @@ def run(*, measure: bool, stdout: TextIO) -> None:
         cells = f"{path.stem:{widest}s} {contract.taps:4d} {path.stat().st_size / 1e6:4.1f} {contract.arithmetic:10s}"
         times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
         default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
-        stdout.write(f"{cells}{figures}{times}{default}\n")
-    stdout.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
-    if measure:
-        stdout.writelines(_notes(paths, took_us))
+        out.write(f"{cells}{figures}{times}{default}\n")
+    out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
+    if not measure:
+        return
+    out.write(f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
+    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
+    if uneven:
+        named = ", ".join(uneven)
+        out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
 
 
 def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
@@ -73,10 +78,3 @@ def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
                 bar.advance(ROUND_TICKS)  # not while it measures
     both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
     return [(float(p50), float(p99)) for p50, p99 in both.T]
-
-
-def _notes(paths: list[Path], took_us: list[tuple[float, float]]) -> Iterator[str]:
-    yield f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n"
-    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
-    if uneven:
-        yield f"those of {', '.join(uneven)} are uneven, as on a busy machine: measure again when it is quiet\n"

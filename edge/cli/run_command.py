@@ -36,6 +36,7 @@ from edge.api import (
 )
 from edge.cli.run_options import runtime_options
 from edge.cli.user_commands import user_commands
+from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.status_line import MessageSink
 from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
@@ -89,11 +90,11 @@ def run(
             source,
             contextlib.ExitStack() as closing,
         ):
-            hint = partial(_silence_hint, options.source, source)
+            hint = partial(silence_hint, options.source, source.counters)
             unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
             messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
-            facts = {"contract": model.contract, "source": source, "fields": options.fields}
-            opener = partial(open_sink, **facts, stop=stop, commands=commands)
+            given = {"contract": model.contract, "source": source, "fields": options.fields}
+            opener = partial(open_sink, **given, stop=stop, commands=commands)
             if view is not None:
                 view.begin(source.name, source.kind, model.name, opener, messages.say, player)
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
@@ -195,12 +196,6 @@ def recorded_text(made_s: float, now_s: float) -> str:
         f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
     )
     return f"recorded on {time.strftime('%Y-%m-%d at %H:%M', time.localtime(made_s))}, {ago}"
-
-
-def _silence_hint(sources: Sequence[str], source: Source) -> str:
-    from edge.pipeline.silence_hint import silence_hint
-
-    return silence_hint(sources, source.counters)
 
 
 def _tell(line: str) -> None:

@@ -2,12 +2,16 @@
 
 from typing import Final, NamedTuple
 
+from edge.cli import option_tables as of
+from edge.cli.option_tables import Group
+
 
 class Help(NamedTuple):
-    """Help of a command: what follows its name, what it does, and what stands below its options."""
+    """Help of a command: what follows its name, what it does, its options, and what stands below them."""
 
     usage: str
     about: str
+    groups: tuple[Group, ...]
     more: str
 
 
@@ -146,33 +150,53 @@ HELP: Final = {
         "[options]\n       edge-sr COMMAND [options]",
         "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
         "pattern: a fine map of how deep an object presses into the pad, in mm.",
+        of.RUN,
         _RUN,
     ),
     "demo": Help(
         "[options]",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
+        (of.DEMO, *of.RESULTS, of.PROCESSOR),
         "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
     ),
-    "record": Help("FILE [options]", "Runs like edge-sr, and records scans, patterns and events.", _RECORD),
-    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", _REPLAY),
-    "convert": Help("FILE NEW", "Writes a recording in another format: that of the ending of the new name.", _CONVERT),
-    "map": Help("[options]", "Runs like edge-sr, and fuses the patterns into a map of the object.", _MAP),
-    "models": Help("[--measure]", "Lists the bundled models, with their error.", ""),
+    "record": Help(
+        "FILE [options]",
+        "Runs like edge-sr, and records scans, patterns and events.",
+        (of.RECORD, *of.RUN),
+        _RECORD,
+    ),
+    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY),
+    "convert": Help(
+        "FILE NEW",
+        "Writes a recording in another format: that of the ending of the new name.",
+        (of.CONVERT,),
+        _CONVERT,
+    ),
+    "map": Help(
+        "[options]",
+        "Runs like edge-sr, and fuses the patterns into a map of the object.",
+        (of.MAP, *of.RUN),
+        _MAP,
+    ),
+    "models": Help("[--measure]", "Lists the bundled models, with their error.", (of.MODELS,), ""),
     "baseline": Help(
         "--out FILE",
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
+        of.BASELINE,
         _BASELINE,
     ),
     "devices": Help(
         "[--json]",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
+        (of.DEVICES,),
         "Exit code: 3 if there is no adapter.",
     ),
     "doctor": Help(
         "[options]",
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
+        of.DOCTOR,
         _DOCTOR,
     ),
 }

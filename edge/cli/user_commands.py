@@ -94,7 +94,6 @@ def terminal_keys(commands: Commands) -> Iterator[None]:
 @contextmanager
 def _given_back_on_signals(keys: Keys) -> Iterator[None]:
     """Restore the terminal before a signal that ends or stops the program has its usual effect."""
-    before: dict[int, Any] = {}
 
     def end(number: int, frame: object) -> None:
         keys.give_back(for_good=True)
@@ -113,18 +112,8 @@ def _given_back_on_signals(keys: Keys) -> Iterator[None]:
         signal.signal(signal.SIGTSTP, stop)
         keys.take()
 
-    ours: dict[int, Any] = {getattr(signal, name): end for name in ENDING if hasattr(signal, name)}
-    ours[signal.SIGTSTP] = stop
-    for number, handler in ours.items():
-        before[number] = signal.getsignal(number)
-        if before[number] != signal.SIG_IGN:  # as under nohup, or in a shell without jobs
-            signal.signal(number, handler)
-    try:
+    with handled(ENDING, end) as before, handled(["SIGTSTP"], stop):
         yield
-    finally:
-        for number, handler in ours.items():
-            if signal.getsignal(number) is handler:
-                signal.signal(number, before[number])
 
 
 @contextmanager

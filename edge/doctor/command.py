@@ -251,7 +251,10 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
         else:
             files = [f"kept in {options.out}"] if kept else []
             files += [f"the former file is now {options.out}{BACKUP_SUFFIX}"] if kept and replaced else []
-            print(*_lines(link, examined.findings, files, stopped_s), sep="\n", file=out)
+            emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
+            early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
+            print(f"{link.name}{emulated}", page(examined.findings, columns()), *files, sep="\n", file=out)
+            print(*wrapped(early + summary(examined.findings), columns()), sep="\n", file=out)
         if failed is not None:
             raise failed
         if stop.is_set():
@@ -259,11 +262,3 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return EXIT_STOPPED
     return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
-
-
-def _lines(link: Link, findings: list[Finding], files: list[str], stopped_s: float | None) -> list[str]:
-    """Return the findings for a person; the visit was stopped after `stopped_s`, or None."""
-    emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
-    early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
-    shown = [f"{link.name}{emulated}", page(findings, columns()), *files]
-    return [*shown, *wrapped(early + summary(findings), columns())]

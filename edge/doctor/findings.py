@@ -66,17 +66,12 @@ def summary(findings: Iterable[Finding]) -> str:
 def page(findings: Sequence[Finding], columns: int) -> str:
     """Return all findings as text, those of the link first, in lines of `columns` at most unless a word is wider."""
     lines: list[str] = []
+    indent = " " * (_MARK_WIDTH + 2)
     for sensor in dict.fromkeys(finding.sensor for finding in findings):
         lines.append("link" if sensor is None else f"sensor {sensor}")
-        for finding in findings:
-            if finding.sensor == sensor:
-                lines += _lines(finding, columns)
+        for finding in (one for one in findings if one.sensor == sensor):
+            norm = f" (norm: {finding.norm})" if finding.norm else ""
+            text = f"{finding.name}: {finding.measured}{norm}"
+            lines += wrapped(text, columns, f"  {_MARKS[finding.verdict]:{_MARK_WIDTH}}", indent)
+            lines += wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ")
     return "\n".join(lines)
-
-
-def _lines(finding: Finding, columns: int) -> list[str]:
-    norm = f" (norm: {finding.norm})" if finding.norm else ""
-    indent = " " * (_MARK_WIDTH + 2)
-    text = f"{finding.name}: {finding.measured}{norm}"
-    lines = wrapped(text, columns, f"  {_MARKS[finding.verdict]:{_MARK_WIDTH}}", indent)
-    return lines + (wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ") if finding.remedy else [])

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.poses.pad_pose import PadPose
 
+SIZE_MM: Final = 60.0
+PX_PER_MM: Final = 4.0
 MOST_PX: Final = 2000
 """Most pixels along a map's side: its layers take 100 MB."""
 

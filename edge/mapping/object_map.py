@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from edge.errors import UsageError
 from edge.mapping.evidence import CONTACT_LEVEL, weigh
-from edge.mapping.footprint import MOST_PX, Grid, footprint
+from edge.mapping.footprint import MOST_PX, PX_PER_MM, SIZE_MM, Grid, footprint
 from edge.perception.pattern_check import LEAST_COUNTS
 from edge.perception.result import Result
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
 
-SIZE_MM: Final = 60.0
-PX_PER_MM: Final = 4.0
 STEP_MM: Final = 0.5
 """Movement within which patterns are one piece of evidence, about one pixel of a pattern."""
 INDEPENDENT_MM: Final = USPA44.pitch_mm

@@ -16,8 +16,8 @@ from edge.mapping.live_map import MapState
 from edge.mapping.map_files import check_npz, save_npz, save_png
 from edge.mapping.object_map import ObjectMap
 from edge.perception.result import Result
-from edge.pipeline.sink import Sink
-from firmware_bridge.in_place import check_writable, write_in_place
+from edge.pipeline.sink import Sink, check_new
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PadPose
@@ -70,12 +70,7 @@ class MapSink(Sink):
         self._files = [(path, save) for path, save in ((npz, save_npz), (png, save_png)) if path]
         self._first_files = self._files
         for path, _ in self._files:
-            if path.exists():
-                raise SinkError(f"{path} exists: give another name, or delete it first")
-            try:
-                check_writable(path)
-            except OSError as error:
-                raise SinkError(f"cannot write {path}: {error.strerror}") from error
+            check_new(path)
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
         self._clock_ns = clock_ns

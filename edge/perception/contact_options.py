@@ -15,17 +15,7 @@ IDLE_RESET_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class RuntimeOptions:
-    """Options of making results from scans; each field is the flag of its name, and a keyword of `open_runtime`.
-
-    Attributes:
-        contact_on_counts: summed z at which a tap begins.
-        contact_off_counts: summed z below which it ends.
-        idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
-        every_scan: infer also where nothing has changed beyond noise since the last pattern.
-        follow_drift: let the rest level follow the readings of a free pad.
-        learn: learn the gains of the channels from contacts.
-        taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
-            none: its taps then follow the paper's schedule.
+    """Options of making results from scans; each is a flag of its name, and a keyword of `open_runtime`.
 
     Raises:
         UsageError: the contact thresholds, the time or the taps are out of range.

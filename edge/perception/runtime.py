@@ -36,15 +36,12 @@ class Runtime:
         estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
         geometry: of the sensors; refused if the model was not trained for it.
-        baselines: stored baselines by sensor name; a sensor without one is zeroed from its first
-            scans, during which its pad must be still and free.
-        counts_per_newton: summed z per [N], of all sensors or by name; without it a force in newtons is the vendor's,
-            if the scan has one.
+        baselines: stored ones by sensor name, as in `open_runtime`.
+        counts_per_newton: as in `open_runtime`; without it a force in newtons is the vendor's, if the scan has one.
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
-        pad: properties of the pad of all sensors, or of each by name, for models that use them. Counts per newton that
-            it lacks are those above.
+        pad: as in `open_runtime`. Counts per newton that it lacks are those above.
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
-        options: thresholds of taps, and which computations may be omitted.
+        options: the other settings of `open_runtime`.
         clock_ns: measures run time.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
@@ -94,7 +91,6 @@ class Runtime:
         self._pad, self._measured = pad, measured
         self._mounted = frozenset(mountings or ())
         self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
-        self._options = options
         self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
         # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.

@@ -17,10 +17,6 @@ from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEst
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
 
-def _unknown_s() -> float:
-    return math.nan
-
-
 def take_baselines(
     source: Source,
     *,
@@ -47,7 +43,7 @@ def take_baselines(
     check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)
     source.lend()
-    clock = _unknown_s if source.kind == "replay" else time.time  # never today's, of an old file
+    clock = (lambda: math.nan) if source.kind == "replay" else time.time  # never today's, of an old file
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}
     baselines: dict[str, Baseline] = {}

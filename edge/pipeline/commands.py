@@ -3,7 +3,6 @@
 A line is such as {"cmd": "reset"}, or {"cmd": "pose", "x_mm": 1.5, "y_mm": 0}.
 """
 
-import json
 import os
 import select
 import sys
@@ -13,14 +12,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.pose_queue import LONGEST_BYTES, PoseQueue, json_object
 from firmware_bridge.scans.scan import is_sensor_name
+
+if TYPE_CHECKING:
+    from edge.perception.runtime import Runtime
 
 READ_BYTES: Final = 1 << 16
 """Bytes of one read: all that a pipe holds, some 500 poses."""
-LONGEST_LINE_BYTES: Final = 4096
 WAITING: Final = 64
 """Commands that may wait until the loop takes them."""
 
@@ -104,19 +105,7 @@ class Commands:
         return commands
 
 
-class Controlled(Protocol):
-    """Runtime as seen by commands."""
-
-    def reset(self) -> None:
-        """Forget earlier taps."""
-        ...
-
-    def zero(self, name: str | None = None, *, force: bool = False) -> None:
-        """Zero one sensor again, or all."""
-        ...
-
-
-def obey(commands: Commands, runtime: Controlled, may_come: Callable[[str], bool] = lambda name: False) -> None:
+def obey(commands: Commands, runtime: "Runtime", may_come: Callable[[str], bool] = lambda name: False) -> None:
     """Carry out the commands that were put since the last call; one for a sensor that `may_come` yet waits for it."""
     for command in commands.poll():
         if command.name == "reset":
@@ -164,7 +153,7 @@ class CommandLines:
                 data = b""
             self._open = bool(data)
             *lines, partial = (self._partial + (data or b"\n")).split(b"\n")
-            self._partial = partial[: LONGEST_LINE_BYTES + 1]
+            self._partial = partial[: LONGEST_BYTES + 1]
             for line in lines:
                 self._parse(line)
 
@@ -178,14 +167,11 @@ class CommandLines:
     def _parse(self, line: bytes) -> None:
         if not line.strip():
             return
-        try:
-            parsed = json.loads(line) if len(line) <= LONGEST_LINE_BYTES else None
-        except (ValueError, RecursionError):
-            parsed = None
-        if isinstance(parsed, dict) and parsed.get("cmd") == "pose":
+        parsed = json_object(line) or {}
+        if parsed.get("cmd") == "pose":
             self._commands.poses.put_fields(parsed, time.monotonic_ns())
             return
-        command = runtime_command(parsed) if isinstance(parsed, dict) else None
+        command = runtime_command(parsed)
         if command is None:
             shown = ascii(line[:60].decode(errors="replace"))
             self._commands.refuse(f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}")

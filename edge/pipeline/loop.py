@@ -192,8 +192,8 @@ class Loop:
             self._now_ns = first_ns
         intake, statistics = self._intake, self.statistics
         poses = intake.take(recorded, first_ns, self._now_ns)
-        statistics.poses, statistics.poses_refused = intake.used, intake.refused
-        statistics.poses_dropped = intake.dropped
+        statistics.poses, statistics.poses_refused = intake.used, self.poses.refused
+        statistics.poses_dropped = self.poses.dropped
         for sink in self.sinks if poses else ():
             sink.pose(poses)
         for event in intake.look(self._now_ns):

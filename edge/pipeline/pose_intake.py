@@ -2,25 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final
 
 from edge.inference.bundled import POSED_MODEL
 from edge.perception.event import Event
+from edge.perception.runtime import Runtime
 from edge.pipeline.pose_queue import PoseError, PoseQueue
-from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS
 
 REPEATED_NS: Final = 10_000_000_000
 """Time after which the same reason is reported again, in [ns]: a stream of bad poses must not flood."""
-
-
-class Posed(Protocol):
-    """Runtime as seen by poses."""
-
-    def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
-        """Take a pose; False if one at the same time or later was taken before."""
-        ...
 
 
 @dataclass(slots=True)
@@ -37,13 +29,11 @@ class PoseIntake:
 
     Attributes:
         used: poses that the runtime has taken.
-        refused: poses that could not be taken.
-        dropped: poses that nobody took in time.
     """
 
     def __init__(
         self,
-        runtime: Posed,
+        runtime: Runtime,
         queue: PoseQueue,
         *,
         recorded: bool = False,
@@ -64,14 +54,6 @@ class PoseIntake:
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
         self._events: list[Event] = []
-
-    @property
-    def refused(self) -> int:  # noqa: D102 - above
-        return self._queue.refused
-
-    @property
-    def dropped(self) -> int:  # noqa: D102 - above
-        return self._queue.dropped
 
     def take(self, recorded: Sequence[TimedPose], first_scan_ns: int | None, now_ns: int) -> list[TimedPose]:
         """Pass on the poses that wait and those of the source, and return those that the runtime has taken.

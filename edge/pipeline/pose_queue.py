@@ -16,6 +16,19 @@ FURTHEST_AHEAD_NS: Final = 1_000_000_000
 _FIELDS: Final = ("cmd", "x_mm", "y_mm", "turn_deg", "error_mm", "error_deg", "sensor", "time_ns", "holds")
 
 
+LONGEST_BYTES: Final = 4096
+"""Bytes of one message: ten times those of a pose."""
+
+
+def json_object(message: str | bytes) -> dict[str, Any] | None:
+    """Return the object of JSON in a stranger's message; None where it is another thing, or too long."""
+    try:
+        parsed = json.loads(message) if len(message) <= LONGEST_BYTES else None
+    except (ValueError, RecursionError):
+        return None
+    return parsed if isinstance(parsed, dict) else None
+
+
 class PoseError(ValueError):
     """A pose that cannot be taken, with a line for the user and a short name of the reason."""
 
@@ -84,8 +97,6 @@ def _shown(value: object) -> str:
 
 WAITING_POSES: Final = 1024
 """Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""
-LONGEST_BYTES: Final = 4096
-"""Bytes of one message: ten times those of a pose."""
 
 
 class PoseQueue:
@@ -123,11 +134,8 @@ class PoseQueue:
 
     def put_json(self, text: bytes, now_ns: int, sensor: str | None = None) -> None:
         """Put the pose in a message of JSON, of this sensor if it names none, or refuse it."""
-        try:
-            parsed = json.loads(text) if len(text) <= LONGEST_BYTES else None
-        except (ValueError, RecursionError):
-            parsed = None
-        if not isinstance(parsed, dict):
+        parsed = json_object(text)
+        if parsed is None:
             self.refuse(PoseError("json", f'{text[:40]!a} is not JSON such as {{"x_mm": 1.5, "y_mm": 0}}'))
             return
         if parsed.get("sensor") is None:

@@ -26,19 +26,35 @@ from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
 
 
 def open_recording(
-    *files: str | Path,
-    sensor: str | Path | None,
-    zero: bool,
-    paced: bool,
-    rate_hz: float | None,
+    path: str | Path,
+    *more: str | Path,
+    sensor: str | Path | None = None,
+    zero: bool = False,
+    paced: bool = False,
+    rate_hz: float | None = None,
     bar: bool = False,
     player: Player | None = None,
 ) -> Source:
-    """Return the source that plays recordings, each FILE[,FILE], as edge.api.open_recording does; raises the same.
+    """Open a recording as a source, to compute its results again as `edge-sr replay` does.
 
-    It may show its progress in a bar, or be controlled by a player, without an end.
+    Every scan gets a result, however slow the loop is, with the time, mounting and baseline of the recording.
+
+    Args:
+        path: .mcap, .npz or .csv.
+        more: recordings of other sensors, played beside it.
+        sensor: file that `edge-sr doctor` wrote, used instead of the recorded settings.
+        zero: zero from the first 100 scans, instead of using the recorded baselines.
+        paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
+        rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
+        bar: show on a terminal how much of it was taken.
+        player: controls it, and makes it play without an end.
+
+    Raises:
+        RecordingError: the recording cannot be used.
+        SourceError: its rate is unknown or out of range.
+        SensorFileError: the sensor file cannot be used.
     """
-    paths = [path for file in files for path in recording_paths(str(file))]
+    paths = [path for file in (path, *more) for path in recording_paths(str(file))]
     if player is not None:
         replay = PlayedReplay(paths, player, rate_hz)
     else:

@@ -162,11 +162,7 @@ class Stream:
             SinkError: a sink cannot be written; SinkClosedError if its reader has gone.
         """
         while True:
-            while self._made:
-                result = self._next_made()
-                if result is not None:
-                    self._newest.see(result)
-                    yield result
+            yield from self._returned()
             if self.ended and self._error is None:
                 return
             self._step(POLL_S)
@@ -174,11 +170,8 @@ class Stream:
     async def __aiter__(self) -> AsyncIterator[Result]:
         """Yield every result as `__iter__` does, beside other tasks; nothing is lost where one of them cancels it."""
         while True:
-            while self._made:
-                result = self._next_made()
-                if result is not None:
-                    self._newest.see(result)
-                    yield result
+            for result in self._returned():
+                yield result
             if self.ended and self._error is None:
                 return
             await self._step_beside()
@@ -259,6 +252,14 @@ class Stream:
         latest = self._newest.take(sensor, self._clock_ns())
         self._pass_over()
         return latest
+
+    def _returned(self) -> Iterator[Result]:
+        """Yield the results that were made, each as one that an iteration returns."""
+        while self._made:
+            result = self._next_made()
+            if result is not None:
+                self._newest.see(result)
+                yield result
 
     def _next_made(self) -> Result | None:
         """Return the next result; None after an event, which is told instead."""

@@ -3,11 +3,14 @@
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, Protocol
 
+from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import Commands
+from firmware_bridge.in_place import check_writable
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.poses.timed_pose import TimedPose
@@ -52,8 +55,7 @@ class Sink(Protocol):
         """Do what is due, several times a second while no scan comes; raises as `write` does."""
 
     def close(self) -> None:
-        """Finish the written records, or raise a SinkError."""
-        ...
+        """Finish the written records, or raise a SinkError; there may be nothing to finish."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,16 @@ class RunFacts:
     stop: threading.Event = field(default_factory=threading.Event)
     commands: Commands | None = None
     fields: str | None = None
+
+
+def check_new(path: Path) -> None:
+    """Raise a SinkError where a new file cannot be written, before anything is begun."""
+    if path.exists() or path.is_symlink():
+        raise SinkError(f"{path} exists: give another name, or delete it first")
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 NOW: Final = RunFacts()

@@ -24,13 +24,11 @@ _KEPT: Final = 128
 class Ros2Poses:
     """Subscriber in a thread of its own, whose poses go to the queue as they come."""
 
-    def __init__(
-        self, topic: str, queue: PoseQueue, sensor: str | None = None, environment: Mapping[str, str] = os.environ
-    ) -> None:
+    def __init__(self, topic: str, queue: PoseQueue, sensor: str | None = None) -> None:
         """Subscribe to a topic, whichever type of pose is published there, now or later; for a sensor, or for all."""
         self._queue, self._sensor = queue, sensor
         self._clock = StampClock(lambda line: queue.warn("clock", line))
-        self._domain, self._participant = join(environment)
+        self._domain, self._participant = join(os.environ)
         self._end = GuardCondition(self._participant)
         self._waiting = WaitSet(self._participant)
         self._waiting.attach(self._end)

@@ -3,12 +3,11 @@
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from edge import __version__
 from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
@@ -88,11 +87,8 @@ class McapScans(McapFile):
         self._repeat_ns: dict[str, int] = {}
         self._scan, self._baseline = scan_type(run.geometry.taxel_count), baseline_type(run.geometry.taxel_count)
         self._source_told = False
-        release = "0"  # of a checkout
-        with suppress(PackageNotFoundError):
-            release = version("tactile-edge-sr")
         try:
-            super().__init__(path, "ros2", f"tactile-edge-sr {release}", clock_s)
+            super().__init__(path, "ros2", f"tactile-edge-sr {__version__}", clock_s)
             try:
                 for name, fields in (facts or {}).items():
                     self.add_metadata(name, fields)

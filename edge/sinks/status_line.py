@@ -228,6 +228,3 @@ class MessageSink(Sink):
             self._stream.flush()
         except OSError:
             self._stream = None  # the window was closed; that ends no recording
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to finish."""

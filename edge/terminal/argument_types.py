@@ -9,7 +9,6 @@ from typing import Any, Final, NoReturn
 
 from edge import __version__
 from edge.terminal.text_wrap import FEWEST_COLUMNS
-from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.schedule import POSITIVE
 
 MOST_COLUMNS: Final = 80
@@ -81,11 +80,6 @@ def positive(text: str, low: float = POSITIVE[0], high: float = POSITIVE[1]) -> 
     if not low <= value <= high:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number, {low:g} to {high:g}")
     return value
-
-
-def counts_per_newton(text: str) -> float:
-    """Parse the sensitivity of a pad."""
-    return positive(text, *PAD_RANGES["counts_per_newton"])
 
 
 def not_negative(text: str) -> float:

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Self, TextIO, TypeVar
 
@@ -91,15 +91,9 @@ class Progress:
             self._bar.close()
 
 
-def tracked(things: Iterable[_Thing], what: str, unit: str, total: int | None = None) -> Iterator[_Thing]:
-    """Yield things one after the other under a bar; each counts when the next is requested.
-
-    `what` and `unit` are those of Progress; `total` is the number of things, if they have no length.
-    """
-    count = len(things) if total is None and isinstance(things, Sized) else total
-    if count is None:
-        raise TypeError("the sequence has no length: pass `total`")
-    with Progress(what, count, unit) as progress:
+def tracked(things: Collection[_Thing], what: str, unit: str) -> Iterator[_Thing]:
+    """Yield things one after the other under a bar, as for Progress; each counts when the next is requested."""
+    with Progress(what, len(things), unit) as progress:
         for thing in things:
             yield thing
             progress.advance()

@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 END_S: Final = 1.5
 """Time from the signal to the end by force, within the two seconds that are promised."""
@@ -31,8 +31,8 @@ _before_force: list[Callable[[], object]] = []
 
 
 @contextlib.contextmanager
-def handled(names: Iterable[str], handle: Callable[[int, object], object]) -> Iterator[list[int]]:
-    """Handle signals within a with statement, and yield their numbers.
+def handled(names: Iterable[str], handle: Callable[[int, Any], object]) -> Iterator[dict[int, Any]]:
+    """Handle signals within a with statement, and yield their former handlers by number.
 
     Signals that the parent has this program ignore stay ignored: nohup does so with a hang-up, and a shell without jobs
     with the Ctrl-C that is meant for another program in front.
@@ -42,7 +42,7 @@ def handled(names: Iterable[str], handle: Callable[[int, object], object]) -> It
     for number in before:
         signal.signal(number, handle)
     try:
-        yield list(before)
+        yield before
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -110,9 +110,6 @@ class RunSnapshot(Sink):
         if self._unseen:
             self._news(self._clock_ns())
 
-    def close(self) -> None:
-        """Do nothing: there is nothing to finish."""
-
     def events(self, since: int) -> list[NumberedEvent]:
         """Return the latest events after number `since`."""
         return [one for one in self._events.copy() if one.number > since]

@@ -25,13 +25,14 @@ from websockets.protocol import State
 
 from edge.errors import SinkError
 from edge.pipeline.commands import Commands
+from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.view.access import SOCKET, Access
 from edge.view.connection_limits import MOST_VIEWERS, Connection, Connections
 from edge.view.frames import Frames, Run, hello, refused, state
 from edge.view.recorder import Recorder
 from edge.view.run_snapshot import RunSnapshot
 from edge.view.static_page import load_page
-from edge.view.viewers import LONGEST_BYTES, AttendedViewer, execute
+from edge.view.viewers import AttendedViewer, execute
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import Player
 

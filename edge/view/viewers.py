@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import json
 import math
 import time
 from typing import Any, Final
@@ -12,6 +11,7 @@ from websockets.exceptions import ConnectionClosed
 
 from edge.mapping.live_map import MapState
 from edge.pipeline.commands import WAITING, Command, Commands, runtime_command
+from edge.pipeline.pose_queue import json_object
 from edge.validation import as_float
 from edge.view.frames import Frames
 from firmware_bridge.links.replay_player import Player
@@ -20,7 +20,6 @@ PING_S: Final = 0.25
 LATE_S: Final = 0.5
 """Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 GONE_S: Final = 10.0
-LONGEST_BYTES: Final = 4096
 _FORMS: Final = (
     '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}, {"cmd": "record", "on": true}, '
     '{"cmd": "pause", "on": true}; of a recording {"cmd": "play", "at_s": 1.5} with "speed" and "on" as wanted'
@@ -103,11 +102,8 @@ def execute(message: str | bytes, viewer: Viewer, commands: Commands, player: Pl
 
 
 def _refusal(message: str | bytes, viewer: Viewer, commands: Commands, player: Player | None) -> str | None:
-    try:
-        parsed = json.loads(message) if isinstance(message, str) else None
-    except (ValueError, RecursionError):
-        parsed = None
-    if not isinstance(parsed, dict):
+    parsed = json_object(message) if isinstance(message, str) else None
+    if parsed is None:
         return f"{_shown(message)} is not a JSON object: expected {_FORMS}"
     name = parsed.get("cmd")
     if name == "play":

@@ -302,7 +302,7 @@ def test_options_that_are_spoken_of_exist():
         option
         for package in ("edge", "examples", "export", "firmware_bridge", "train")
         for path in (ROOT / package).rglob("*.py")
-        for option in re.findall(r'"(--[a-z][a-z0-9-]*)"', path.read_text())
+        for option in re.findall(r'"(--[a-z][a-z0-9-]*)[ "]', path.read_text())
     }
     known |= {"--help", "--nproc-per-node"}  # argparse's, torchrun's
     for page in written_samples.PAGES:

@@ -135,7 +135,7 @@ class TestIntake:
         assert event.kind == "poses_trouble" and "40 ns, is not after" in event.text
         queue.put(pose(1))
         intake.take([], None, 200)
-        assert intake.look(200) == [] and intake.refused == 3
+        assert intake.look(200) == [] and queue.refused == 3
         queue.put(pose(2))
         intake.take([], None, 300)
         events = [event for event in intake.look(100 + REPEATED_NS) if event.kind == "poses_trouble"]
@@ -175,14 +175,14 @@ class TestIntake:
         assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
         queue.put(pose(8, sensor="4"))
         assert intake.take([], 9, 9) == []
-        assert intake.refused == 2 and "has poses of its own" in intake.look(9)[0].text
+        assert queue.refused == 2 and "has poses of its own" in intake.look(9)[0].text
 
     def test_poses_of_now_are_refused_for_scans_of_another_time(self):
         queue = PoseQueue()
         intake = PoseIntake(make_runtime(), queue, recorded=True)
         queue.put(pose(9))
         assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
-        assert intake.refused == 1 and "recording" in intake.look(6)[0].text
+        assert queue.refused == 1 and "recording" in intake.look(6)[0].text
 
 
 class PoseSink(ListSink):

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Command, Commands
+from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.view.access import grant, is_loopback
-from edge.view.viewers import LONGEST_BYTES, Viewer, execute
+from edge.view.viewers import Viewer, execute
 from firmware_bridge.links.replay_player import Player
 
 TOKEN = "correct-horse-battery"
