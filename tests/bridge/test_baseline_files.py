@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from edge_samples import BASELINE, REST
+from hostile_samples import one_line
 
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline, load_baselines, save_baselines
@@ -84,10 +85,14 @@ def test_saving_where_nothing_can_be_written(tmp_path):
         ({"baselines": [{}, 1]}, r"'baselines': \[{}, 1\], expected a list of at least one object"),
         ({"sensor": ""}, "'sensor'"),
         ({"sensor": 4}, "'sensor'"),
+        ({"sensor": "4\x1b[2J"}, "'sensor'"),
+        ({"sensor": "x" * 65}, "'sensor'"),
         ({"created_unix_s": 0}, "'created_unix_s'"),
         ({"created_unix_s": True}, "'created_unix_s'"),
         ({"created_unix_s": "5"}, "'created_unix_s'"),
         ({"created_unix_s": float("inf")}, "'created_unix_s'"),
+        ({"created_unix_s": 10**400}, "'created_unix_s'"),
+        ({"created_unix_s": 1e300}, "'created_unix_s'"),
         ({"scans": 0}, "'scans'"),
         ({"scans": 1.0}, "'scans'"),
         ({"scans": 2**31}, "'scans'"),
@@ -114,8 +119,9 @@ def test_files_that_are_none(tmp_path, changes, match):
     document = json.loads(path.read_text())
     (document if changes.keys() <= document.keys() else document["baselines"][0]).update(changes)
     path.write_text(json.dumps(document))
-    with pytest.raises(RecordingError, match=rf"zero\.json.*{match}.*zero again"):
+    with pytest.raises(RecordingError, match=rf"zero\.json.*{match}.*zero again") as refused:
         load_baselines(path)
+    assert one_line(refused)
 
 
 def test_a_sensor_twice(tmp_path):
@@ -127,13 +133,17 @@ def test_a_sensor_twice(tmp_path):
         load_baselines(path)
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"null", b"\xff", b"[" * 100_000, None])
+@pytest.mark.parametrize(
+    "text", [b"", b"{", b"[1]", b"null", b"NaN", b'"', b"1" * 10_000, b"\xff", b"[" * 100_000, b'{"a":' * 100_000, None]
+)
 def test_files_that_are_no_json_or_not_there(tmp_path, text):
     path = tmp_path / "zero.json"
     if text is not None:
         path.write_bytes(text)
-    with pytest.raises(RecordingError, match=r"zero\.json: cannot be read: No such" if text is None else r"zero\.json"):
+    words = r"zero\.json: cannot be read: No such" if text is None else r"zero\.json"
+    with pytest.raises(RecordingError, match=words) as refused:
         load_baselines(path)
+    assert one_line(refused)
 
 
 def test_a_file_of_a_mebibyte_is_read_and_a_larger_one_is_not(tmp_path):
