@@ -3,9 +3,7 @@
 import csv
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -42,21 +40,19 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     return path
 
 
-class _Played(Protocol):
-    lost_frames: int
-
-
-_P = TypeVar("_P", bound=_Played)
-
-
-def undisturbed(play: Callable[[], _P], tries: int = 4) -> _P:
-    """Return a play without a lost frame, since the terminal overflows where the machine stands still."""
-    played = play()
-    for _ in range(tries - 1):
-        if not played.lost_frames:
-            break
-        played = play()
-    return played
+def write_npz(path: Path, counts: np.ndarray, time_ns: object = None, sensors: object = None, **more: object) -> Path:
+    """Write a recording for numpy: by default of one sensor, at 100 Hz."""
+    scan = np.arange(len(counts))
+    arrays = {
+        "format": "tactile-recording",
+        "version": 1,
+        "sensor": np.array(["4"] * len(counts) if sensors is None else sensors),
+        "scan": scan,
+        "time_ns": np.array(scan * 10_000_000 if time_ns is None else time_ns),
+        "counts": counts,
+    }
+    np.savez(path, **arrays, **more)
+    return path
 
 
 def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:
