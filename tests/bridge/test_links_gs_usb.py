@@ -7,9 +7,9 @@ from functools import partial
 import can
 import pytest
 import usb.core
+from bridge_samples import frames_of
 from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from gs_usb_emulator import ACCESS, IO, PIPE, TIMEOUT, GsUsbBackend, GsUsbPort, libusb_error
-from gs_usb_samples import frames_of, opened
 from usb.backend import libusb1
 
 from firmware_bridge.can.slcan import CanFrame
@@ -18,6 +18,11 @@ from firmware_bridge.links import gs_usb_devices, gs_usb_link
 from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.scans.can_id_maps import trigger_frame
+
+
+def opened(port=None, **settings):
+    backend = GsUsbBackend(port or GsUsbPort())
+    return backend.ports[0], GsUsbLink(backend=backend, **settings)
 
 
 @pytest.mark.parametrize("packet_bytes", [24, 64, 512])

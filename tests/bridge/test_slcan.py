@@ -14,23 +14,11 @@ from slcan_samples import (
 )
 
 from firmware_bridge.can.slcan import (
-    BITRATE_1M,
-    CLOSE,
     LINES_TO_LEARN,
-    LONGEST_LINE,
-    OPEN,
-    STAMPED_BYTES,
-    STAMPS_OFF,
-    STAMPS_ON,
     CanFrame,
     SlcanDecoder,
     encode_frame,
 )
-
-
-def test_commands_are_what_adapters_know():
-    assert (CLOSE, BITRATE_1M, OPEN) == (b"C\r", b"S8\r", b"O\r")
-    assert (STAMPS_ON, STAMPS_OFF) == (b"Z1\r", b"Z0\r")
 
 
 @given(st.lists(plain_frames, max_size=20) | st.lists(stamped_frames, max_size=20))
@@ -183,21 +171,3 @@ def test_what_breaks_the_row_begins_it_anew():
         assert len(decoder.feed(between)) == 1
     assert decoder.feed(b"".join(STAMPED[:3]) + b"z\rnoise\r") == []
     assert len(decoder.feed(STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
-
-
-def test_stamped_lines_are_packed_too():
-    decoder = SlcanDecoder()
-    decoder.feed(b"".join(STAMPED))
-    (piece,) = decoder.cut(STAMPED[2] * 16)
-    assert not isinstance(piece, CanFrame)
-    assert piece == (bytes.fromhex("0048 937E317E1593120F 1234") * 16, STAMPED_BYTES)
-    assert decoder.usual_line_bytes == len(STAMPED[0])
-    assert decoder.feed(STAMPED[2] * 2) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 2
-    assert SlcanDecoder().usual_line_bytes == len(GOLDEN)
-
-
-def test_the_longest_frame_fits_the_bound():
-    longest = CanFrame(0x1FFFFFFF, bytes(range(8)), extended=True, timestamp_ms=59_999)
-    line = encode_frame(longest)
-    assert len(line) == LONGEST_LINE + 1
-    assert decode(b"?" * 50 + line[:-1], line[-1:])[0] == [longest]

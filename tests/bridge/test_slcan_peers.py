@@ -1,20 +1,16 @@
 """The same line, spoken by python-can: it reads our emulator, and we read what it writes."""
 
-import os
-import threading
 import time
 
 import can
 import pytest
-from bridge_samples import make_recording
+from bridge_samples import frames_of, make_recording
 from can.interfaces.slcan import slcanBus
-from gs_usb_samples import frames_of
 from link_rigs import message_of
 from serial_samples import SilentDevice
 
 from firmware_bridge.can.slcan import SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import SlcanAdapter
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 
@@ -52,19 +48,3 @@ def test_we_read_what_it_writes():
             bus.send(message_of(frame))
         decoder = SlcanDecoder()
         assert decoder.feed(far_end.received(len(frames) * 22)) == frames and decoder.counters()["bad_lines"] == 0
-
-
-def test_what_it_says_on_opening_is_obeyed_and_is_no_frame():
-    heard = b""
-    with SilentDevice() as device:
-        opened = threading.Thread(target=lambda: open_peer(device.port).shutdown())
-        opened.start()
-        while b"C\r" not in heard[2:]:  # the last command that it sends
-            heard += os.read(device.device_fd, 1000)
-        opened.join()
-    assert heard.startswith(b"C\rS8\r\rO\rO\r")
-    adapter = SlcanAdapter()
-    # An empty command, and opening what is open: refused as by any strict adapter, and open all the same.
-    assert adapter.feed(heard.removesuffix(b"C\r")) == b"\a\r\a\r\a" and adapter.hears_the_bus
-    decoder = SlcanDecoder()
-    assert decoder.feed(heard) == [] and decoder.counters()["frames"] == 0

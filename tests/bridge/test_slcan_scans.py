@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -86,23 +86,6 @@ def test_no_scan_closes_when_a_link_breaks():
     assert abandoned > 300
 
 
-def test_without_stamps_nothing_waits():
-    scans = SlcanScans()
-    for stamped in (False, True, False, True):
-        lines = [line for _, line in on_the_bus(random.Random(2), 3, stamped=stamped, faults=0.0)]
-        scans.feed(b"".join(lines[:150]), 0)
-        counts = scans.counters()
-        assert counts["frames"] == counts["readings"] + counts["foreign"]
-        if stamped:
-            assert scans.bytes_until_scan() < 16 * 26
-        scans.begin_anew()
-    counts = scans.counters()
-    assert (
-        counts["readings"]
-        == 16 * counts["scans"] + counts["abandoned"] + counts["unconfirmed"] + (counts["resynchronised"])
-    )
-
-
 def test_a_cycle_read_in_one_piece_with_a_pause_in_it_is_two():
     """As after the host stood still: the bus was off between half of one press and half of another."""
     scans, places = SlcanScans(), USPA44_MAP.wire_order("4")
@@ -159,22 +142,13 @@ def test_the_head_of_a_line_with_a_later_tail_is_no_reading():
     assert scan.complete and scans.counters()["foreign"] == 1, "a damaged line is none, and the next is whole"
 
 
-def text_of(numbers: range, model=USPA44_MAP) -> bytes:
+def text_of(numbers: range) -> bytes:
     lines = []
     for number in numbers:
-        for can_id, taxel in model.wire_order("4"):
+        for can_id, taxel in USPA44_MAP.wire_order("4"):
             words = b"".join(value.to_bytes(2, "big") for value in (taxel, number, 1000 * taxel + number))
             lines.append(encode_frame(CanFrame(can_id, b"\x93" + words + b"\x0f")))
     return b"".join(lines)
-
-
-def test_the_wrong_model_shows_half_of_the_taxels():
-    for sent, read in ((USPA44_MAP, XR1944_MAP), (XR1944_MAP, USPA44_MAP)):
-        scans = SlcanScans(read)
-        got = scans.feed(text_of(range(4), sent), 0)
-        # Of four cycles the first does not prove a sensor yet, and nothing has closed the last.
-        assert [int(scan.fresh.sum()) for scan in got] == [8, 8]
-        assert scans.counters()["foreign"] == 32
 
 
 @given(st.integers(0, 2**32))

@@ -2,11 +2,14 @@
 
 import csv
 import os
+import random
 import time
 from pathlib import Path
 
 import numpy as np
 
+from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
 from firmware_bridge.recording.csv_reader import CSV_HEADER
@@ -23,6 +26,12 @@ def make_counts(scans: int, seed: int = 0) -> np.ndarray:
     """Return counts of scans that all differ in every taxel, (scans, 3, 4, 4)."""
     noise = np.random.default_rng(seed).integers(0, 30, (scans, 3, 4, 4))
     return (REST_COUNTS + noise + 40 * (np.arange(scans) % 2)[:, None, None, None]).astype(np.int32)
+
+
+def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
+    """Return the frames of so many scans that all differ."""
+    noise = random.Random(seed)
+    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
 
 
 def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recording:
