@@ -145,11 +145,11 @@ def test_a_lost_frame_costs_its_own_cycle_alone(reader, lost):
 @pytest.mark.parametrize(
     ("fault", "share", "rates_hz", "fewest", "in_bursts"),
     [
-        (losing, 0.0005, (100,), 380, 380),
-        (losing, 0.05, (100,), 140, 140),
-        (losing, 0.002, (100, 103), 720, 720),  # phases that drift
-        (doubling, 0.02, (100,), 395, 373),
-        (swapping, 0.02, (100,), 320, 320),
+        (losing, 0.0005, (100,), 395, 380),
+        (losing, 0.05, (100,), 170, 165),
+        (losing, 0.002, (100, 103), 760, 730),  # phases that drift
+        (doubling, 0.02, (100,), 399, 385),
+        (swapping, 0.02, (100,), 370, 360),
     ],
 )
 def test_no_scan_is_of_two_cycles_on_a_faulty_bus(reader, fault, share, rates_hz, fewest, in_bursts):

@@ -69,7 +69,6 @@ SUBJECTS = {
     "assembler": Subject(
         "firmware_bridge.scans.scan_assembler",
         (
-            "tests/bridge/test_scan_assembler_cycles.py",
             "tests/bridge/test_scan_assembler.py",
             "tests/bridge/test_slcan_scans.py",
             "tests/bridge/test_cycles.py",
