@@ -64,7 +64,7 @@ class Subject:
 
 
 SUBJECTS = {
-    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py", "tests/bridge/test_slcan_damage.py")),
+    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
     "assembler": Subject(
         "firmware_bridge.scans.scan_assembler",
