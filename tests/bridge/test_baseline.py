@@ -163,14 +163,6 @@ def test_from_counts_takes_what_it_is_given():
             Baseline.from_counts("6", bad, 99.0)
 
 
-def test_a_pad_that_has_drifted_rests_higher_by_that():
-    baseline = of(np.full((3, 4, 4), 65_530))
-    drifted = baseline.moved(np.full((3, 4, 4), 10.5, dtype=np.float32))
-    assert (drifted.counts == 4.5).all() and drifted.id == baseline.id
-    with pytest.raises(ValueError, match="read-only"):
-        drifted.counts[...] = 0
-
-
 def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
     counts = still(200)
     counts[:, :, 1, 1] = ABSENT

@@ -153,12 +153,6 @@ def test_after_a_gap_the_rate_is_forgotten():
     assert pad.z() - before == pytest.approx(CREEP, abs=1e-4)
 
 
-def test_where_scans_are_rare_a_block_lasts_longer():
-    pad = resting()
-    assert [pad.block(of_z(8, own=9), after_ns=500_000_000) for _ in range(2)] == [True, True]
-    assert (pad.z(15), pad.z()) == pytest.approx((8, 8 + 4 * (0.65 * 1.8 + 0.05)), abs=1e-3)
-
-
 def test_scans_closer_than_the_sample_period_are_left_out():
     pad = Blocks()
     for block in range(7):
@@ -302,14 +296,6 @@ def test_four_taxels_without_a_step_tell_what_is_common(voting, followed):
     assert (pad.z(), pad.z(15)) == pytest.approx((6 - behind, 6 - behind) if followed else (0, 0), abs=1e-4)
     if not followed:
         np.testing.assert_allclose(pad.tracker.counts, 0, atol=1e-4)  # beside a step no taxel creeps on its own
-
-
-def test_beside_a_step_only_drift_that_is_faster_is_shared():
-    """By hand, as above: of 5 counts/s the first count is not shared, and there is no creep."""
-    pad, step = resting(), of_z(taxel=5, own=40)
-    pad.touched(step)
-    pad.blocks(2, step + of_z(10, own=9))
-    assert (pad.z(), pad.z(5)) == pytest.approx((10 + 0.5 * 0.65 * 4, 10), abs=1e-3)
 
 
 @pytest.mark.parametrize("dead_taxels", [1, 9, 16])

@@ -142,17 +142,6 @@ def test_flags_are_asked_for_and_told(impatient):
         assert link.counters()["bad_lines"] == 0
 
 
-def test_bus_off_is_told_at_once_and_over_with_the_next_frame():
-    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        read_scans(link, 3)
-        emulator.tell(emulator.adapter.state_line("b", 256, 256))
-        read_until(link, lambda: link.trouble == BUS_OFF)
-        assert link.counters()["adapter_bus_off"] == 1
-        emulator.tell(emulator.adapter.state_line("a", 0, 0))
-        read_until(link, lambda: link.trouble is None)
-        assert read_scans(link, 3)
-
-
 def test_a_silent_bus_with_errors_is_trouble(impatient):
     """The bitrate or the wiring is wrong: the adapter hears noise, and a frame never."""
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:

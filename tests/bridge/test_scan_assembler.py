@@ -262,16 +262,6 @@ def test_the_period_is_measured_by_stamps_if_there_are_any(first, stamped, pause
     assert assembler.longest_cycle_ns(WHOLE) == pause_ns
 
 
-def test_a_link_that_was_away_has_no_period():
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0))
-    assembler.begin_anew()
-    feed_cycle(assembler, 1, 20 * MS)
-    assert assembler.longest_cycle_ns(WHOLE) == SHORTEST_PAUSE_NS
-    feed_cycle(assembler, 2, 40 * MS)
-    assert assembler.longest_cycle_ns(WHOLE) == 10 * MS
-
-
 def test_a_cycle_is_taken_as_one_only_in_the_usual_order():
     assembler, other = ScanAssembler(USPA44_MAP), USPA44_MAP.cycle([*IDS[1:], IDS[0]])
     assert assembler.longest_cycle_ns(WHOLE) == 0
@@ -309,17 +299,6 @@ def test_a_cycle_takes_doubts_of_the_order_away():
     assert assembler.longest_cycle_ns(WHOLE) == 0, "one more, and the order is another"
     assert assembler.fewest_missing() == 1, "no pause is slept through while it is learnt"
     assert counters(assembler)["resynchronised"] == 15 * 3 and counters(assembler)["scans"] == 2
-
-
-def test_a_cycle_shows_its_sensor_and_where_the_next_begins():
-    assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[5:])
-    assert counters(assembler) == {"readings": 11, "resynchronised": 11}
-    feed_cycle(assembler, 1)
-    assembler.begin_anew()
-    feed_cycle(assembler, 2)
-    (torn,) = feed_at(assembler, cycle(3)[1:])
-    assert torn.fresh.sum() == 15 and counters(assembler)["torn_wire"] == 1
 
 
 @pytest.mark.parametrize("stamped", [False, True])

@@ -1,7 +1,5 @@
 """Lines of slcan and their frames, whole and damaged."""
 
-import random
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -197,18 +195,6 @@ def test_what_breaks_the_row_begins_it_anew():
 # Damaged lines: bytes that are changed, cut, lost or of noise.
 
 
-@given(
-    st.lists(st.tuples(st.text("0123456789ABCDEFabcdef \0zx", max_size=60).map(str.encode), plain_frames), max_size=10)
-)
-@settings(deadline=None)
-def test_noise_without_frame_letters_costs_nothing(noisy):
-    stream = b"".join(noise + encode_frame(frame) for noise, frame in noisy)
-    sent, counters = decode(stream)
-    assert sent == [frame for _, frame in noisy]
-    assert counters.get("skipped_bytes", 0) == sum(len(noise) for noise, _ in noisy)
-    assert counters.get("bad_lines", 0) == 0
-
-
 def test_every_byte_at_every_place_of_a_line():
     """One corrupted byte has no effect, loses the frame, or puts another digit in its place."""
     digits = b"0123456789ABCDEFabcdef"
@@ -281,15 +267,3 @@ def test_no_loss_makes_a_frame_once_stamps_are_learnt():
             decoder = SlcanDecoder()
             decoder.feed(line * LINES_TO_LEARN)
             assert decoder.feed(line[:start] + line[end:] + line) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)]
-
-
-@pytest.mark.parametrize(("stamp", "learnt", "places"), [(b"", 0, set()), (b"1234", 0, {4}), (b"1234", 4, set())])
-def test_where_a_letter_in_mid_line_makes_a_whole_frame(stamp, learnt, places):
-    noise = random.Random(5)
-    made_up = set()
-    for _ in range(300):
-        line = encode_frame(CanFrame(0x004, noise.randbytes(8)))[:-1] + stamp + b"\r"
-        for place in range(1, len(line) - 1):
-            got, _ = decode(STAMPED[2] * learnt + line[:place] + b"t" + line[place + 1 :])
-            made_up |= {place for frame in got[learnt:] if len(frame.data) == 8}
-    assert made_up == places
