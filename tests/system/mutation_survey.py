@@ -75,12 +75,8 @@ SUBJECTS = {
         ),
     ),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
-    "baseline": Subject(
-        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py", "tests/bridge/test_baseline_files.py")
-    ),
-    "drift": Subject(
-        "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
-    ),
+    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
+    "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
     "contract": Subject(
         "edge.inference.contract",
         ("tests/runtime/test_contract.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),
