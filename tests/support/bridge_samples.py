@@ -5,6 +5,7 @@ import os
 import random
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,10 +50,10 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     return path
 
 
-def write_npz(path: Path, counts: np.ndarray, time_ns: object = None, sensors: object = None, **more: object) -> Path:
+def write_npz(path: Path, counts: np.ndarray, time_ns: Any = None, sensors: Any = None, **more: Any) -> Path:
     """Write a recording for numpy: by default of one sensor, at 100 Hz."""
     scan = np.arange(len(counts))
-    arrays = {
+    arrays: dict[str, Any] = {
         "format": "tactile-recording",
         "version": 1,
         "sensor": np.array(["4"] * len(counts) if sensors is None else sensors),
