@@ -117,7 +117,7 @@ def test_any_chunking_gives_the_same_scans_and_counters(seed, sensors, stamped, 
 
 @pytest.mark.parametrize("lost", [0.0, 0.002, 0.05])
 @pytest.mark.parametrize("longest", [40, 400])
-def test_mixed_cycles_that_are_read_late_give_the_scans_of_their_frames(longest, lost):
+def test_mixed_cycles_read_late_give_the_scans_of_their_frames(longest, lost):
     noise, names = random.Random(longest), ("4", "6", "8", "10")
     lines = text_of(60, names, stamped=True).split(b"\r")[:-1]
     timed = [(150_000 * at, line + b"\r") for at, line in enumerate(lines) if noise.random() >= lost]
