@@ -170,6 +170,10 @@ def test_a_stamp_beyond_a_minute_is_none():
 )
 def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     few = LINES_TO_LEARN - 1
+    decoder = SlcanDecoder()
+    assert decoder.usual_line_bytes == len(GOLDEN)
+    decoder.feed(b"".join(usual))
+    assert decoder.usual_line_bytes == len(usual[0])
     # Before that both are taken, in any order.
     assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few
     # Then those of the other form are bad lines: damage, such as four lost digits.
