@@ -1,54 +1,126 @@
 """Cycles of scans: none mixes two, whatever is lost, and a sensor's place is recovered; readings name their cycle."""
 
+import random
+import struct
+from itertools import groupby
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
 import pytest
 from bridge_samples import read_until_lost
-from cycle_samples import (
-    PLAIN,
-    PLAIN_BURSTS,
-    READERS,
-    STAMPED,
-    USB,
-    bus,
-    doubling,
-    in_order,
-    losing,
-    numbered,
-    pausing,
-    read,
-    swapping,
-)
 from wire_faults import FAULTS, STAMPS, Case, play
 from wire_faults import READERS as LINE_READERS
 
-from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.can import gs_usb
+from firmware_bridge.can.slcan import encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import Controller, bus_timeline
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, LAYOUT_B_MAP, USPA44_MAP
+from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.slcan_scans import SlcanScans
 
-LONGEST_WAIT_MS = 1.5
+LONGEST_WAIT_NS = 1_500_000
 FIRST = 1000
+IDS = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
 ORDERS = {
     "downwards": list(range(15, -1, -1)),
     "rows backwards": [4 * (place // 4) + 3 - place % 4 for place in range(16)],
     "begun elsewhere": [*range(5, 16), *range(5)],
     "any": [9, 2, 14, 0, 7, 11, 4, 1, 15, 6, 3, 12, 8, 5, 13, 10],
 }
+
+
+class Reader(NamedTuple):
+    """Way to read: gs_usb with a frame a transfer, or slcan from an adapter that hands on what it has so often."""
+
+    stamped: bool
+    latency_s: float = 0.001
+    usb: bool = False
+
+
+PLAIN, STAMPED, PLAIN_BURSTS = Reader(False), Reader(True), Reader(False, 0.016)
+STAMPED_BURSTS, USB = Reader(True, 0.016), Reader(True, usb=True)
 # Plain bursts of 16 ms end anywhere in a cycle, which looks like a pause of the bus until the period is known. Later,
 # cycles that come late wait for others to show that none was lost. What holds for that reader as well is that nothing
 # is mixed.
-every_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-sharp_reader = pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=lambda reader: reader.name)
+every_reader = pytest.mark.parametrize("reader", [PLAIN, STAMPED, PLAIN_BURSTS, STAMPED_BURSTS, USB], ids=str)
+
+
+def numbered(cycles):
+    """Return a recording in which every reading is the number of its cycle."""
+    counts = np.broadcast_to(np.arange(FIRST, FIRST + cycles)[:, None, None, None], (cycles, 3, 4, 4)).astype(np.int32)
+    return Recording(Path("numbered.csv"), (Track("4", counts, None),), 100.0)
+
+
+def bus(cycles, rates_hz=(100.0,), first_frame=0):
+    """Return times and frames of sensors "4", "6", ..., each at its rate."""
+    controllers = [Controller(numbered(cycles).tracks[0], 4 + 2 * n, rate_hz) for n, rate_hz in enumerate(rates_hz)]
+    return list(bus_timeline(controllers, jitter_s=0.001, seed=0, loop=False, first_frame=first_frame))
+
+
+def losing(frames, share):
+    draw = random.Random(1)
+    return [timed for timed in frames if draw.random() >= share]
+
+
+def doubling(frames, share):
+    draw = random.Random(0)
+    return [one for one in frames for _ in range(1 + (draw.random() < share))]
+
+
+def swapping(frames, share):
+    draw, swapped = random.Random(0), list(frames)
+    for at in range(len(frames) - 1):
+        if draw.random() < share:
+            (early_s, early), (late_s, late) = swapped[at : at + 2]
+            swapped[at : at + 2] = [(early_s, late), (late_s, early)]
+    return swapped
+
+
+def handed_on(frames, reader):
+    """Yield when something is read, in [s], and what."""
+    if reader.usb:
+        for time_s, frame in frames:
+            head = struct.pack("<IIBBBB", gs_usb.RECEIVED, frame.can_id, 8, 0, 0, 0)
+            yield time_s + 0.0002, head + frame.data + struct.pack("<I", round(time_s * 1e6))
+        return
+    for tick, lot in groupby(frames, key=lambda timed: int(timed[0] / reader.latency_s)):
+        lines = [
+            encode_frame(frame._replace(timestamp_ms=int(time_s * 1000) % 60_000 if reader.stamped else None))
+            for time_s, frame in lot
+        ]
+        yield (tick + 1) * reader.latency_s, b"".join(lines)
+
+
+def read(frames, reader):
+    """Return the cycles of whole scans by sensor, how many were mixed, how long each had to wait, and counters."""
+    scans = GsUsbScans() if reader.usb else SlcanScans()
+    if reader.usb:
+        scans.start(stamped=True, channels=1)
+    found = SimpleNamespace(numbers={}, whole=0, mixed=0, waits_ns=[])
+    for time_s, data in handed_on(frames, reader):
+        now_ns = 5_000_000_000 + round(time_s * 1e9)
+        for scan in filter(lambda scan: scan.whole, scans.feed(data, now_ns)):
+            cycles = set(scan.counts[2].ravel().tolist())
+            found.numbers.setdefault(scan.sensor, []).append(max(cycles))
+            found.waits_ns.append(now_ns - scan.time_ns)
+            found.whole, found.mixed = found.whole + 1, found.mixed + (len(cycles) > 1)
+    found.counters = scans.counters()
+    return found
 
 
 @every_reader
 @pytest.mark.parametrize("first_frame", range(16))
 def test_who_joins_anywhere_has_the_next_cycle(reader, first_frame):
-    worth = read(bus(12, first_frame=first_frame), reader)
-    assert worth.mixed == 0
-    assert worth.numbers["4"][0] == FIRST + (first_frame > 0)
-    cut_off = (16 - first_frame) % 16
-    assert worth.counters["resynchronised"] == cut_off or reader is PLAIN_BURSTS
-    assert worth.whole == 12 - (first_frame > 0) or reader is PLAIN_BURSTS
+    found = read(bus(12, first_frame=first_frame), reader)
+    assert found.mixed == 0 and found.numbers["4"][0] == FIRST + (first_frame > 0)
+    if reader is not PLAIN_BURSTS:
+        assert found.counters["resynchronised"] == (16 - first_frame) % 16
+        assert found.whole == 12 - (first_frame > 0)
 
 
 @every_reader
@@ -56,85 +128,49 @@ def test_who_joins_anywhere_has_the_next_cycle(reader, first_frame):
 def test_a_lost_frame_costs_its_own_cycle_alone(reader, lost):
     frames = bus(12)
     del frames[16 * 5 + lost]
-    worth = read(frames, reader)
-    assert worth.mixed == 0
-    assert worth.counters["torn_wire"] == 1 or reader is PLAIN_BURSTS
-    missing = set(range(FIRST, FIRST + 12)) - set(worth.numbers["4"])
-    assert missing == {FIRST + 5} or reader is PLAIN_BURSTS
+    found = read(frames, reader)
+    assert found.mixed == 0
+    if reader is not PLAIN_BURSTS:
+        assert found.counters["torn_wire"] == 1
+        assert set(range(FIRST, FIRST + 12)) - set(found.numbers["4"]) == {FIRST + 5}
 
 
 @every_reader
-@pytest.mark.parametrize("share", [0.0005, 0.05])
-def test_no_scan_is_of_two_cycles_at_any_share_of_loss(reader, share):
-    worth = read(losing(share, seed=1)(bus(400)), reader)
-    assert worth.mixed == 0 and worth.whole > 400 * (1 - share) ** 16 * 0.8
-    assert max(worth.waits_ms) < LONGEST_WAIT_MS or reader is PLAIN_BURSTS
+@pytest.mark.parametrize(
+    ("fault", "share", "rates_hz", "fewest", "in_bursts"),
+    [
+        (losing, 0.0005, (100,), 395, 380),
+        (losing, 0.05, (100,), 170, 165),
+        (losing, 0.002, (100, 103), 760, 730),  # phases that drift
+        (doubling, 0.02, (100,), 399, 385),
+        (swapping, 0.02, (100,), 370, 360),
+    ],
+)
+def test_no_scan_is_of_two_cycles_on_a_faulty_bus(reader, fault, share, rates_hz, fewest, in_bursts):
+    found = read(fault(bus(400, rates_hz), share), reader)
+    assert found.mixed == 0 and len(found.numbers) == len(rates_hz)
+    assert found.whole > (in_bursts if reader is PLAIN_BURSTS else fewest)
+    assert max(found.waits_ns) < LONGEST_WAIT_NS or reader is PLAIN_BURSTS
 
 
-@every_reader
-def test_doubles_and_swaps_mix_nothing(reader):
-    for fault in (doubling(0.02), swapping(0.02)):
-        assert read(fault(bus(300)), reader).mixed == 0
-    assert read(swapping(0.02)(bus(300)), reader).whole >= 240
-    assert read(doubling(0.02)(bus(300)), reader).whole >= (280 if reader is PLAIN_BURSTS else 295)
-
-
-@every_reader
-@pytest.mark.parametrize("stall_ms", [5, 70, 500])
-def test_a_reader_that_stands_still_mixes_nothing(reader, stall_ms):
-    stalls = [(0.9 * n + 0.0131 * (n % 7), stall_ms / 1000) for n in range(1, 6)]
-    worth = read(bus(600), reader, stalls=stalls)
-    assert worth.mixed == 0
-    assert worth.numbers["4"][-50:] == list(range(FIRST + 550, FIRST + 600)) or reader is PLAIN_BURSTS
-
-
-@sharp_reader
-@pytest.mark.parametrize("pause_ms", [2, 10, 30, 200])
-def test_a_bus_that_pauses_mixes_nothing(reader, pause_ms):
-    every_s = 0.13 if pause_ms < 100 else 0.5
-    worth = read(pausing(pause_ms / 1000, every_s, seed=1)(bus(600)), reader)
-    assert worth.mixed == 0 and worth.whole > (250 if reader.stamped else 190)
-
-
-@every_reader
-def test_two_sensors_whose_phases_drift_are_told_apart(reader):
-    worth = read(losing(0.002)(bus(400, (100, 103))), reader)
-    assert worth.mixed == 0 and worth.numbers.keys() == {"4", "6"}
-    assert worth.whole > 720
-
-
-@pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=lambda reader: reader.name)
+@pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=str)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("first_frame", [0, 7])
 def test_another_order_is_learnt_and_nothing_mixed_meanwhile(reader, order, first_frame):
-    worth = read(losing(0.005)(in_order(bus(300, first_frame=first_frame), ORDERS[order])), reader)
+    ids = {IDS[place]: IDS[other] for place, other in enumerate(ORDERS[order])}
+    usual = bus(300, first_frame=first_frame)
+    frames = [(time_s, frame._replace(can_id=ids[frame.can_id])) for time_s, frame in usual]
+    found = read(losing(frames, 0.005), reader)
     # Without stamps a pause counts only once the period is measured: until then the order of the ids is all there is.
-    assert worth.mixed <= (2 if reader is PLAIN and order == "begun elsewhere" else 0) and worth.whole > 250
-    assert worth.numbers["4"][0] < FIRST + 12
-    assert worth.numbers["4"][-1] == FIRST + 299
-
-
-@pytest.mark.parametrize("model", [LAYOUT_A_MAP, LAYOUT_B_MAP, ID_MAPS["XR1944"]], ids=lambda model: model.name)
-def test_other_layouts_are_cut_alike(model):
-    sensor = model.taxels[next(iter(model.taxels))][0]
-    ids = [can_id for can_id, _ in model.wire_order(sensor)]
-    usual = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
-    renamed = dict(zip(usual, ids, strict=True))
-    for first_frame in range(16):
-        frames: list[tuple[float, CanFrame]] = [
-            (time_s, frame._replace(can_id=renamed[frame.can_id])) for time_s, frame in bus(20, first_frame=first_frame)
-        ]
-        del frames[75]
-        worth = read(frames, PLAIN, model=model)
-        assert worth.mixed == 0 and worth.whole >= 18 - (first_frame > 0)
+    assert found.mixed <= (2 if reader is PLAIN and order == "begun elsewhere" else 0) and found.whole > 250
+    assert found.numbers["4"][0] < FIRST + 12 and found.numbers["4"][-1] == FIRST + 299
 
 
 @pytest.mark.parametrize("old_canable", [True, False], ids=["plain", "stamped"])
 def test_a_link_opened_in_mid_cycle_gives_scans_of_one(old_canable):
     """The real serial path is used, as its reader waits for the bytes of a cycle and could sleep through one."""
-    recording = numbered(60, first=FIRST)
     with (
-        Emulator([recording], first_frame=5, old_canable=old_canable) as emulator,
+        Emulator([numbered(60)], first_frame=5, old_canable=old_canable) as emulator,
         SlcanSerialLink(emulator.port) as link,
     ):
         scans = read_until_lost(link)

@@ -1,43 +1,35 @@
-"""The controller and the adapter that are emulated: their frames, times and answers."""
+"""The controller and the adapter that are emulated: their frames, times and answers, on a pseudo-terminal as well."""
 
 import random
+import time
 from itertools import islice
 
+import can
 import numpy as np
 import pytest
-from bridge_samples import make_counts, make_recording
+from bridge_samples import frames_of, make_counts, make_recording, read_until_lost, stacked, write_recording
+from can.interfaces.slcan import slcanBus
+from link_rigs import message_of
+from serial_samples import SilentDevice
 
-from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.can.slcan import CanFrame, SlcanDecoder
+from firmware_bridge.emulation.robot_main import main
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
 from firmware_bridge.errors import RecordingError
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, decode
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan import ABSENT
 
 # Frames of the controller.
-
-
-def test_a_scan_is_sixteen_frames_in_the_order_of_sda_and_taxel():
-    counts = make_counts(1)[0]
-    frames = scan_frames(counts, 4, random.Random(0))
-    seen = "004 014 024 034 104 114 124 134 204 214 224 234 304 314 324 334"
-    assert [f"{frame.can_id:03X}" for frame in frames] == seen.split()
-    # Columns run backwards: the first frame is the right end of the top row.
-    assert decode(frames[0], USPA44_MAP) == ("4", 3, *counts[:, 0, 3])
-    for frame in frames:
-        reading = decode(frame, USPA44_MAP)
-        assert reading is not None
-        assert reading[2:] == tuple(counts[:, reading.taxel // 4, reading.taxel % 4])
-        assert frame.data[0] != 0 and frame.data[7] != 0
-    assert len({frame.data[0] for frame in frames}) > 4 and len({frame.data[7] for frame in frames}) > 4
 
 
 def test_the_ends_of_the_range_and_absent_taxels():
     counts = make_counts(1)[0]
     counts[:, 0, 3] = [0, 65_535, 256]
     counts[:, 1, 1] = ABSENT
-    frames = scan_frames(counts, 15, random.Random(0))
+    frames = scan_frames(counts, 15, random.Random(0))  # columns run backwards
     assert frames[0].data[1:7] == bytes.fromhex("0000 FFFF 0100")
     assert len(frames) == 15 and 0x12F not in {frame.can_id for frame in frames}
 
@@ -61,13 +53,6 @@ def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
 def test_a_controller_that_falls_behind_sends_no_two_at_once():
     times = [time_s for time_s, _ in timeline(rate_hz=1000.0)]
     assert np.diff(times) == pytest.approx([FRAME_S] * (len(times) - 1))
-
-
-def test_looping_goes_on_in_time():
-    frames = timeline(scans=2, loop=True)
-    assert len(frames) == 5000
-    assert frames[5 * 16][0] == pytest.approx(0.05)
-    assert decode(frames[32][1], USPA44_MAP) == decode(frames[0][1], USPA44_MAP)
 
 
 # Answers of the adapter.
@@ -113,40 +98,131 @@ def test_time_stamps_are_on_request_and_wrap_each_minute():
     assert adapter.encode(FRAME, 60.0) == b"t0048937E317E1593120F\r"
 
 
-def test_flags_are_cleared_by_telling():
-    adapter = SlcanAdapter(left_open=True)
-    adapter.flags = 0x8A
-    assert adapter.feed(b"F\r") + adapter.feed(b"F\r") == b"F8A\rF00\r"
-
-
-def test_the_state_is_told_and_bus_off_hears_nothing():
-    adapter = SlcanAdapter(left_open=True)
-    assert adapter.state_line("w", 96, 0) == b"sw096000\r" and adapter.hears_the_bus
-    assert adapter.state_line("b", 256, 256) == b"sb256256\r" and not adapter.hears_the_bus
-    adapter.feed(b"C\r")
-    assert adapter.state_line("a", 0, 0) == b"", "who is closed tells nothing"
-
-
-@pytest.mark.parametrize(
-    ("recordings", "options", "words"),
-    [
-        (1, {"controllers": [4, 6]}, "expected"),
-        (1, {"controllers": [16]}, "expected"),
-        (1, {"controllers": [-1]}, "expected"),
-        (2, {"controllers": [4, 4]}, "2 different ones"),
-        (1, {"rate_hz": 0.0}, "expected"),
-        (1, {"rate_hz": float("nan")}, "expected"),
-    ],
-)
-def test_options_out_of_range(recordings, options, words):
-    with pytest.raises(ValueError, match=words):
-        Emulator([make_recording(1)] * recordings, **options)
-
-
-def test_recordings_that_no_such_sensor_made():
+def test_what_no_such_sensors_made_is_refused():
     other = make_recording(1)
     wide = Track("4", np.zeros((1, 3, 5, 6), dtype=np.int32), None)
     with pytest.raises(RecordingError, match=r"\(3, 5, 6\)"):
         Emulator([type(other)(other.path, (wide,), 100.0)])
-    with pytest.raises(RecordingError, match="--rate-hz"):
-        Emulator([type(other)(other.path, other.tracks, None)])
+    for recordings, controllers in (1, [4, 6]), (1, [16]), (1, [-1]), (2, [4, 4]):
+        with pytest.raises(ValueError, match="expected"):
+            Emulator([other] * recordings, controllers=controllers)
+
+
+# The pseudo-terminal.
+
+
+def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
+    with (
+        Emulator([make_recording(200, rate_hz=450.0)], jitter_s=0, waits=True) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        time.sleep(0.4)  # the terminal is full after .1 s; nor does it take its lateness for a stop, amid a scan
+        scans = read_until_lost(link)
+    assert (stacked(scans) == make_counts(200)).all()
+    assert (emulator.sent_frames, emulator.lost_frames) == (200 * 16, 0)
+
+
+def test_a_stop_amid_a_scan_tears_none():
+    """Only the machine can stop an emulator there; a controller sends its scans whole."""
+    with (
+        Emulator([make_recording(20), make_recording(20, seed=1)], seed=3) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        encode = emulator.adapter.encode
+        numbers = iter(range(20 * 32))
+
+        def encode_slowly(frame, time_s):
+            if next(numbers) in (20, 325):
+                time.sleep(0.5)
+            return encode(frame, time_s)
+
+        emulator.adapter.encode = encode_slowly
+        scans = read_until_lost(link)
+    assert (stacked(scans, "4") == make_counts(20)).all() and (stacked(scans, "6") == make_counts(20, seed=1)).all()
+    assert emulator.lost_frames == 0 and all(scan.fresh.all() for scan in scans)
+    for sensor in "46":
+        apart_ns = np.diff([scan.device_ns or 0 for scan in scans if scan.sensor == sensor])
+        assert (apart_ns > 300_000_000).sum() >= 2, "a gap of each stop; the machine may have stopped it as well"
+        assert apart_ns.min() > 0, "a clock whose rate is followed may be corrected by some ms after a stop"
+
+
+def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
+    stamps = []
+    emulator = Emulator(
+        [make_recording(10), make_recording(10, seed=1)],
+        frame_s=2e-4,
+        on_scan=lambda controller, time_ns: stamps.append((controller, time_ns, emulator.sent_frames)),
+    )
+    begun_ns = time.monotonic_ns()
+    with emulator, SlcanSerialLink(emulator.port) as link:
+        scans = read_until_lost(link)
+    assert all(sent >= 16 * (number + 1) for number, (_, _, sent) in enumerate(stamps))
+    for controller in (4, 6):
+        told_ns = [time_ns for name, time_ns, _ in stamps if name == controller]
+        came_ns = [scan.time_ns for scan in scans if scan.sensor == str(controller)]
+        assert len(told_ns) == len(came_ns) == 10
+        assert all(begun_ns < before < after for before, after in zip(told_ns, came_ns, strict=True))
+
+
+# The command.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["gone.csv"], "cannot be read"), (["a.csv"], "--rate-hz"), (["a.csv", "--rate-hz", "0"], "positive")],
+)
+def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, capsys, arguments, words):
+    write_recording(tmp_path / "a.csv", make_counts(1))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
+    def interrupt(emulator, timeout_s):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Emulator, "wait", interrupt)
+    path = write_recording(tmp_path / "a.csv", make_counts(1))
+    assert main([str(path), "--rate-hz", "100"]) == 130
+    assert capsys.readouterr().err == ""
+
+
+# The same line, spoken by python-can: it reads our emulator, and we read what it writes.
+
+
+def open_peer(port: str) -> slcanBus:
+    """Open it as its users do, without the two seconds that it sleeps."""
+    return slcanBus(f"{port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "stamps"), [({}, b"Z1\r"), ({"acknowledges": False}, b""), ({"old_canable": True}, b"")], ids=str
+)
+def test_it_reads_our_emulator(options, stamps):
+    recording = make_recording(20)
+    received: list[can.Message] = []
+    with Emulator([recording], loop=True, **options) as emulator:
+        emulator.adapter.feed(stamps)
+        with open_peer(emulator.port) as bus:
+            end_s = time.monotonic() + 60
+            while len(received) < 20 * 16 and time.monotonic() < end_s:
+                received += filter(None, [bus.recv(0.1)])
+    order = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
+    assert [message.arbitration_id for message in received] == order * 20
+    assert all(message.dlc == len(message.data) == 8 and not message.is_extended_id for message in received)
+    values = [int.from_bytes(message.data[5:7], "big") for message in received]
+    taxels = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
+    assert values == [int(scan.reshape(3, 16)[2, taxel]) for scan in recording.tracks[0].counts for taxel in taxels]
+
+
+def test_we_read_what_it_writes():
+    """The package takes the place of the adapter: what it sends is put on our line."""
+    frames = frames_of(3)
+    with SilentDevice() as far_end, slcanBus(f"{far_end.port}@3000000", sleep_after_open=0) as bus:
+        assert far_end.received(2) == b"O\r"
+        for frame in frames:
+            bus.send(message_of(frame))
+        decoder = SlcanDecoder()
+        assert decoder.feed(far_end.received(len(frames) * 22)) == frames and decoder.counters()["bad_lines"] == 0

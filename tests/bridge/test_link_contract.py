@@ -4,8 +4,7 @@ import threading
 import time
 
 import pytest
-from bridge_samples import make_counts, read_scans
-from gs_usb_samples import frames_of
+from bridge_samples import frames_of, make_counts, read_scans
 from link_rigs import DemoRig, GsUsbRig, PythonCanRig, ReplayRig, ServerRig, SlcanRig
 
 from edge.errors import UsageError

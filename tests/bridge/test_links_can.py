@@ -9,8 +9,8 @@ from pathlib import Path
 
 import can
 import pytest
+from bridge_samples import frames_of
 from can.interfaces.virtual import VirtualBus
-from gs_usb_samples import frames_of
 from link_rigs import PulledBus, message_of
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError

@@ -7,9 +7,9 @@ from functools import partial
 import can
 import pytest
 import usb.core
+from bridge_samples import frames_of
 from gs_usb_adapter import CANDLELIGHT, QUEUE_FRAMES, GsUsbAdapter
 from gs_usb_emulator import ACCESS, IO, PIPE, TIMEOUT, GsUsbBackend, GsUsbPort, libusb_error
-from gs_usb_samples import frames_of, opened
 from usb.backend import libusb1
 
 from firmware_bridge.can.slcan import CanFrame
@@ -18,6 +18,11 @@ from firmware_bridge.links import gs_usb_devices, gs_usb_link
 from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.scans.can_id_maps import trigger_frame
+
+
+def opened(port=None, **settings):
+    backend = GsUsbBackend(port or GsUsbPort())
+    return backend.ports[0], GsUsbLink(backend=backend, **settings)
 
 
 @pytest.mark.parametrize("packet_bytes", [24, 64, 512])
@@ -53,22 +58,23 @@ def test_an_unplugging_that_comes_as_another_error(code):
             link.read(100.0)
 
 
-class PulledAfterAScan(GsUsbAdapter):
-    """Its cable comes out between the sixteenth frame and the next look for one."""
+class Watched(GsUsbAdapter):
+    """Adapter that hands on what `then` makes of each transfer and of the number of those so far."""
 
     fetched = 0
+    then = staticmethod(lambda number, data: data)
 
     def fetch(self, timeout_s):
         data = super().fetch(timeout_s)
         self.fetched += data is not None
-        if self.fetched == 16:
-            self.unplug()
-        return data
+        return self.then(self.fetched, data)
 
 
 def test_what_came_before_the_unplugging_is_not_lost():
-    port, link = opened(GsUsbPort(PulledAfterAScan))
+    """The cable comes out between the sixteenth frame and the next look for one."""
+    port, link = opened(GsUsbPort(Watched))
     with link:
+        port.adapter.then = lambda number, data: port.adapter.unplug() or data if number == 16 else data
         port.adapter.hear(*frames_of(1), stamp_us=1000)
         (scan,) = link.read(10.0)
         assert scan.complete
@@ -76,20 +82,17 @@ def test_what_came_before_the_unplugging_is_not_lost():
             link.read(10.0)
 
 
-def test_a_signal_is_not_an_unplugging():
-    signals = []
+def test_a_signal_is_not_an_unplugging(monkeypatch):
+    port, link = opened()
+    with link, monkeypatch.context() as patched:
 
-    class Interrupted(GsUsbAdapter):
-        def fetch(self, timeout_s):
-            if signals:
-                raise signals.pop()
-            return super().fetch(timeout_s)
+        def interrupted(timeout_s):
+            patched.undo()
+            raise usb.core.USBError("interrupted", -10, errno.EINTR)
 
-    port, link = opened(GsUsbPort(Interrupted))
-    with link:
-        signals.append(usb.core.USBError("interrupted", -10, errno.EINTR))
+        patched.setattr(port.adapter, "fetch", interrupted)
         port.adapter.hear(*frames_of(1), stamp_us=1000)
-        assert len(link.read(10.0)) == 1 and not signals
+        assert len(link.read(10.0)) == 1 and port.adapter.fetch is not interrupted
 
 
 def test_lost_frames_are_counted_and_told():
@@ -123,16 +126,9 @@ def test_the_state_that_the_controller_reports():
 
 
 def test_a_short_packet_ends_a_transfer():
-    class CutShort(GsUsbAdapter):
-        fetched = 0
-
-        def fetch(self, timeout_s):
-            data = super().fetch(timeout_s)
-            self.fetched += data is not None
-            return data[:13] if data and self.fetched == 21 else data
-
-    port, link = opened(GsUsbPort(CutShort))
+    port, link = opened(GsUsbPort(Watched))
     with link:
+        port.adapter.then = lambda number, data: data[:13] if data and number == 21 else data
         for number, frame in enumerate(frames_of(3)):
             port.adapter.hear(frame, stamp_us=10_000 * (number // 16) + 130 * (number % 16))
         scans = [scan for _ in range(48) for scan in link.read(0.0)]

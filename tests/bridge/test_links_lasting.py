@@ -7,7 +7,7 @@ from edge_samples import FakeLink, make_scan
 
 from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice
+from firmware_bridge.links.base import Link
 from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
@@ -115,14 +115,6 @@ def test_a_silence_that_turns_out_a_loss_is_one_outage():
     notices, link, _ = lasting(world, 7.0)
     assert kinds(notices) == ["silent", "lost", "back"] and link.counters()["outages"] == 1
     assert notices[-1].text == "slcan:x is back after 4.4 s"
-
-
-def test_each_outage_is_met_with_the_same_haste():
-    world = World(away=[(1.0, 20.0), (30.0, 30.35)], mute=[(40.0, 60.0), (70.0, 70.0 + LINK_SILENT_S + 0.015)])
-    notices, _, heard_s = lasting(world, 75.0)
-    assert kinds(notices) == ["lost", "back", "lost", "back", "silent", "back", "silent", "back"]
-    for back_s in (30.35, 70.0 + LINK_SILENT_S + 0.015):
-        assert next(time_s for time_s in heard_s if time_s > back_s) - back_s < 0.4
 
 
 def test_the_silence_of_one_that_is_back_begins_anew():
@@ -238,17 +230,3 @@ def test_the_doctor_knows_the_port_behind_a_name():
     link = SlcanSerialLink("/dev/ttyUSB7", 115_200)
     assert line_facts(link) == line_facts(LastingLink(link, name="left")) == LineFacts("/dev/ttyUSB7", 115_200)
     assert line_facts(FakeLink([])) == LineFacts() and FakeLink([]).can_ids() == frozenset()
-
-
-def test_trouble_and_notices_are_of_the_name():
-    class Telling(FakeLink):
-        def notices(self):
-            return [Notice(self.reads, "back", f"before read {self.reads}")]
-
-    inner = Telling([[make_scan(0)]])
-    inner.trouble = "bus-off"
-    with LastingLink(inner, None, name="left") as link:
-        assert [scan.sensor for scan in link.read(0)] == ["left/4"]
-        assert link.trouble == "bus-off"
-        told = [("left/", "left: bus-off"), ("left/", "left: before read 1")]
-        assert [(notice.sensors, notice.text) for notice in link.notices()] == told

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bridge_samples import make_counts, write_recording
+from bridge_samples import make_counts, write_npz, write_recording
 
 from firmware_bridge.errors import RecordingError, SourceError
 from firmware_bridge.links.registry import open_sources
@@ -28,13 +28,6 @@ class FakeTime:
 
 def replay(time: FakeTime, *paths, **options) -> ReplayLink:
     return ReplayLink(paths, clock=time.clock, sleep=time.sleep, **options)
-
-
-def write_npz(path, sensors, times_ns, counts, **more):
-    scan = np.arange(len(counts))
-    arrays = {"sensor": np.array(sensors), "scan": scan, "time_ns": np.array(times_ns), "counts": counts}
-    np.savez(path, format=np.array("tactile-recording"), version=np.array(1), **arrays, **more)
-    return path
 
 
 def test_a_csv_at_its_recorded_rate(tmp_path):
@@ -80,7 +73,7 @@ def test_sources_without_a_name_are_called_by_their_place(tmp_path):
 def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):
     counts = make_counts(4)
     times_ns = [500, 500 + 3 * MS, 500 + 30 * MS, 500 + 33 * MS]
-    path = write_npz(tmp_path / "both.npz", ["4", "6", "4", "6"], times_ns, counts, rate_hz=np.array(1.0))
+    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"], rate_hz=1.0)
     for rate_hz, due_ms in ((None, [0, 3, 30, 33]), (10, [0, 0, 100, 100])):
         time, scans = FakeTime(), []
         with replay(time, path, rate_hz=rate_hz) as link:
@@ -96,7 +89,7 @@ def test_torn_and_repeated_scans_are_told(tmp_path):
     counts = make_counts(2)[[0, 0, 1, 1]]
     counts[2, :, 1:] = counts[1, :, 1:]
     counts[3, :, 2, 2] = ABSENT
-    with replay(FakeTime(), write_npz(tmp_path / "one.npz", ["4"] * 4, range(4), counts)) as link:
+    with replay(FakeTime(), write_npz(tmp_path / "one.npz", counts, range(4))) as link:
         scans = [scan for _ in range(4) for scan in link.read(1.0)]
     assert [scan.repeated for scan in scans] == [False, True, False, False]
     assert [scan.torn for scan in scans] == [False, False, True, True]
@@ -121,7 +114,7 @@ def test_torn_and_repeated_scans_are_told(tmp_path):
 )
 def test_recordings_that_cannot_be_replayed(tmp_path, names, options, words):
     write_recording(tmp_path / "finger.csv", make_counts(2))
-    write_npz(tmp_path / "timed.npz", ["4"], [5], make_counts(1))
+    write_npz(tmp_path / "timed.npz", make_counts(1), [5])
     with pytest.raises(RecordingError if names == ["gone.csv"] else SourceError, match=words):
         ReplayLink([tmp_path / name for name in names], **options)
 

@@ -4,7 +4,7 @@ import os
 import time
 
 import pytest
-from bridge_samples import make_recording, read_scans, read_until_lost
+from bridge_samples import make_recording, read_scans
 from edge_samples import wait_for
 from serial_samples import SilentDevice
 
@@ -74,31 +74,6 @@ def test_the_same_stamp_again_is_a_minute_later():
     assert scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= MS
 
 
-def test_stamps_say_how_many_bytes_a_scan_needs():
-    plain, stamped = SlcanScans(), SlcanScans()
-    plain.feed(b"".join(cycle_lines(0)), 0)
-    stamped.feed(b"".join(cycle_lines(0, 0)), 0)
-    assert (plain.bytes_until_scan(), stamped.bytes_until_scan()) == (16 * 22, 16 * 26)
-    stamped.feed(cycle_lines(1, 10)[0] + b"t10", 0)
-    assert stamped.bytes_until_scan() == 15 * 26 - 3
-
-
-def test_firmware_without_stamps_and_flags_is_read_as_ever(monkeypatch):
-    monkeypatch.setattr(slcan_status, "INTERVAL_NS", 20 * MS)
-    recording = make_recording(40)
-    with Emulator([recording], old_canable=True, waits=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_until_lost(link)
-        counters = {name: count for name, count in link.counters().items() if count}
-        assert emulator.adapter.refused == 1  # closing what is not open, as ever
-    # Without stamps a busy machine's pause within a cycle tears it, as any pause of the bus; what is whole is true.
-    sent = [counts.tolist() for counts in recording.tracks[0].counts]
-    got = [scan.counts.tolist() for scan in scans if scan.complete]
-    assert got == [counts for counts in sent if counts in got] and len(got) > 20
-    lossless = {"received_bytes": 640 * 22, "frames": 640, "readings": 640}
-    assert counters.items() >= lossless.items() and (counters.keys() == lossless.keys() | {"scans"} or len(got) < 40)
-    assert {scan.device_ns for scan in scans} == {None} and link.trouble is None
-
-
 LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
 
 
@@ -165,17 +140,6 @@ def test_flags_are_asked_for_and_told(impatient):
         assert link.counters()["adapter_overrun"] == 1
         read_until(link, lambda: link.trouble is None)  # asking has cleared it
         assert link.counters()["bad_lines"] == 0
-
-
-def test_bus_off_is_told_at_once_and_over_with_the_next_frame():
-    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        read_scans(link, 3)
-        emulator.tell(emulator.adapter.state_line("b", 256, 256))
-        read_until(link, lambda: link.trouble == BUS_OFF)
-        assert link.counters()["adapter_bus_off"] == 1
-        emulator.tell(emulator.adapter.state_line("a", 0, 0))
-        read_until(link, lambda: link.trouble is None)
-        assert read_scans(link, 3)
 
 
 def test_a_silent_bus_with_errors_is_trouble(impatient):

@@ -62,58 +62,26 @@ class TestContract:
         assert got.dtype == np.float32
         np.testing.assert_allclose(got, expected, atol=1e-6)
 
-    @pytest.mark.parametrize("takes_gains", [False, True])
-    def test_without_inputs_there_is_the_certainty_of_gains_alone(self, takes_gains):
-        contract = make_contract(takes_gains=takes_gains)
-        assert contract.pad_row(PAD) == pytest.approx([0.9] * takes_gains)
-        assert list(contract.input_shapes) == ["window", "pad"][: 1 + takes_gains]
-
-    def test_what_is_written_is_read(self):
-        for contract in (make_pad_contract(), make_contract()):
-            assert Contract.from_metadata(contract.to_metadata()) == contract
-
     @pytest.mark.parametrize(
         ("key", "value", "expected"),
         [
             ("pad_inputs", "[4]", "a list of [name, centre, spread]"),
             (
                 "pad_inputs",
-                '[["thickness", 1, 1]]',
-                "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane_share",
+                '[[["thickness_mm"], 1, 1]]',
+                "names of: thickness_mm, shear_modulus_mpa, poisson, in_plane",
             ),
-            ("pad_inputs", '[[["thickness_mm"], 1, 1]]', "a list of"),
             ("pad_inputs", '[["thickness_mm", 4]]', "a list of"),
             ("pad_inputs", '[["thickness_mm", -4, 1]]', "centre as a pad may have it"),
-            ("pad_inputs", '[["thickness_mm", 4, 0]]', "spread from 1e-06"),
             ("pad_inputs", '[["thickness_mm", 4, true]]', "a list of"),
             ("pad_inputs", '[["poisson", 0.4, 0.1], ["poisson", 0.4, 0.1]]', "no name twice"),
-            ("takes_gains", "null", "true or false"),
             ("traction_scale", "0", "a whole number from 1 to 256, or null"),
             ("traction_scale", "true", "a whole number"),
-            ("traction_scale", "256", "at most 1048576 numbers"),
-            *[(key, "65", "64") for key in ("taps", "rows", "cols")],
-            ("batch", "1025", "1024"),
         ],
     )
     def test_what_cannot_be_is_refused_by_name(self, key, value, expected):
         with pytest.raises(ModelError, match=re.escape(f"'{key}' is ") + ".*" + re.escape(expected)):
             Contract.from_metadata(make_pad_contract().to_metadata() | {f"tactile.{key}": value})
-
-    @pytest.mark.parametrize(
-        ("pad", "outside"),
-        [
-            (None, False),
-            (Pad(poisson=0.1), False),
-            (Pad(thickness_mm=5.25), False),
-            (Pad(thickness_mm=5.5), True),
-            (Pad(thickness_mm=3.5), True),
-            (Pad(thickness_mm=5.5, intervals={"thickness_mm": (5.25, 6.0)}), False),
-            (Pad(thickness_mm=5.5, intervals={"thickness_mm": (5.375, 6.0)}), True),
-        ],
-    )
-    def test_a_pad_far_from_those_in_training_is_outside(self, pad, outside):
-        contract = make_contract(pad_inputs=(("thickness_mm", 4.5, 0.5),))
-        assert contract.is_outside(pad) is outside
 
 
 class TestSession:
@@ -132,29 +100,13 @@ class TestSession:
     @pytest.mark.parametrize(
         ("graph", "message"),
         [
-            (
-                {"pad_name": "gel"},
-                r"input is window .*, gel tensor\(float\) \[1, 5\], but .* pad tensor\(float\) \[1, 5\]",
-            ),
+            ({"pad_name": "gel"}, r"window .*, gel tensor\(float\) \[1, 5\], but .* pad tensor\(float\) \[1, 5\]"),
             ({"pad_width": 4}, r"pad tensor\(float\) \[1, 4\], but .* pad tensor\(float\) \[1, 5\]"),
             ({"pad_width": 0}, r"input is window tensor\(float\) \[1, 12, 4, 4\], but .* pad tensor"),
-            (
-                {"with_traction": False},
-                r"output is pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]",
-            ),
-            (
-                {"contract": make_contract(), "pad_width": 5},
-                r"pad tensor\(float\) \[1, 5\], but .* states window [^p]*$",
-            ),
+            ({"with_traction": False}, r"pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]"),
+            ({"contract": make_contract(), "pad_width": 5}, r"pad tensor\(float\) \[1, 5\], .* states window [^p]*$"),
             ({"contract": make_contract(), "with_traction": True}, r"traction tensor\(float\) \[1, 3, 4, 4\], but"),
-            (
-                {"metadata": make_pad_contract(traction_scale=3).to_metadata()},
-                r"\[1, 3, 8, 8\], but .*\[1, 3, 12, 12\]",
-            ),
-            (
-                {"metadata": make_contract().to_metadata()},
-                r"pad tensor\(float\) \[1, 5\], but its contract states window tensor\(float\) \[1, 12, 4, 4\]$",
-            ),
+            ({"metadata": make_pad_contract(traction_scale=3).to_metadata()}, r"3, 8, 8\], but .*\[1, 3, 12, 12\]"),
         ],
     )
     def test_a_graph_that_breaks_its_contract_is_refused(self, tmp_path, graph, message):

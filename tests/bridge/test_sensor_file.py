@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hostile_samples import one_line
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_mounting import mountings
@@ -101,6 +102,7 @@ def text_of(**changes):
     [
         ("format", '"tactile-baseline"', "'tactile-sensor'"),
         ("version", "2", "expected 1"),
+        ("version", "0x" + "f" * 1999, "expected 1"),
         ("model", '"XR9"', "'uSPa44' or 'uSPa46' or 'XR1944' or 'A' or 'B'"),
         ("adapter", '""', "printable"),
         ("order", GRID.replace("15", "14"), "each of 0..15 once"),
@@ -108,11 +110,11 @@ def text_of(**changes):
         ("swap_xy", "1", "true or false"),
         ("signs", "[1, 1, 2]", "1 or -1 for each of x, y, z"),
         ("signs", "[1, 1, true]", "1 or -1"),
-        ("gains", "[1, 1, 0]", "positive numbers, 3, or 3 x 4 x 4"),
+        *(("gains", f"[1, 1, {last}]", "positive numbers, 3, or 3 x 4 x 4") for last in ("0", "1" + "0" * 400)),
         ("gains", f"[{GRID}, {GRID}]", "positive numbers, 3, or 3 x 4 x 4"),
-        ("counts_per_newton", "nan", "a number from 0.001 to 1e+06"),
+        *(("counts_per_newton", value, "a number from 0.001 to 1e+06") for value in ("nan", "1" + "0" * 400)),
         ("id", '"ffff"', "which the counts give, or none; the baseline was changed"),
-        ("created_unix_s", "0", "a number from 1 to 1e+11"),
+        *(("created_unix_s", value, "a number from 1 to 1e+11") for value in ("0", "1" + "0" * 400)),
         ("scans", "1.0", "a whole number from 1"),
         ("x", GRID.replace("15", "65536"), "numbers 0..65535"),
         ("y", "", "missing"),
@@ -123,7 +125,7 @@ def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value, expe
     with pytest.raises(SensorFileError, match=re.escape(expected)) as refused:
         load_sensor_file(tmp_path / "s.toml")
     assert str(refused.value).startswith(f"{tmp_path}/s.toml, '") and f"{key}'" in str(refused.value)
-    assert "\n" not in str(refused.value)
+    assert one_line(refused)
 
 
 HEAD = 'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n'
@@ -144,6 +146,8 @@ OF_GAINS, PLACE = f"gains = {[1.0] * 48}\n", "place_mm = [0, 0, 0]\n"
         (HEAD + f"[sensors.{'x' * 65}]\n", "names of 1 to 64 printable characters"),
         ("format = ", "not TOML"),
         ("\udc80", "not TOML"),
+        (text_of(version="1" + ".a" * 30_000), "a line longer than 2048 bytes"),
+        (text_of(version="1\n" + "#" * 70_000), "larger than the 65,536 bytes"),
         (None, "cannot be read: No such file"),
         (PAD + "thickness = 4.5", "'sensors.4.pad.thickness': not known, expected one of thickness_mm, thickness_mm_"),
         (PAD + "thickness_mm = 0", "'sensors.4.pad.thickness_mm': 0, expected a number from 0.1 to 100"),
@@ -169,8 +173,9 @@ def test_what_is_no_sensor_file_is_refused(tmp_path, text, words):
     path = tmp_path / "s.toml"
     if text is not None:
         path.write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(SensorFileError, match=re.escape(words)):
+    with pytest.raises(SensorFileError, match=re.escape(words)) as refused:
         load_sensor_file(path)
+    assert one_line(refused)
 
 
 def test_a_short_file_by_hand_is_enough(tmp_path):

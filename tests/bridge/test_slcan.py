@@ -1,36 +1,43 @@
+"""Lines of slcan and their frames, whole and damaged."""
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slcan_samples import (
-    GOLDEN,
-    GOLDEN_FRAME,
-    OTHER,
-    OTHER_FRAME,
-    STAMPED,
-    decode,
-    frames,
-    plain_frames,
-    stamped_frames,
+
+from firmware_bridge.can.slcan import LINES_TO_LEARN, LONGEST_LINE, CanFrame, SlcanDecoder, encode_frame
+
+# Two frames as a sensor sent them.
+GOLDEN = b"t0048937E317E1593120F\r"
+GOLDEN_FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
+OTHER = b"t1048938406805591BB0C\r"
+OTHER_FRAME = CanFrame(0x104, bytes.fromhex("938406805591BB0C"))
+STAMPED = [GOLDEN[:-1] + b"%04X\r" % stamp_ms for stamp_ms in (0, 1, 0x1234, 59_999)]
+
+
+def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
+    """Return the frames, and the counters that are not zero."""
+    decoder = SlcanDecoder()
+    frames = [frame for chunk in chunks for frame in decoder.feed(chunk)]
+    return frames, {name: count for name, count in decoder.counters().items() if count}
+
+
+def frames_of(*, extended: bool, remote: bool, stamped: bool) -> st.SearchStrategy[CanFrame]:
+    return st.builds(
+        CanFrame,
+        st.integers(0, 0x1FFFFFFF if extended else 0x7FF),
+        st.binary(max_size=0 if remote else 8),
+        st.just(extended),
+        st.just(remote),
+        st.integers(0, 59_999) if stamped else st.none(),
+    )
+
+
+kinds = [(extended, remote) for extended in (False, True) for remote in (False, True)]
+plain_frames, stamped_frames = (
+    st.one_of([frames_of(extended=extended, remote=remote, stamped=stamped) for extended, remote in kinds])
+    for stamped in (False, True)
 )
-
-from firmware_bridge.can.slcan import (
-    BITRATE_1M,
-    CLOSE,
-    LINES_TO_LEARN,
-    LONGEST_LINE,
-    OPEN,
-    STAMPED_BYTES,
-    STAMPS_OFF,
-    STAMPS_ON,
-    CanFrame,
-    SlcanDecoder,
-    encode_frame,
-)
-
-
-def test_commands_are_what_adapters_know():
-    assert (CLOSE, BITRATE_1M, OPEN) == (b"C\r", b"S8\r", b"O\r")
-    assert (STAMPS_ON, STAMPS_OFF) == (b"Z1\r", b"Z0\r")
+frames = plain_frames | stamped_frames
 
 
 @given(st.lists(plain_frames, max_size=20) | st.lists(stamped_frames, max_size=20))
@@ -163,6 +170,10 @@ def test_a_stamp_beyond_a_minute_is_none():
 )
 def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     few = LINES_TO_LEARN - 1
+    decoder = SlcanDecoder()
+    assert decoder.usual_line_bytes == len(GOLDEN)
+    decoder.feed(b"".join(usual))
+    assert decoder.usual_line_bytes == len(usual[0])
     # Before that both are taken, in any order.
     assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few
     # Then those of the other form are bad lines: damage, such as four lost digits.
@@ -185,19 +196,78 @@ def test_what_breaks_the_row_begins_it_anew():
     assert len(decoder.feed(STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
 
 
-def test_stamped_lines_are_packed_too():
-    decoder = SlcanDecoder()
-    decoder.feed(b"".join(STAMPED))
-    (piece,) = decoder.cut(STAMPED[2] * 16)
-    assert not isinstance(piece, CanFrame)
-    assert piece == (bytes.fromhex("0048 937E317E1593120F 1234") * 16, STAMPED_BYTES)
-    assert decoder.usual_line_bytes == len(STAMPED[0])
-    assert decoder.feed(STAMPED[2] * 2) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)] * 2
-    assert SlcanDecoder().usual_line_bytes == len(GOLDEN)
+# Damaged lines: bytes that are changed, cut, lost or of noise.
 
 
-def test_the_longest_frame_fits_the_bound():
-    longest = CanFrame(0x1FFFFFFF, bytes(range(8)), extended=True, timestamp_ms=59_999)
-    line = encode_frame(longest)
-    assert len(line) == LONGEST_LINE + 1
-    assert decode(b"?" * 50 + line[:-1], line[-1:])[0] == [longest]
+def test_every_byte_at_every_place_of_a_line():
+    """One corrupted byte has no effect, loses the frame, or puts another digit in its place."""
+    digits = b"0123456789ABCDEFabcdef"
+    for place in range(len(GOLDEN)):
+        for byte in range(256):  # of a stream that has taught no form yet
+            line = bytearray(GOLDEN)
+            line[place] = byte
+            got, counters = decode(bytes(line) + OTHER)
+            assert got[-1:] == [OTHER_FRAME], (place, byte)
+            where_digits_are = 1 <= place < len(GOLDEN) - 1 and place != 4
+            if line == GOLDEN or (place > 0 and line.upper() == GOLDEN.upper()):
+                assert got[:-1] == [GOLDEN_FRAME] and counters == {"frames": 2}, (place, byte)
+            elif where_digits_are and byte in (digits if place > 1 else b"01234567"):
+                assert len(got) == 2 and counters == {"frames": 2}, (place, byte)
+                assert bin(_bits(got[0]) ^ _bits(GOLDEN_FRAME)).count("1") <= 4, (place, byte)
+            else:
+                # A letter in mid-line may start a shorter frame, a length of 6 leaves four digits for a time
+                # stamp; but eight bytes of data come of nothing, and every loss is counted.
+                assert all(len(frame.data) < 8 or frame.extended for frame in got[:-1]), (place, byte)
+                assert len(got) == 2 or {"bad_lines", "non_ascii_lines", "skipped_bytes"} & counters.keys()
+            if byte >= 0x80:
+                assert got == [OTHER_FRAME], (place, byte)
+
+
+def _bits(frame: CanFrame) -> int:
+    return frame.can_id << 64 | int.from_bytes(frame.data, "big")
+
+
+def test_every_cut_of_a_line():
+    for start in range(len(GOLDEN)):
+        for end in range(start, len(GOLDEN)):
+            got, _ = decode(GOLDEN[:start] + GOLDEN[end:] + OTHER)
+            assert got == ([GOLDEN_FRAME, OTHER_FRAME] if start == end else [OTHER_FRAME]), (start, end)
+
+
+@pytest.mark.parametrize(
+    ("stream", "frames", "counted"),
+    [
+        (GOLDEN[:12] + OTHER, 1, {"skipped_bytes": 12}),
+        (GOLDEN[:-1] + OTHER, 1, {"skipped_bytes": 21}),
+        (OTHER + GOLDEN[:9] + b"\xb1" + GOLDEN[10:] + OTHER, 2, {"non_ascii_lines": 1, "skipped_bytes": 21}),
+        (b"\xff\xfe" + OTHER, 1, {"skipped_bytes": 2}),
+        (b"A" * 10_000 + OTHER, 1, {"skipped_bytes": 10_000}),
+        (b"A" * 10_000 + b"\r" + OTHER, 1, {"bad_lines": 1, "skipped_bytes": 10_000}),
+    ],
+)
+def test_damage_spoils_the_frame_it_falls_into_and_no_other(stream, frames, counted):
+    assert decode(stream) == ([OTHER_FRAME] * frames, {"frames": frames} | counted)
+
+
+def test_a_line_without_end_is_counted_while_it_goes_on():
+    """A line at the wrong speed may never end."""
+    assert decode(b"A" * 10_000)[1] == {"skipped_bytes": 10_000 - LONGEST_LINE}
+
+
+@given(st.lists(st.sampled_from([GOLDEN, OTHER[:9], b"\xff", b"z\r", b"\r", b"\a", b"junk"]), max_size=60))
+@settings(deadline=None)
+def test_every_byte_is_a_frame_a_reply_or_skipped(pieces):
+    stream = b"".join(pieces) + b"\r"
+    got, counters = decode(stream)
+    ends, lone_z = stream.count(b"\r") + stream.count(b"\a"), stream.replace(b"\a", b"\r").split(b"\r").count(b"z")
+    assert counters.get("frames", 0) == len(got)
+    assert len(stream) == counters.get("skipped_bytes", 0) + 21 * len(got) + ends + lone_z
+
+
+def test_no_loss_makes_a_frame_once_stamps_are_learnt():
+    line = STAMPED[2]
+    for start in range(len(line)):
+        for end in range(start + 1, len(line)):
+            decoder = SlcanDecoder()
+            decoder.feed(line * LINES_TO_LEARN)
+            assert decoder.feed(line[:start] + line[end:] + line) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)]

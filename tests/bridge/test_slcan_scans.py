@@ -1,4 +1,4 @@
-"""slcan text to scans in one go: cycles read late, mixed or in pieces of any length, and the CAN ids that came."""
+"""slcan text to scans in one go: cycles that mix, in pieces of any length, and the CAN ids that came."""
 
 import random
 
@@ -7,100 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, XR1944_MAP
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
-
-ORDERS = {name: [can_id for can_id, _ in USPA44_MAP.wire_order(name)] for name in ("4", "6", "8", "10")}
-FRAME_MS = 0.52
-
-
-def on_the_bus(rng, cycles, *, stamped, faults):
-    """Lines with the time of each in ms: four sensors whose cycles take most of the time, and one foreign frame."""
-    sent = []
-    for lane, order in enumerate(ORDERS.values()):
-        for cycle in range(cycles):
-            begun_ms = 10 * cycle + 2 * lane + rng.random()
-            for place, can_id in enumerate(order):
-                if rng.random() >= faults:
-                    data = bytes([rng.randrange(256) for _ in range(8)])
-                    sent += [(begun_ms + FRAME_MS * place, CanFrame(can_id, data))] * (1 + (rng.random() < faults))
-    sent += [(10.0 * cycle + 3, CanFrame(0x7F0, bytes(8))) for cycle in range(0, cycles, 7)]
-    sent.sort(key=lambda timed: timed[0])
-    return [
-        (time_ms, encode_frame(frame._replace(timestamp_ms=int(time_ms + 59_900) % 60_000) if stamped else frame))
-        for time_ms, frame in sent
-    ]
-
-
-def fed(scans, lines, rng, longest_ms):
-    """Feed the lines in reads of random length, which may end within a line; return the scans."""
-    came, waiting, due_ms = [], b"", 0.0
-    for time_ms, line in [*lines, (lines[-1][0] + 1000, b"")]:
-        if time_ms >= due_ms:
-            kept = rng.randrange(20) if line else 0
-            data, waiting = waiting[: len(waiting) - kept], waiting[max(len(waiting) - kept, 0) :]
-            came += scans.feed(data, int(due_ms * 1e6))
-            due_ms = time_ms + rng.uniform(0, longest_ms)
-        waiting += line
-    return came
-
-
-@pytest.mark.parametrize("faults", [0.0, 0.002, 0.05])
-@pytest.mark.parametrize("longest_ms", [6.0, 60.0])
-def test_mixed_cycles_give_the_scans_of_their_frames(longest_ms, faults):
-    for seed in range(2):
-        lines = on_the_bus(random.Random(seed), 60, stamped=True, faults=faults)
-        mixed, one_by_one = SlcanScans(), SlcanScans()
-        got = fed(mixed, lines, random.Random(seed), longest_ms)
-        expected = [scan for ms, line in lines for scan in one_by_one.feed(line, int(ms * 1e6))]
-        for name in ORDERS:
-            mine, theirs = ([scan for scan in some if scan.sensor == name] for some in (got, expected))
-            assert len(theirs) > 40
-            for scan, other in zip(mine, theirs, strict=True):
-                assert (scan.number, scan.counts.tolist()) == (other.number, other.counts.tolist())
-                assert (scan.renewed == other.renewed).all()
-        assert mixed.can_ids == one_by_one.can_ids
-        counts = mixed.counters()
-        assert counts == one_by_one.counters() and counts["frames"] == counts["readings"] + counts["foreign"]
-
-
-def test_no_scan_closes_when_a_link_breaks():
-    """Frames wait for the end of their cycle, with a pause among them; a break of the link closes no scan."""
-    abandoned = 0
-    for seed in range(12):
-        rng = random.Random(seed)
-        scans, got, text, late_ms = SlcanScans(), 0, b"", 0
-        for time_ms, line in on_the_bus(rng, 30, stamped=False, faults=0.02):
-            late_ms += rng.choice([5, 30, 200]) if rng.random() < 0.01 else 0
-            stamp_ms = int(time_ms + late_ms)
-            text += line[:-1] + b"%04X\r" % stamp_ms
-            if rng.random() < 0.05:
-                got, text = got + len(scans.feed(text, stamp_ms * 1_000_000)), b""
-                if rng.random() < 0.2:
-                    scans.begin_anew()
-        counts = scans.counters()
-        assert counts["scans"] == got > 0
-        abandoned += counts["abandoned"]
-        assert counts["frames"] == counts["readings"] + counts["foreign"]
-    assert abandoned > 300
-
-
-def test_without_stamps_nothing_waits():
-    scans = SlcanScans()
-    for stamped in (False, True, False, True):
-        lines = [line for _, line in on_the_bus(random.Random(2), 3, stamped=stamped, faults=0.0)]
-        scans.feed(b"".join(lines[:150]), 0)
-        counts = scans.counters()
-        assert counts["frames"] == counts["readings"] + counts["foreign"]
-        if stamped:
-            assert scans.bytes_until_scan() < 16 * 26
-        scans.begin_anew()
-    counts = scans.counters()
-    assert (
-        counts["readings"]
-        == 16 * counts["scans"] + counts["abandoned"] + counts["unconfirmed"] + (counts["resynchronised"])
-    )
 
 
 def test_a_cycle_read_in_one_piece_with_a_pause_in_it_is_two():
@@ -159,30 +68,26 @@ def test_the_head_of_a_line_with_a_later_tail_is_no_reading():
     assert scan.complete and scans.counters()["foreign"] == 1, "a damaged line is none, and the next is whole"
 
 
-def text_of(numbers: range, model=USPA44_MAP) -> bytes:
-    lines = []
-    for number in numbers:
-        for can_id, taxel in model.wire_order("4"):
-            words = b"".join(value.to_bytes(2, "big") for value in (taxel, number, 1000 * taxel + number))
-            lines.append(encode_frame(CanFrame(can_id, b"\x93" + words + b"\x0f")))
+def text_of(cycles: int, sensors: tuple[str, ...], *, stamped: bool) -> bytes:
+    """Return lines of sensors whose cycles mix, each a frame later than the one before."""
+    orders, lines = [USPA44_MAP.wire_order(sensor) for sensor in sensors], []
+    for number in range(cycles):
+        for place in range(16 + len(orders)):
+            for lane, order in enumerate(orders):
+                if 0 <= place - lane < 16:
+                    can_id, taxel = order[place - lane]
+                    words = b"".join(value.to_bytes(2, "big") for value in (taxel, number, 1000 * taxel + number))
+                    stamp_ms = (59_950 + 10 * number + place // 4) % 60_000 if stamped else None
+                    lines.append(encode_frame(CanFrame(can_id, b"\x93" + words + b"\x0f", timestamp_ms=stamp_ms)))
     return b"".join(lines)
 
 
-def test_the_wrong_model_shows_half_of_the_taxels():
-    for sent, read in ((USPA44_MAP, XR1944_MAP), (XR1944_MAP, USPA44_MAP)):
-        scans = SlcanScans(read)
-        got = scans.feed(text_of(range(4), sent), 0)
-        # Of four cycles the first does not prove a sensor yet, and nothing has closed the last.
-        assert [int(scan.fresh.sum()) for scan in got] == [8, 8]
-        assert scans.counters()["foreign"] == 32
-
-
-@given(st.integers(0, 2**32))
-@settings(deadline=None, max_examples=60)
-def test_any_chunking_gives_the_same_scans_and_counters(seed):
-    noise = random.Random(seed)
-    stream = bytearray(text_of(range(6)))
-    for _ in range(noise.randrange(30)):
+@given(st.integers(0, 2**32), st.sampled_from(("4", "46", "468a")), st.booleans(), st.integers(0, 30))
+@settings(deadline=None, max_examples=120)
+def test_any_chunking_gives_the_same_scans_and_counters(seed, sensors, stamped, faults):
+    noise, names = random.Random(seed), tuple(str(int(sensor, 16)) for sensor in sensors)
+    stream = bytearray(text_of(8, names, stamped=stamped))
+    for _ in range(faults):
         place = noise.randrange(len(stream))
         match noise.randrange(4):
             case 0:
@@ -193,16 +98,36 @@ def test_any_chunking_gives_the_same_scans_and_counters(seed):
                 stream[place] = noise.randrange(256)
             case 3:
                 stream[place:place] = stream[place : place + noise.randrange(60)]
-    whole = SlcanScans()
-    expected = whole.feed(bytes(stream), 0)
     cuts = sorted(noise.randrange(len(stream) + 1) for _ in range(noise.randrange(40)))
-    chunked = SlcanScans()
-    got = [
-        scan
-        for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)
-        for scan in chunked.feed(bytes(stream[a:b]), 0)
-    ]
-    assert chunked.counters() == whole.counters()
-    assert [scan.number for scan in got] == [scan.number for scan in expected]
-    for one, other in zip(got, expected, strict=True):
-        assert (one.counts == other.counts).all() and (one.renewed == other.renewed).all()
+    pieces = [bytes(stream[a:b]) for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
+    whole, chunked = SlcanScans(), SlcanScans()
+    expected, got = whole.feed(bytes(stream), 0), [scan for piece in pieces for scan in chunked.feed(piece, 0)]
+    for scans in (whole, chunked):
+        assert scans.counters()["frames"] == scans.counters()["readings"] + scans.counters()["foreign"]
+        scans.begin_anew()  # frames that wait for the end of their cycle close none when the link breaks
+    counts = whole.counters()
+    assert chunked.counters() == counts and chunked.can_ids == whole.can_ids and counts["scans"] == len(expected)
+    assert faults or counts["scans"] == 8 * len(names)
+    for name in names:
+        mine, theirs = ([scan for scan in some if scan.sensor == name] for some in (got, expected))
+        for one, other in zip(mine, theirs, strict=True):
+            assert one.number == other.number
+            assert (one.counts == other.counts).all() and (one.renewed == other.renewed).all()
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.002, 0.05])
+@pytest.mark.parametrize("longest", [40, 400])
+def test_mixed_cycles_read_late_give_the_scans_of_their_frames(longest, lost):
+    noise, names = random.Random(longest), ("4", "6", "8", "10")
+    lines = text_of(60, names, stamped=True).split(b"\r")[:-1]
+    timed = [(150_000 * at, line + b"\r") for at, line in enumerate(lines) if noise.random() >= lost]
+    late, one_by_one, got, at = SlcanScans(), SlcanScans(), [], 0
+    expected = [scan for now_ns, line in timed for scan in one_by_one.feed(line, now_ns)]
+    while at < len(timed):
+        piece = timed[at : at + noise.randint(1, longest)]
+        got, at = got + late.feed(b"".join(line for _, line in piece), piece[-1][0]), at + len(piece)
+    assert late.counters() == one_by_one.counters() and len(got) > 200
+    for name in names:
+        mine, theirs = ([scan for scan in some if scan.sensor == name] for some in (got, expected))
+        for scan, other in zip(mine, theirs, strict=True):
+            assert (scan.number, scan.counts.tolist()) == (other.number, other.counts.tolist())

@@ -72,12 +72,6 @@ def test_what_is_trouble_and_until_when(lines, frames, in_silence, trouble):
     assert status.trouble(frames, flags_of_a_silence=in_silence) == trouble
 
 
-def test_flags_are_forgotten_on_request():
-    status = told(b"F08")
-    status.forget()
-    assert status.trouble(0) is None and counted(status)["adapter_overrun"] == 1
-
-
 MS = 1_000_000
 T0 = 10**12
 

@@ -67,7 +67,7 @@ LEFT_OUT = {
     r"ros2 .*": "needs ROS",
     r"lerobot-record .*|tactile-sr-to-lerobot .*": "needs LeRobot; test_lerobot runs it where that is installed",
     r"pip install -e \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
-    r"python examples/viewers/rerun_view\.py .*": "needs Rerun; test_mcap_viewers runs it where that is installed",
+    r"python examples/viewers/rerun_view\.py .*": "needs Rerun; test_mcap_recording runs it where that is installed",
     r"your-robot-program \| .*": "is the reader's own; test_poses_stdin pipes poses of a program",
     r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
     r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",

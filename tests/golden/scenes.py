@@ -13,8 +13,10 @@ import numpy as np
 if __name__ == "__main__":  # as pyproject.toml has it for pytest
     sys.path[:0] = [str(Path(__file__).parents[1] / "support"), str(Path(__file__).parents[2])]
 
+from bridge_samples import write_npz
+from bridge_samples import write_recording as write_csv
 from golden_runs import EDGE_SR, Adapter, brief, differences, edge_sr, environment, short
-from golden_world import ABSENT, FREE_SCANS, PRESSES, gripped, pressed, write_csv, write_npz
+from golden_world import ABSENT, FREE_SCANS, PRESSES, gripped, pressed
 
 from edge.api import demo_recording
 

@@ -235,13 +235,6 @@ def test_whatever_comes_a_parser_keeps_its_promise(name, number, changes):
     TARGETS[name][0](damaged(seeds(name)[number % len(seeds(name))], changes))
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", TARGETS)
-def test_what_is_begun_with_is_kept_too(name):
-    for seed in seeds(name):
-        TARGETS[name][0](seed)
-
-
 LOADERS = {"numpy.load": ("allow_pickle", False), "torch.load": ("weights_only", True)}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, make_contract
+from edge_samples import make_contract
 from hostile_samples import archive, npy, one_line, recording_arrays, stored
 
 from edge.errors import EdgeError, ModelError
@@ -22,7 +22,7 @@ from firmware_bridge.recording import npz_recording as recording
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.npz_reader import read_npz
-from firmware_bridge.zeroing.baseline import load_baselines, save_baselines
+from firmware_bridge.zeroing.baseline import load_baselines
 from train.data.presses import load_presses
 from train.errors import CheckpointError, DatasetError
 from train.learning.checkpoint import load_network
@@ -177,43 +177,17 @@ class TestText:
         with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):
             load_recording(path)
 
-    @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "1" * 10_000, "\xff", "NaN", '"', ""])
-    def test_json_that_no_parser_should_choke_on(self, tmp_path, text):
-        path = tmp_path / "file.json"
-        path.write_bytes(text.encode("latin1"))
-        with pytest.raises(RecordingError) as raised:
-            load_baselines(path)
-        assert one_line(raised)
-
-    @pytest.mark.parametrize(
-        ("key", "value"),
-        [("created_unix_s", 10**400), ("created_unix_s", 1e300), ("sensor", "4\x1b[2J"), ("sensor", "x" * 65)],
-    )
-    def test_a_baseline_of_values_that_nothing_can_be_done_with(self, tmp_path, key, value):
-        path = tmp_path / "zero.json"
-        save_baselines(path, [BASELINE])
-        document = json.loads(path.read_text())
-        document["baselines"][0][key] = value
-        path.write_text(json.dumps(document))
-        with pytest.raises(RecordingError, match=f"'{key}'") as raised:
-            load_baselines(path)
-        assert one_line(raised)
-
 
 class TestContract:
     @pytest.mark.parametrize(
         ("key", "text"),
         [
-            ("taps", "1000000"),
             ("scale", "9" * 5000),
             ("pitch_mm", "1" + "0" * 400),
-            ("pitch_mm", "1e-300"),
-            ("counts_per_unit", "[1e-300, 1, 1]"),
             ("counts_per_unit", "[NaN, 1, 1]"),
             ("output_full_scale", "1e300"),
             ("interval_factor", "Infinity"),
             ("confidence", "[" * 60_000),
-            ("test_error", " " * 70_000),
             ("sensor", '"a\\nb"'),
         ],
     )
@@ -222,8 +196,3 @@ class TestContract:
         with pytest.raises(ModelError, match=f"'{key}'") as raised:
             Contract.from_metadata(metadata)
         assert one_line(raised)
-
-    def test_a_pattern_of_too_many_pixels(self):
-        metadata = make_contract(scale=255, rows=64, cols=64).to_metadata()
-        with pytest.raises(ModelError, match=r"'scale' is 255, expected patterns of at most 1048576 pixels"):
-            Contract.from_metadata(metadata)

@@ -3,7 +3,6 @@
 import json
 import re
 import struct
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.mcap_records import MOST_RECORD_BYTES
 from firmware_bridge.recording.scan_messages import BASELINE, SCAN, SENSOR
 
-MEMORY_LIMIT_BYTES = 60_000_000
+pytestmark = pytest.mark.usefixtures("bounded_memory")
 GOOD = {
     "header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "4"},
     "sensor": "4",
@@ -47,15 +46,6 @@ REST = {
     "age_s": 1.0,
     "counts": np.full(48, 16_000.0),
 }
-
-
-@pytest.fixture(autouse=True)
-def bounded_memory():
-    tracemalloc.start()
-    yield
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < MEMORY_LIMIT_BYTES
 
 
 def written(tmp_path, *records, magic=MCAP0_MAGIC):

@@ -2,13 +2,15 @@
 
 import csv
 import os
+import random
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
+from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
 from firmware_bridge.recording.csv_reader import CSV_HEADER
@@ -27,6 +29,12 @@ def make_counts(scans: int, seed: int = 0) -> np.ndarray:
     return (REST_COUNTS + noise + 40 * (np.arange(scans) % 2)[:, None, None, None]).astype(np.int32)
 
 
+def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
+    """Return the frames of so many scans that all differ."""
+    noise = random.Random(seed)
+    return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
+
+
 def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recording:
     return Recording(Path("made.csv"), (Track("4", make_counts(scans, seed), None),), rate_hz)
 
@@ -42,21 +50,19 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     return path
 
 
-class _Played(Protocol):
-    lost_frames: int
-
-
-_P = TypeVar("_P", bound=_Played)
-
-
-def undisturbed(play: Callable[[], _P], tries: int = 4) -> _P:
-    """Return a play without a lost frame, since the terminal overflows where the machine stands still."""
-    played = play()
-    for _ in range(tries - 1):
-        if not played.lost_frames:
-            break
-        played = play()
-    return played
+def write_npz(path: Path, counts: np.ndarray, time_ns: Any = None, sensors: Any = None, **more: Any) -> Path:
+    """Write a recording for numpy: by default of one sensor, at 100 Hz."""
+    scan = np.arange(len(counts))
+    arrays: dict[str, Any] = {
+        "format": "tactile-recording",
+        "version": 1,
+        "sensor": np.array(["4"] * len(counts) if sensors is None else sensors),
+        "scan": scan,
+        "time_ns": np.array(scan * 10_000_000 if time_ns is None else time_ns),
+        "counts": counts,
+    }
+    np.savez(path, **arrays, **more)
+    return path
 
 
 def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:

@@ -14,6 +14,7 @@ from queue import Empty, Queue
 
 import numpy as np
 import pytest
+from bridge_samples import write_npz
 from edge_samples import ROOT
 
 from edge.api import load_model
@@ -157,9 +158,7 @@ def emulated(folder, *tracks, options=()):
     recordings = []
     for counts in tracks:
         path = folder / f"{len(list(folder.glob('*.npz')))}.npz"
-        facts = {"format": "tactile-recording", "version": 1, "sensor": ["4"] * len(counts)}
-        times_ns = np.arange(len(counts)) * PERIOD_NS
-        np.savez(path, **facts, scan=np.arange(len(counts)), time_ns=times_ns, counts=counts.astype(np.int32))
+        write_npz(path, counts.astype(np.int32))
         recordings.append(load_recording(path))
     # A link of its own, for a pseudo-terminal that is gone may be given to another test, and the run tries it again.
     with Emulator(recordings, loop=True, link=folder / "port") as emulator:

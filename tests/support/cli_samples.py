@@ -11,6 +11,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from bridge_samples import write_npz
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, wait_for, write_model
 
 from edge.cli import main as cli
@@ -22,17 +23,8 @@ TIMEOUT_S = 60
 
 
 def write_recording(path: Path, presses, period_ns=10_000_000) -> Path:
-    scans = [make_scan(n, press_counts=press, noise=3) for n, press in enumerate(presses)]
-    np.savez(
-        path,
-        format=np.array("tactile-recording"),
-        version=np.array(1),
-        sensor=np.array(["4"] * len(scans)),
-        scan=np.arange(len(scans)),
-        time_ns=np.arange(len(scans)) * period_ns,
-        counts=np.stack([scan.counts for scan in scans]),
-    )
-    return path
+    counts = np.stack([make_scan(n, press_counts=press, noise=3).counts for n, press in enumerate(presses)])
+    return write_npz(path, counts, np.arange(len(counts)) * period_ns)
 
 
 @pytest.fixture(scope="module")

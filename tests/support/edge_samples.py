@@ -92,7 +92,6 @@ def write_model(
     pad_name: str | None = None,
     pad_width: int | None = None,
     with_traction: bool | None = None,
-    traction_shape: tuple[int, ...] | None = None,
 ) -> Path:
     """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
@@ -112,7 +111,7 @@ def write_model(
     newest[[0, 1, 2], [0, 1, 2]] = gain
     batch = (input_shape or [contract.batch])[0]
     shape = [batch, *contract.pattern_shape]
-    traction_shape = traction_shape or contract.traction_shape or (3, contract.rows, contract.cols)
+    traction_shape = contract.traction_shape or (3, contract.rows, contract.cols)
     nodes = [
         helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
         helper.make_node("ConvTranspose", ["floats", "weights"], ["soft"], strides=[scale, scale]),

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording
 
-from firmware_bridge.recording.csv_reader import CSV_HEADER
 from train.experiments.support.workbench import Workbench
 
 
@@ -21,7 +21,8 @@ def save_recordings(folder: Path) -> None:
     """Write two trials of two sensors: one grips all the time, the other lets go; its last rows are the rest level."""
     for trial, released in (("trial-a", False), ("trial-b", True)):
         for sensor in ("sensor1", "sensor2"):
-            _save_recording(folder / trial / f"xela_{sensor}.csv", REST + grip(released))
+            (folder / trial).mkdir(parents=True, exist_ok=True)
+            write_recording(folder / trial / f"xela_{sensor}.csv", REST + grip(released))
 
 
 def grip(released: bool) -> np.ndarray:
@@ -32,10 +33,3 @@ def grip(released: bool) -> np.ndarray:
         pressed[30:] = 0
     pressed[10:30:10] = pressed[9:29:10]
     return pressed
-
-
-def _save_recording(path: Path, counts: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    taxels_by_axes = counts.transpose(0, 2, 3, 1).reshape(len(counts), -1)
-    lines = [",".join(CSV_HEADER), *(",".join(f"{value}.0" for value in row) for row in taxels_by_axes)]
-    path.write_text("\n".join(lines) + "\n")

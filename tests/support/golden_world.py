@@ -1,9 +1,7 @@
-"""Inputs of the golden records: presses on a pad made by arithmetic alone, as files and as bytes of a link."""
+"""Inputs of the golden records: presses on a pad made by arithmetic alone, also as bytes of a link."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -59,30 +57,6 @@ def gripped(scans: int = 200, *, free: int = 60) -> np.ndarray:
     face = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), np.full((4, 4), 650.0)])
     noise = np.random.default_rng(2).normal(0, 2, (scans, 3, 4, 4))
     return np.rint(REST + load[:, None, None, None] * face + noise).astype(np.int32)
-
-
-def write_csv(path: Path, counts: np.ndarray) -> Path:
-    """Write counts as a CSV of 48 columns, taxel by taxel."""
-    header = [f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz"]
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(counts.reshape(len(counts), 3, 16).transpose(0, 2, 1).reshape(len(counts), 48).tolist())
-    return path
-
-
-def write_npz(path: Path, counts: np.ndarray) -> Path:
-    """Write counts at 100 Hz as a recording for numpy; ABSENT where a taxel gave no reading."""
-    np.savez(
-        path,
-        format=np.array("tactile-recording"),
-        version=np.array(1),
-        sensor=np.array(["4"] * len(counts)),
-        scan=np.arange(len(counts)),
-        time_ns=np.arange(len(counts)) * 10_000_000,
-        counts=counts,
-    )
-    return path
 
 
 def slcan_cycle(counts: np.ndarray, number: int, *, stamped: bool, controller: int = 4) -> list[bytes]:

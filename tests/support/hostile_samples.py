@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bridge_samples import REST_COUNTS as REST
 
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -16,9 +17,6 @@ from firmware_bridge.zeroing.baseline import Baseline
 
 def one_line(error: pytest.ExceptionInfo) -> bool:
     return "\n" not in str(error.value) and len(str(error.value)) < 1000
-
-
-REST = np.array([16_000, 16_400, 38_600])[:, None, None] + np.arange(16).reshape(4, 4) * 90
 
 
 def archive(compressed: bool = False, **arrays: Any) -> bytes:

@@ -10,10 +10,9 @@ from itertools import count
 from pathlib import Path
 
 import can
-from bridge_samples import make_counts, read_scans, write_recording
+from bridge_samples import frames_of, make_counts, read_scans, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
-from gs_usb_samples import frames_of
 from server_samples import looping
 from xela_server_emulator import ServerEmulator
 

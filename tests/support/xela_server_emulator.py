@@ -17,7 +17,7 @@ from typing import Any, Final, Self
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
-from xela_server_model import GARBAGE, VendorServer
+from xela_server_model import VendorServer
 
 HOST: Final = "127.0.0.1"
 """Address of this machine alone, so that no other one takes its messages for a sensor's."""
@@ -41,11 +41,11 @@ class ServerEmulator:
         lost_messages: number of messages without room at a client.
     """
 
-    def __init__(self, server: VendorServer, *, message_hz: float = 100.0, garbage_every: int = 0) -> None:
-        """Prepare to serve so many messages a second, with an invalid one after each `garbage_every`; 0 for none."""
+    def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
+        """Prepare to serve so many messages a second."""
         self.url = ""
         self.sent_messages = self.lost_messages = 0
-        self._vendor, self._message_hz, self._garbage_every = server, message_hz, garbage_every
+        self._vendor, self._message_hz = server, message_hz
         self._port = 0
         self._sequence = 0
         self._greeted = asyncio.Event()
@@ -142,14 +142,10 @@ class ServerEmulator:
         """Send messages from the first greeting to the end of the recordings, then hang up."""
         await self._greeted.wait()
         start_s, ticks = time.monotonic(), 0
-        garbage = 0
         while not self._vendor.ended(ticks / self._message_hz):
             await asyncio.sleep(max(0.0, start_s + ticks / self._message_hz - time.monotonic()))
             await self._send(self._vendor.message(self._sequence, ticks / self._message_hz, time.time()))
             self._sequence += 1
-            if self._garbage_every and self._sequence % self._garbage_every == 0:
-                await self._send(GARBAGE[garbage % len(GARBAGE)])
-                garbage += 1
             behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
             ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         await self._close(1001, "")

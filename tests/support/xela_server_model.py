@@ -19,21 +19,6 @@ NEWTONS_PER_COUNT: Final = np.array([0.0007, 0.0007, 0.00085])[:, None, None]
 TEMPERATURE_K: Final = 302.5
 _ROUNDED: Final = 1e-6
 """Tolerance, in cycles: a message sent at the time of a cycle holds it, however that time was rounded."""
-GARBAGE: Final[tuple[str | bytes, ...]] = (
-    "",
-    '{"message": 12, "time": 17',
-    '{"message": 1e3}',
-    '{"message": -1, "1": {"taxels": 16}}',
-    '{"message": 7, "message": 8}',
-    '{"message": 7, "1": {"taxels": 16, "data": "8197,829A"}}',
-    '{"message": NaN}',
-    "[" * 5000,
-    b"\xff\xfe not text",
-    '{"message": ' + "9" * 6000 + "}",
-    "null",
-    "x" * 50_000,
-)
-"""Invalid messages, sent one after the other; a client must survive each of them."""
 
 
 class _Player(NamedTuple):

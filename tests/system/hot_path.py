@@ -143,16 +143,8 @@ def run_child(core: int) -> None:
             if part == "in contact":
                 values[2, 4:12] += 3000 + 200 * (index % 8)
             stamp_ms = (time_ns // 1_000_000 + 10 * (index + 1)) % 60_000
-            texts.append(
-                b"".join(
-                    encode_frame(
-                        CanFrame(
-                            can_id, b"\0" + values[:, taxel].astype(">u2").tobytes() + b"\0", timestamp_ms=stamp_ms
-                        )
-                    )
-                    for can_id, taxel in order
-                )
-            )
+            data = [(can_id, b"\0" + values[:, taxel].astype(">u2").tobytes() + b"\0") for can_id, taxel in order]
+            texts.append(b"".join(encode_frame(CanFrame(*one, timestamp_ms=stamp_ms)) for one in data))
         return texts
 
     gc.collect()

@@ -64,24 +64,19 @@ class Subject:
 
 
 SUBJECTS = {
-    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py", "tests/bridge/test_slcan_damage.py")),
+    "slcan": Subject("firmware_bridge.can.slcan", ("tests/bridge/test_slcan.py",)),
     "gs_usb": Subject("firmware_bridge.can.gs_usb", ("tests/bridge/test_gs_usb.py",)),
     "assembler": Subject(
         "firmware_bridge.scans.scan_assembler",
         (
-            "tests/bridge/test_scan_assembler_cycles.py",
             "tests/bridge/test_scan_assembler.py",
             "tests/bridge/test_slcan_scans.py",
             "tests/bridge/test_cycles.py",
         ),
     ),
     "taps": Subject("edge.perception.tap_tracker", ("tests/runtime/test_taps.py",)),
-    "baseline": Subject(
-        "firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py", "tests/bridge/test_baseline_files.py")
-    ),
-    "drift": Subject(
-        "firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift_thresholds.py", "tests/bridge/test_drift.py")
-    ),
+    "baseline": Subject("firmware_bridge.zeroing.baseline", ("tests/bridge/test_baseline.py",)),
+    "drift": Subject("firmware_bridge.zeroing.drift_tracker", ("tests/bridge/test_drift.py",)),
     "contract": Subject(
         "edge.inference.contract",
         ("tests/runtime/test_contract.py", "tests/bridge/test_pad.py", "tests/runtime/test_session.py"),

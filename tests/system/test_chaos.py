@@ -4,10 +4,10 @@ import os
 from collections import Counter
 
 import pytest
-from bridge_samples import make_recording, write_recording
+from bridge_samples import make_recording
 from chaos import Chaos, Run, promises
 from chaos_judge import HELD_CYCLES, Judge, telling
-from chaos_wire import NAMES, FaultyBus, Sent, main, numbered, stretches
+from chaos_wire import NAMES, FaultyBus, Sent, numbered, stretches
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.emulator_thread import EmulatorThread
@@ -129,18 +129,11 @@ def test_a_recording_is_played_among_faults_for_a_program_of_ones_own(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (["--faults", "loss@1+1"], "expected one of: lost, gaps"),
-        (["--faults", "lost@1"], "expected NAME[=SHARE]@START+LENGTH"),
-        (["--rate-hz", "0"], "expected a positive number"),
-    ],
+    ("text", "complaint"), [("loss@1+1", "expected one of: lost, gaps"), ("lost@1", "expected NAME")]
 )
-def test_faults_that_cannot_be_are_refused(tmp_path, capsys, words, complaint):
-    path = write_recording(tmp_path / "played.csv", make_recording(20).tracks[0].counts, rate_hz=100)
-    with pytest.raises(SystemExit):
-        main([str(path), *words])
-    assert complaint in capsys.readouterr().err
+def test_faults_that_cannot_be_are_refused(text, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        stretches(text, 1)
 
 
 def test_a_mixture_holds_every_fault_and_ends_in_calm():

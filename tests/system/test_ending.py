@@ -218,17 +218,6 @@ def test_ctrl_c_before_anything_has_begun_is_no_traceback(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_nothing_is_left_of_the_watch_where_it_ends_in_time():
-    from edge.terminal.stop_signals import stop_on_signals
-
-    with stop_on_signals() as stop:
-        assert any(thread.name == "ending" for thread in threading.enumerate())
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.wait(60)
-    assert not any(thread.name == "ending" for thread in threading.enumerate())
-    assert signal.set_wakeup_fd(-1) == -1
-
-
 def test_kill_9_leaves_whole_records(tmp_path):
     """All but the last line of a file are whole, and hold what another sink has shown: sinks are served in order."""
     recording = write_recording(tmp_path / "played.csv", make_counts(200), rate_hz=400)

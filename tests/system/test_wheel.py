@@ -78,6 +78,12 @@ def run(command, **environment):
     return done.stdout
 
 
+def ended(folder, *command):
+    """Run a command in a folder to its end, whatever that is."""
+    settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 60}
+    return subprocess.run(list(map(str, command)), cwd=folder, env=without_checkout(), **settings)
+
+
 def test_the_runtime_installs_without_the_training_libraries(fresh, demo):
     installed = json.loads(run([*pip_for(fresh.parent), "list", "--format", "json"]))
     assert "tactile-edge-sr" in {package["name"] for package in installed}
@@ -123,15 +129,7 @@ print(len(names))
 
 
 def test_what_is_left_out_is_one_line(fresh, tmp_path):
-    done = subprocess.run(
-        [str(fresh / "edge-sr"), "bench"],
-        cwd=tmp_path,
-        env=without_checkout(),
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = ended(tmp_path, fresh / "edge-sr", "bench")
     line = "edge-sr: edge-sr bench is in another wheel, which is not installed: install tactile-edge-sr-train as well"
     assert (done.returncode, done.stdout, done.stderr.splitlines()) == (2, "", [line])
 
@@ -213,14 +211,7 @@ def test_the_second_wheel_adds_models_and_bench(both, tmp_path):
     listed = run([str(both / "edge-sr"), "models"]).splitlines()
     assert any(line.startswith("stsr ") for line in listed)
     assert "--sensors" in run([str(both / "edge-sr"), "bench", "--help"])
-    done = subprocess.run(
-        [str(both / "python"), "-m", "train.data.make_presses", "x.npz"],
-        cwd=tmp_path,
-        env=without_checkout(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = ended(tmp_path, both / "python", "-m", "train.data.make_presses", "x.npz")
     # Its dependencies were left out here: one line says what is missing and how to install it.
     (line,) = done.stderr.splitlines()
     assert done.returncode == 1 and line.startswith("not installed: ") and "torch" in line and "pip install" in line
