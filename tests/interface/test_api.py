@@ -185,27 +185,6 @@ def test_leaving_the_loop_closes_everything(way):
     assert footprint() == before
 
 
-def test_zeroing_and_forgetting_taps_in_the_loop():
-    presses = [3000] * 5 + [0] * 5 + [3000] * 5 + [0] * 5
-    scans = [[make_scan(n, press_counts=press)] for n, press in enumerate(presses)]
-    said = [threading.Event(), threading.Event()]  # what comes in one batch has its results already
-    link = FakeLink([*scans[:8], said[0], *scans[8:13], said[1], *scans[13:]])
-    with Source(link) as source:
-        runtime = open_runtime(FakeModel(), source, baselines={"4": BASELINE})
-        results = []
-        for result in Stream(source, runtime):
-            results.append(result)
-            if result.scan.number == 7:
-                runtime.reset()
-                said[0].set()
-            if result.scan.number == 12:
-                runtime.zero("6")
-                said[1].set()
-    assert max(result.taps_used for result in results) == 1  # it would be two
-    told = [(result.scan.number, result.event) for result in results if result.event]
-    assert told == [(8, "earlier taps forgotten"), (13, "zeroing refused: no sensor 6, there are 4")]
-
-
 class Outage(FakeLink):
     """A cable that is out for a moment after ten scans."""
 

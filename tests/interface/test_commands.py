@@ -18,7 +18,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, write_model
 
 from edge.cli.user_commands import user_commands
-from edge.pipeline.commands import RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
+from edge.pipeline.commands import RESET, Command, CommandLines, Commands, obey, read_stdin
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []
@@ -93,10 +93,10 @@ def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
 
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
     _, commands = lines_of(pipe[0])
-    os.write(pipe[1], b'{"cmd": "reset"}')
+    os.write(pipe[1], b'{"cmd": "zero", "sensor": null, "force": true}')
     assert commands.poll() == []
     os.close(pipe[1])
-    assert commands.poll() == [RESET]
+    assert commands.poll() == [Command("zero", None, True)]
     assert commands.poll() == []
     os.close(pipe[0])
     assert commands.poll() == [], "a pipe that has ended is not touched again"
@@ -112,21 +112,6 @@ def test_a_terminal_and_a_missing_stdin_are_left_alone(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
     assert polled_stdin() == []
     os.close(leader)
-
-
-@pytest.mark.parametrize(
-    ("line", "command"),
-    [
-        (b'{"cmd": "zero"}', ZERO),
-        (b'{"cmd": "zero", "sensor": "4"}', Command("zero", "4")),
-        (b'{"cmd": "zero", "sensor": null, "force": true}', Command("zero", None, True)),
-        (b'{"force": false, "sensor": "6", "cmd": "zero"}', Command("zero", "6", False)),
-    ],
-)
-def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
-    _, commands = lines_of(pipe[0])
-    os.write(pipe[1], line + b"\n")
-    assert commands.poll() == [command] and commands.refused == 0
 
 
 class Told:

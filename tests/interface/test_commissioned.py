@@ -1,11 +1,9 @@
 """Effects of a sensor file on a run, and options that take precedence."""
 
-import json
-
 import numpy as np
 import pytest
-from cli_samples import records, run, write_recording
-from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
+from cli_samples import write_recording
+from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 
 from edge.api import Stream, open_recording, open_runtime, open_source
 from edge.cli.run_options import parser
@@ -16,7 +14,6 @@ from edge.pipeline.source_setup import references, settled
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
@@ -45,12 +42,6 @@ def first(pressed, sensor=None, id_map=None, **settings):
     """The first result of the press."""
     with open_source(pressed, sensor=sensor, id_map=id_map) as source:
         return next(iter(Stream(source, open_runtime(FakeModel(), source, **settings))))
-
-
-def test_without_a_file_everything_is_as_it_was(pressed):
-    assert open_source(pressed).sensor_file == SensorFile(USPA44_MAP.name)
-    result = first(pressed)
-    assert result.state == "zeroing" and result.note is None
 
 
 def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, monkeypatch):
@@ -126,19 +117,6 @@ def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(f
 def turned_rest():
     """Return the readings of the free pad where its taxels lie, (3, 4, 4)."""
     return REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)
-
-
-def test_a_run_goes_by_it(tmp_path):
-    """A recording by edge-sr is in place; its axes are raw, and z falls where this sensor is pressed."""
-    write_model(tmp_path / "tiny.onnx")
-    write_recording(tmp_path / "taps.npz", [0] * 5 + [-3000] * 5)
-    entry = SensorEntry(Mounting(AS_MAPPED, signs=(1, 1, -1)), 1500.0, BASELINE)
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": entry}))
-    replay = ("--source", f"replay:{tmp_path}/taps.npz", "--model", tmp_path / "tiny.onnx", "--sink", "jsonl:-")
-    made = records(run("--sensor", tmp_path / "s.toml", *replay).stdout)
-    assert [record["contact"] for record in made] == [False] * 5 + [True] * 5
-    assert made[-1]["force_n"] == pytest.approx(2.0, abs=0.1) and made[-1]["counts"][2][1][1] < REST[2, 1, 1]
-    assert made[-1]["baseline"] == BASELINE.id and json.dumps(made[-1]["dead"]) == "{}"
 
 
 def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):

@@ -340,24 +340,6 @@ def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(trained, m
         assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ("", "about 56.8 minutes on this machine: 3.0 to simulate 9000 presses, 53.3 for 16000 steps of training, "),
-        (
-            "--minutes 4 --figures 9000",
-            "about 4.0 minutes on this machine: 0.4 to simulate 1062 presses, 3.1 for 944 steps of training, ",
-        ),
-    ],
-)
-def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys, options, line):
-    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", *options.split()])
-    trained.main()
-    out = capsys.readouterr().out.splitlines()
-    assert out[0].startswith(line) and len(trained.trainings) == 1
-    assert out[2].startswith("not tried on a sensor: ") and out[-1] == "from now on: edge-sr --model ball/ball.onnx"
-
-
 def test_a_source_that_does_not_exist_is_refused_before_the_training(trained, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x"])
     with pytest.raises(SystemExit, match=r"train_and_deploy: source is 'slcna:x', expected one of"):

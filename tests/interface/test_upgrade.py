@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bridge_samples import REAL_RECORDINGS
 from cli_samples import records, run
 from edge_samples import REST, write_model
 
@@ -113,18 +112,6 @@ def played(folder, *arguments):
     return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
 
 
-def test_a_free_pad_with_the_baseline_of_hours_before_is_never_a_contact(folder):
-    write_csv(folder / "monday" / "left.csv", (120, 0))
-    later = write_csv(folder / "tuesday" / "left.csv", (60, DRIFT))
-    source = f"replay:{folder}/monday/left.csv"
-    done = run("baseline", "--source", source, "--rate-hz", "60", "--out", folder / "zero.json")
-    assert done.returncode == 0, done.stderr
-    shown, stderr = played(folder, later, "--rate-hz", "60", "--baseline", folder / "zero.json")
-    assert {(one["state"], one["contact"], one["trusted"]) for one in shown} == {("baseline_in_doubt", None, False)}
-    assert all("of unknown age" in one["note"] and "zero again" in one["note"] for one in shown)
-    assert "sensor left: baseline in doubt: " in stderr
-
-
 def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
     held = write_csv(folder / "monday" / "a held left.csv", *moving(150))
     held = held.rename(folder / "monday" / "left.csv")
@@ -162,18 +149,3 @@ def test_a_pad_that_only_recovers_gives_patterns(folder):
     shown, stderr = played(folder, path, "--rate-hz", "60")
     assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
     assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)
-
-
-GRIPS = sorted(REAL_RECORDINGS.glob("*/xela_sensor1.csv"))
-
-
-@pytest.mark.skipif(not GRIPS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
-def test_every_public_recording_shows_patterns(folder):
-    zero = folder / "zero.json"
-    done = run("baseline", "--source", f"replay:{GRIPS[-1]}", "--rate-hz", "60", "--out", zero)
-    assert done.returncode == 0, done.stderr
-    for path in GRIPS[:-1]:
-        shown, _ = played(folder, path, "--rate-hz", "60", "--baseline", zero)
-        assert all(one["pattern"] is not None and one["trusted"] is False for one in shown), path
-    shown, _ = played(folder, GRIPS[-1], "--rate-hz", "60")
-    assert sum(one["pattern"] is not None for one in shown) > 170
