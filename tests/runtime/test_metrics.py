@@ -6,7 +6,6 @@ from skimage.metrics import structural_similarity
 
 from edge.evaluation.metrics import boundary_distance_mm, contact_iou, psnr_db, rmse_percent, ssim, ssim_global
 from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regions
-from edge.perception.contact_patch import touched
 
 METRICS = psnr_db, rmse_percent, ssim, ssim_global
 
@@ -57,13 +56,6 @@ def test_a_batch_is_its_members_and_what_does_not_fit_is_refused(metric):
         metric(np.zeros((20, 20)), np.zeros((20, 20)), 0.0)
     with pytest.raises(ValueError, match="11 x 11"):
         ssim(np.zeros((10, 20)), np.zeros((10, 20)), 1.0)
-
-
-def test_touched_is_a_share_of_the_maximum():
-    pattern = np.array([[0.0, 0.5], [0.79, 1.0]])
-    assert touched(pattern, 0.8).tolist() == [[False, False], [False, True]]
-    assert touched(pattern, 0.5).tolist() == [[False, True], [True, True]]
-    assert not touched(np.zeros((2, 2)), 0.5).any() and not touched(np.full((2, 2), -1.0), 0.5).any()
 
 
 def test_iou_counts_overlap_over_union():

@@ -15,7 +15,6 @@ from trust_samples import make_checked_contract, make_posed_trust
 from edge.errors import UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import pose_rows, scheduled_rows
-from edge.inference.trust import ERROR_UNITS, MOST_ERROR, PLACE_MM, pair_width, pose_tap_features, tap_features
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.poses.pad_pose import PadPose
 
@@ -236,16 +235,6 @@ class TestChecks:
         result = pad.push(PRESS)
         assert (result.taps_used, result.taps_dropped, len(result.window)) == (1, 1, 1)
         assert pad.push(PRESS).tap_mismatch is None, "they are forgotten for good"
-
-    def test_features_of_pairs_hold_the_pose_in_place_of_the_turns(self):
-        window, poses = random_taps(3)
-        poses[1:] = [[2.5, -5, 90, 0.5, 10], [0, 0, -30, 100, 1e5]]
-        features, before = pose_tap_features(window, poses), tap_features(window)
-        assert features.shape == (2, pair_width(48, poses=True)) and before.shape == (2, pair_width(48, poses=False))
-        np.testing.assert_array_equal(features[:, :98], before[:, :98])
-        np.testing.assert_allclose(features[0, 98:100], [2.5 / PLACE_MM, -5 / PLACE_MM])
-        np.testing.assert_allclose(features[:, 100:102], [[0, 1], [np.sqrt(3) / 2, -0.5]], atol=1e-6)
-        np.testing.assert_allclose(features[:, 102:], [[0.5, 10] / ERROR_UNITS, [MOST_ERROR] * 2])
 
 
 def random_taps(taps, seed=0):

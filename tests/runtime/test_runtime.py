@@ -11,13 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.errors import ModelError, UsageError, WindowError
+from edge.errors import UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.result import mask_bits
-from edge.perception.runtime import MOST_TOGETHER
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -102,10 +99,6 @@ class TestResult:
 
 
 class TestRefusals:
-    def test_a_sensor_that_the_model_was_not_trained_for_is_refused(self):
-        with pytest.raises(ModelError, match="'pitch_mm'"):
-            make_runtime(geometry=dataclasses.replace(USPA44, pitch_mm=5.0))
-
     def test_a_baseline_or_scan_of_another_grid_is_refused(self):
         small = Baseline.of("4", REST[:, :2], 0.0, 100, "file")
         with pytest.raises(UsageError, match=r"sensor 4 has shape \(3, 2, 4\), expected \(3, 4, 4\)"):
@@ -157,31 +150,6 @@ class TestOvertaken:
         runtime.push(make_scan(2))
         runtime.push(make_scan(3, press_counts=2000))
         assert model.windows[-1][1, 2, 1, 1] == 9.0, "the peak was in the scan without a pattern"
-
-    def test_the_newest_scan_wins_and_keeps_the_place(self):
-        """Sensor 4 sends three scans while 6 sends one, and both wait: 4 is the first all the same."""
-        runtime = make_runtime(baselines=dict.fromkeys("468", BASELINE))
-        sent = [make_scan(number, sensor="4", press_counts=PRESS * (number + 1)) for number in range(3)]
-        assert runtime.take(sent[0]) == [] and runtime.take(make_scan(0, sensor="6", press_counts=PRESS)) == []
-        overtaken = [result for scan in sent[1:] for result in runtime.take(scan)]
-        told = [(result.scan.number, result.state, result.pattern) for result in overtaken]
-        assert told == [(0, "dropped", None), (1, "dropped", None)]
-        (idle,) = runtime.take(make_scan(0, sensor="8"))
-        assert idle.state == "idle" and runtime.waiting == 2
-        newest, other = runtime.infer()
-        assert (newest.scan, other.scan.sensor, runtime.waiting) == (sent[2], "6", 0)
-        assert newest.pattern.max() == pytest.approx(3 * other.pattern.max())
-
-    def test_sensors_beyond_one_call_wait_and_none_starves(self):
-        names = [str(number) for number in range(2 * MOST_TOGETHER)]
-        runtime = make_runtime(baselines=dict.fromkeys(names, BASELINE), options=RuntimeOptions(every_scan=True))
-
-        def infer(number):
-            for name in names:
-                runtime.take(make_scan(number, sensor=name, press_counts=PRESS))
-            return [result.scan.sensor for result in runtime.infer()]
-
-        assert [infer(number) for number in range(4)] == 2 * [names[:MOST_TOGETHER], names[MOST_TOGETHER:]]
 
     @settings(max_examples=30, deadline=None)
     @given(

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, inferred, make_contract, make_scan
+from edge_samples import FakeModel, make_contract
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading
@@ -78,21 +78,3 @@ def test_every_scan_is_inferred_where_that_is_asked_for():
     pad, model = make_pad(options=RuntimeOptions(every_scan=True))
     assert all(pad.push(PRESS).reused_from is None for _ in range(5))
     assert len(model.windows) == 5
-
-
-def test_two_sensors_are_inferred_in_one_call():
-    calls = []
-
-    class Together(FakeModel):
-        def run_together(self, windows, pads=None, poses=None):
-            calls.append(len(windows))
-            return super().run_together(windows, pads)
-
-    baselines = dict.fromkeys(("4", "6"), BASELINE)
-    pressed = [make_scan(1, sensor=name, press_counts=press) for name, press in (("4", 3000), ("6", 5000))]
-    alone = [make_runtime(FakeModel(SURE), baselines=baselines).push(scan) for scan in pressed]
-    results = inferred(make_runtime(Together(SURE), baselines=baselines), pressed)
-    assert calls == [2] and [result.scan for result in results] == pressed
-    for result, one in zip(results, alone, strict=True):
-        np.testing.assert_array_equal(result.pattern, one.pattern)
-        np.testing.assert_array_equal(result.deviation, one.deviation)

@@ -1,18 +1,14 @@
 """Source of one or several links: opened in a thread, read in threads, scripts and emulated adapters."""
 
-import contextlib
-import itertools
 import threading
 import time
 
-import numpy as np
 import pytest
-from bridge_samples import make_recording, stacked
+from bridge_samples import make_recording
 from edge_samples import FakeLink, make_scan
 from runtime_samples import presses
 
 from edge.errors import UsageError
-from edge.pipeline.pace import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import LinkLostError, SourceError
@@ -139,14 +135,6 @@ class TestOne:
 
 
 class TestScripts:
-    def test_scans_of_each_link_keep_their_order(self):
-        links = [FakeLink([[make_scan(n)] for n in range(50)]) for _ in range(4)]
-        with Source(*(LastingLink(link, None, name=f"f{index}") for index, link in enumerate(links))) as source:
-            taken = take_all(source)
-        for index in range(4):
-            assert numbers(taken, f"f{index}/4") == list(range(50))
-        assert source.counters() == {"scans": 200}
-
     def test_a_link_that_hangs_holds_up_no_other(self):
         gate = threading.Event()
         fast, slow = FakeLink([[make_scan(n)] for n in range(5)]), FakeLink([gate, [make_scan(0)]])
@@ -192,33 +180,6 @@ def lasting(port, name):
 
 
 class TestPorts:
-    @pytest.mark.parametrize("together_s", [0.0, 0.003])
-    def test_two_are_read_and_nothing_is_lost_or_mixed_up(self, together_s):
-        recordings = dict(zip(("left", "right"), (make_recording(60, seed=seed) for seed in (1, 2)), strict=True))
-        before = set(threading.enumerate())
-        with contextlib.ExitStack() as stack:
-            played = [stack.enter_context(Emulator([one], jitter_s=0.002, seed=1)) for one in recordings.values()]
-            links = [lasting(one.port, name) for one, name in zip(played, recordings, strict=True)]
-            of_emulators = set(threading.enumerate())
-            source = stack.enter_context(Source(*links))
-            source.pace = Pace(together_s)
-            taken = take_all(source, lambda taken: len(numbers(taken, "left/4")) >= 10)
-            assert {thread.name for thread in set(threading.enumerate()) - of_emulators} == {"scan-reader"}
-            taken += take_all(source, lambda more: min(len(numbers(more, f"{name}/4")) for name in recordings) >= 30)
-            counters = source.counters()
-        assert not set(threading.enumerate()) - before, "a thread outlived the source"
-        for name, recording in recordings.items():
-            mine = [one for one in taken if isinstance(one, Scan) and one.sensor == f"{name}/4"]
-            assert [scan.number for scan in mine] == list(range(len(mine)))
-            assert all(a.time_ns <= b.time_ns for a, b in itertools.pairwise(mine))  # what is read together, arrives so
-            counts = recording.tracks[0].counts
-            whole = [scan for scan in mine if scan.complete]
-            first = next(row for row in range(len(counts)) if np.array_equal(counts[row], whole[0].counts))
-            if counters["torn_wire"] == 0:
-                assert np.array_equal(stacked(whole, f"{name}/4"), counts[first : first + len(whole)])
-        assert counters["frames"] == counters["readings"] and counters["torn_source"] == 0
-        assert counters["outages"] == counters["reopenings"] == 0
-
     def test_one_that_is_away_holds_up_no_other_and_comes_back(self, tmp_path):
         """The left adapter is pulled out for a while; the right one's scans go on meanwhile, each of them."""
         recordings = [make_recording(120, seed=seed) for seed in (1, 2)]

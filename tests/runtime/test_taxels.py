@@ -173,27 +173,6 @@ class TestWatch:
         """In an hour no taxel came nearer to stuck than four scans in a row."""
         assert not any(Pad(seed=3).read(3000))
 
-    def test_what_is_told(self):
-        pad = Pad()
-        pad.read(STUCK_SCANS + 3, at(3, 1, 2, 3), silent(7))
-        (estimated,) = pad.watch.notes("neighbours")
-        assert estimated.kind == "estimated" and estimated.text in (
-            "taxel 7 silent, taxel 3 stuck: estimated from their neighbours",
-            "taxel 3 stuck, taxel 7 silent: estimated from their neighbours",
-        )
-        told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
-        assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
-
-    def test_one_at_its_end_is_held_from_the_first_scan(self):
-        pad = Pad()
-        pad.read(3)
-        pad.read(1, pressed(0, 5000, share=1))
-        before = pad.watch.held[2, 1, 1]
-        assert 65535 - BASELINE.counts[2, 1, 1] < 27_000, "as a contact might read"
-        pad.read(1, pressed(0, 5000, share=1), at(5, 16_185, 16_585, 65535))
-        assert pad.watch.held[2, 1, 1] == before
-        assert "its last reading is held, taxel 5 at the end of its range" in pad.note()
-
     def test_no_reading_is_held_for_too_long(self):
         """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
         assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
