@@ -6,9 +6,8 @@ import pytest
 
 from edge.bench import system
 from edge.bench.errors import BenchError
-from edge.bench.live_report import Page
 from edge.bench.provenance import read_provenance
-from edge.bench.system import Cost, measured, show_system
+from edge.bench.system import measured
 from edge.cli.main import main
 
 
@@ -34,23 +33,6 @@ def test_a_record_is_later_than_the_last_byte_of_its_scan(brief):
             assert cost.p99_us >= cost.p50_us > 50
             return
     pytest.skip("the machine is too busy: frames were lost in five rounds")
-
-
-def test_both_trees_are_measured_in_turn_and_their_ratio_is_shown(brief, monkeypatch, capsys):
-    turns = []
-
-    def cost(part, sensors, seconds, tree):
-        turns.append((part, tree == system.ROOT))
-        return Cost(2.0 + (tree != system.ROOT), None, None, 0, 70.0)
-
-    monkeypatch.setattr(system, "ROUNDS", 3)
-    monkeypatch.setattr(system, "measured", cost)
-    monkeypatch.setattr(system, "tree_of", lambda commit, folder: folder)
-    import sys
-
-    show_system(300, 1, "main", Page(sys.stdout, sys.stderr))
-    assert turns == [(part, ours) for part in system.PARTS for _ in range(3) for ours in (True, False)]
-    assert "| in contact, ratio | 0.667 (0.667..0.667) | - | - |  |  |" in capsys.readouterr().out
 
 
 def test_a_commit_that_is_not_here_is_named(tmp_path):

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_samples import letter, raster, result_of
+from map_samples import letter, result_of
 from matplotlib.image import imread
 from PIL import Image
 
 from edge.errors import SinkError
 from edge.mapping import map_files
-from edge.mapping.live_map import Box, MapState
 from edge.mapping.object_map import MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
 from edge.perception.event import Event
@@ -150,20 +149,3 @@ def test_states_are_shown_a_few_times_a_second_and_at_the_end():
     sink.wait()
     sink.close()
     assert shown[-1].number == len(shown) and shown[-1].counts["fused"] == sink.whole.fused
-
-
-def test_a_state_holds_what_has_changed_since_another():
-    whole = ObjectMap()
-    states = []
-    for pose in [*raster()[:6], None, *raster()[6:8]]:
-        if pose is not None:
-            whole.add(result_of(letter, pose), pose)
-        states.append(MapState(len(states) + 1, whole.grid, *whole.contact(), {}, {}))
-    assert states[6].since(states[5]) is None and states[6].since(states[6]) is None
-    for state, before in ((states[5], states[1]), (states[7], states[3]), (states[3], None)):
-        box = state.since(before)
-        assert box is not None and box != Box(0, 0, 240, 240)
-        patched = np.full_like(state.contact, np.nan) if before is None else before.contact.copy()
-        part = np.s_[box.top : box.bottom, box.left : box.right]
-        patched[part] = state.contact[part]
-        assert np.array_equal(patched, state.contact, equal_nan=True)

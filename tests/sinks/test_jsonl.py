@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import RUN, make_results, make_sure_results
@@ -55,54 +55,6 @@ class TestJsonLines:
         assert whole.pattern is not None and {"source", "state", "trusted", "note", "pattern_unit"} < record.keys()
         assert record.keys() == {*ALWAYS, "counters", *more}
         assert record == {name: expected[name] for name in record}
-
-    def test_a_record_says_all_of_a_contact(self):
-        ticks = iter([0, 123_456])
-        runtime = Runtime(
-            FakeModel(),
-            source="emulated",
-            baselines={"4": BASELINE},
-            counts_per_newton=1200,
-            clock_ns=lambda: next(ticks),
-            unix_time_s=lambda: 1012.34,
-        )
-        result = runtime.push(make_scan(7, press_counts=3000, stale=(0, 15)))
-        record = json.loads(record_line(result, RUN))
-        pattern = record.pop("pattern")
-        assert np.shape(pattern) == (40, 40)
-        np.testing.assert_allclose(pattern, result.pattern, rtol=1e-5)
-        assert record.pop("counts") == result.scan.counts.tolist()
-        assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
-        assert record.pop("deviation") is record.pop("traction") is None
-        assert record.pop("wrench") is record.pop("wrench_origin") is record.pop("shear_ratio") is None
-        unknown = (
-            "device_time_ns interval_mm expected_rmse_mm another_tap next_tap trusted untrusted_reason "
-            "taps_dropped mismatch tap_mismatch pose poses reused_from latency_us filled gains_certainty event"
-        )
-        assert record == dict.fromkeys(unknown.split()) | {
-            "time_ns": 8 * PERIOD_NS,
-            "sensor": "4",
-            "scan": 7,
-            "source": "emulated",
-            "state": "contact",
-            "fresh": 0xFFFF,
-            "renewed": 0x7FFE,
-            "contact": True,
-            "taps_used": 1,
-            "force_counts": 3000.0,
-            "force_n": 2.5,
-            "area_mm2": 22.09,
-            "run_time_us": 123.5,
-            "baseline": BASELINE.id,
-            "baseline_origin": "file",
-            "baseline_age_s": 12.3,
-            "drift_counts": {"common": [0.0, 0.0, 0.0], "own": 0.0, "step": 0.0},
-            "model": "fake",
-            "dead": {},
-            "note": "not checked: the model has no checks",
-            "counters": RUN,
-            "pattern_unit": "mm",
-        }
 
     def test_absent_is_null(self):
         record = json.loads(record_line(Runtime(FakeModel(), source="device").push(make_scan(absent=(2,))), {}))

@@ -30,7 +30,7 @@ from zenoh_samples import (
 )
 
 from edge.errors import SinkError
-from edge.perception.event import Event, Note
+from edge.perception.event import Event
 from edge.pipeline.sink import RunFacts
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
@@ -125,18 +125,6 @@ class TestWhoComesAndGoes:
                 reader.undeclare()
                 wait_for(lambda: sink.write(result, {}) or sink.trouble is not None)
             sink.close()
-
-    def test_a_reader_that_goes_ends_nothing_and_the_next_is_found(self, endpoint, consume):
-        first, sink, result = consume(endpoint), ZenohSink(f"grip?connect={endpoint}"), make_results(2)[1]
-        wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
-        first.stop()
-        wait_for(lambda: sink.write(result, {}) or sink.trouble is not None)
-        second = consume(endpoint)
-        wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
-        sink.write(replace(result, notes=(Note("late", "again"),)), {})
-        sink.close()
-        messages, _ = second.until_gone()
-        assert json.loads([payload for key, *_, payload in messages if key == "grip/4/scan"][-1])["note"] == "again"
 
     def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
         consumer, result = consume(endpoint), make_results(2)[1]

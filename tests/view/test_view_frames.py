@@ -12,7 +12,7 @@ from view_samples import CONTRACT, Press
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
-from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.frames import Frames, Run, hello, state
 from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
 from edge.view.viewers import Viewer
 from firmware_bridge.links.replay_player import PlayerState
@@ -193,20 +193,10 @@ def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_t
     assert header["scan"] == 9 and numbers(header) == list(range(1, 10))
 
 
-def test_state_tells_the_silence_of_a_sensor(heard, clock):
-    heard.write(Press("4").next(), {})
-    clock.now_ns += 700_000_000
-    heard.write(Press("6").next(), {})
-    assert Frames(heard, clock(), "emulated").silent() == {"4": 0.7}
-    clock.now_ns += 500_000_000
-    assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
-    header, _ = unpack(state(Path("edge.mcap"), 3, {"4": 1.2}))
-    facts = {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
-    assert header == facts | {"replay": None, "recorded_s": None, "recorded_bytes": None}
-    recorded = unpack(state(Path("edge.mcap"), 1, {}, None, (2.5, 70_000)))[0]
-    assert (recorded["recorded_s"], recorded["recorded_bytes"]) == (2.5, 70_000)
+def test_state_tells_of_what_is_recorded_and_played():
     played = PlayerState(1.5, 6.7, 0.5, paused=True, waiting=False, rounds=2)
-    assert unpack(state(None, 1, {}, played))[0]["replay"] == played._asdict()
+    header = unpack(state(Path("edge.mcap"), 3, {}, played, (2.5, 70_000)))[0]
+    assert (header["recorded_s"], header["recorded_bytes"], header["replay"]) == (2.5, 70_000, played._asdict())
 
 
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
@@ -216,33 +206,6 @@ def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     assert unpack(state(path, 1, {}))[0]["recording"] == r"\xff.mcap"
     heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
     assert look(Viewer(), heard, clock)[0][0]["note"] == r"recording into \xff.mcap stopped"
-
-
-def test_what_is_refused_is_an_event():
-    header, _ = unpack(refused(7, "no command", "emulated"))
-    assert (header["kind"], header["event"], header["note"], header["time_ns"]) == ("event", "refused", "no command", 7)
-    assert "number" not in header and header["sensor"] is None
-
-
-def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(heard, clock):
-    four, viewer = Press("4"), Viewer()
-
-    def told(press_counts=3000):
-        heard.write(four.next(press_counts), {})
-        return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
-
-    four.runtime.zero()
-    assert told() == [("refused", None)]  # no sensor has sent yet
-    four.runtime.zero("4")
-    assert told() == [("in_contact", "4")]
-    four.runtime.zero("6")
-    assert told() == [("refused", None)]
-    four.runtime.zero("4", force=True)
-    assert told() == []
-    four.runtime.lose_touch()
-    assert told() == [("given_up", "4")]
-    four.runtime.reset()
-    assert told() == [("reset", None)]  # of all sensors, though this one's result carries it
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Recordings that a viewer of the live page asks for."""
 
-import json
 import re
 import threading
 import time
@@ -12,11 +11,9 @@ from view_samples import CONTRACT, TIMEOUT_S, Press
 
 from edge.errors import SinkError
 from edge.perception.event import Event
-from edge.pipeline.commands import Command, Commands, obey
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
-from edge.view.viewers import Viewer, execute
 from firmware_bridge.recording.formats import load_recording
 
 AT = time.struct_time((2026, 11, 22, 5, 6, 7, 6, 326, 0))
@@ -175,23 +172,3 @@ def test_one_that_cannot_be_finished_is_told(tmp_path):
     ask(recorder, told, True)
     recorder.close()
     assert told[-1].kind == "sink" and told[-1].text.endswith("could not be finished: no room for the end")
-
-
-def test_commands_to_record_are_done_and_the_others_handed_on(tmp_path):
-    class Untouched:
-        def reset(self):
-            raise AssertionError
-
-        zero = reset
-
-    recorder, _ = make_recorder(tmp_path, lambda text: Disk())
-    commands = Commands()
-    commands.record = recorder.record
-    for message in ({"cmd": "zero"}, {"cmd": "record", "on": True}, {"cmd": "reset"}, {"cmd": "jump"}):
-        execute(json.dumps(message), Viewer(), commands)
-    assert recorder.path is None  # not before the loop asks
-    assert list(commands.poll()) == [Command("zero"), Command("reset")] and commands.refused == 1
-    wait_for(lambda: recorder.wait() or recorder.path is not None)
-    execute('{"cmd": "record", "on": false}', Viewer(), commands)
-    obey(commands, Untouched())
-    assert recorder.path is None
