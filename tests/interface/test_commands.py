@@ -8,7 +8,6 @@ import select
 import signal
 import sys
 import termios
-import threading
 import time
 from pathlib import Path
 
@@ -138,26 +137,6 @@ def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
             assert everything.refused == 1
     runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
     assert runtime.done == ["reset", ("4", True)]
-
-
-def test_commands_of_many_threads_come_each_once_and_in_their_threads_order():
-    commands, got = Commands(), []
-
-    def ask(name):
-        for number in range(200):
-            commands.put(Command("zero", f"{name}/{number}"))
-            commands.refuse()
-
-    threads = [threading.Thread(target=ask, args=(name,)) for name in "abcd"]
-    for thread in threads:
-        thread.start()
-    while any(thread.is_alive() for thread in threads):
-        got += commands.poll()
-    got += commands.poll()
-    for name in "abcd":
-        mine = [one.sensor for one in got if one.sensor and one.sensor.startswith(name)]
-        assert mine == [f"{name}/{number}" for number in range(200)]
-    assert len(got) == commands.refused == 800
 
 
 TIMEOUT_S = 60.0

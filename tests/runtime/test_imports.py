@@ -84,25 +84,6 @@ def test_a_run_loads_what_it_uses_and_leaves_no_trace(tmp_path):
     assert (disabled, left, with_openssl) == ("1", "[]", "False")
 
 
-_HEAPS = """
-import ctypes, sys, threading
-from edge.terminal.heap import share_one_heap
-if sys.argv[1] == "share":
-    share_one_heap()
-libc = ctypes.CDLL(None)
-libc.malloc.restype = libc.fopen.restype = ctypes.c_void_p
-barrier = threading.Barrier(4)
-def allocate():
-    barrier.wait()
-    libc.malloc(ctypes.c_size_t(1000))
-    barrier.wait()
-threads = [threading.Thread(target=allocate) for _ in range(4)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
-libc.malloc_info(0, file)
-libc.fclose(file)
-"""
 _GIVEN_BACK = """
 from pathlib import Path
 from edge.terminal.heap import give_back
@@ -118,10 +99,5 @@ print(full - resident())
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="glibc's heap is looked at on Linux")
 class TestHeap:
-    @pytest.mark.parametrize(("asked", "heaps"), [("share", 1), ("not", 5)])
-    def test_threads_share_one(self, asked, heaps, tmp_path):
-        run(_HEAPS, asked, tmp_path / "heaps.xml")
-        assert (tmp_path / "heaps.xml").read_text().count("<heap nr=") == heaps
-
     def test_free_memory_between_used_blocks_is_given_back(self):
         assert int(run(_GIVEN_BACK)[0]) > 5000, "of the 12,000 pages that are free"

@@ -68,27 +68,16 @@ class TestWhatIsThere:
             np.testing.assert_array_equal(values(half, map_name), getattr(result, map_name))
         np.testing.assert_array_equal(values(half, "counts"), result.scan.counts)
 
-    def test_nothing_is_left_of_a_pattern_that_is_over(self, sink, name):
+    def test_what_is_over_or_was_not_read_is_not_there(self, sink, name):
         sink.write(make_result(0, press_counts=3000), {})
-        sink.write(make_result(1), {})
-        half = latest(attach(name), "4")
-        assert half is not None
-        said = fields(half)
-        assert (said["scan"], said["state"], said["contact"], said["has_pattern"]) == (1, 3, 0, 0)
-        assert np.isnan(values(half, "pattern")).all() and np.isnan(values(half, "deviation")).all()
-
-    def test_a_sensor_without_a_baseline_has_no_zeroed_counts(self, sink, name):
+        sink.write(replace(make_result(1), dead={0: "stuck", 15: "silent"}, filled="neighbours"), {})
         sink.write(make_result(0, sensor="6", absent=(3,)), {})
-        half = latest(attach(name), "6")
-        assert half is not None
-        assert (fields(half)["state"], fields(half)["contact"]) == (1, -1)
-        assert np.isnan(values(half, "zeroed")).all()
-        assert values(half, "counts")[:, 0, 3].tolist() == [-1, -1, -1]
-
-    def test_dead_taxels_are_told(self, sink, name):
-        sink.write(replace(make_result(), dead={0: "stuck", 15: "silent"}, filled="neighbours"), {})
-        half = latest(attach(name), "4")
-        assert half is not None and (fields(half)["dead"], fields(half)["filled"]) == (0x8001, 2)
+        over, zeroing = (latest(attach(name), sensor) or b"" for sensor in "46")
+        said = [fields(over)[key] for key in ("scan", "state", "contact", "has_pattern", "dead", "filled")]
+        assert said == [1, 3, 0, 0, 0x8001, 2]
+        assert np.isnan(values(over, "pattern")).all() and np.isnan(values(over, "deviation")).all()
+        assert (fields(zeroing)["state"], fields(zeroing)["contact"]) == (1, -1)
+        assert np.isnan(values(zeroing, "zeroed")).all() and values(zeroing, "counts")[:, 0, 3].tolist() == [-1] * 3
 
     def test_memory_that_nobody_wrote_is_no_sensor(self, sink, name):
         assert latest(attach(name), "") is None and latest(attach(name), "4") is None

@@ -68,22 +68,6 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     ]
 
 
-def test_hello_says_what_does_not_change():
-    header, maps = unpack(hello(Run("demo", "emulated", "mtsr4", CONTRACT, "c0ffee"), None))
-    model = {"model": "mtsr4", "taps": 4, "pattern_unit": "mm", "full_scale": 2.0, "wrench": False, "checks": False}
-    grid = {
-        "rows": 4,
-        "cols": 4,
-        "taxel_pitch_mm": 4.7,
-        "height": 40,
-        "width": 40,
-        "pixel_pitch_mm": pytest.approx(0.47),
-    }
-    run = {"kind": "hello", "version": 1, "run": "c0ffee", "name": "demo", "source": "emulated", "recording": None}
-    contact = {"contact_level": CONTRACT.contact_level, "max_fps": MAX_FPS, "maps": []}
-    assert maps == {} and header == run | model | grid | contact
-
-
 def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
     press, viewer, traced = Press(), Viewer(), []
     for scans in (1, 4, 0, 7, 200):
