@@ -21,11 +21,8 @@ FREE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
 def faults(scans, **changes):
     """Return names and verdicts of the findings that are not ok, where every input is available."""
     changes.setdefault("references", {"4": FREE})
-    return {
-        finding.name: finding.verdict
-        for finding in judge(watched(scans, **changes), 0.0).findings
-        if finding.verdict != "ok"
-    }
+    found = judge(watched(scans, **changes), 0.0).findings
+    return {finding.name: finding.verdict for finding in found if finding.verdict != "ok"}
 
 
 def remedy_of(name, scans, **changes):
@@ -243,10 +240,8 @@ class TestIdMap:
         sensor = {"uSPa44": "4", "uSPa46": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
         ids = [can_id for can_id, _ in ID_MAPS[spoken].wire_order(sensor)]
         heard, closed, counters = heard_of(ID_MAPS[asked], ids)
-        found = {
-            one.name: one
-            for one in judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0).findings
-        }
+        examined = judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0)
+        found = {one.name: one for one in examined.findings}
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
             sensor = {"AB": "7b"}.get(spoken + asked, sensor)
             assert found["id map"].verdict == "ok" and f"sensor {sensor} received" in found["id map"].measured

@@ -30,6 +30,7 @@ from firmware_bridge.zeroing.baseline import Baseline
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
 WHOLE = SensorEntry(Mounting(swap_xy=True, gains=GAINS), 1180.0, BASELINE)
 NONE: dict = {}
+ASSUMED: dict = {"assumed": frozenset({"mounting"})}
 
 
 @pytest.fixture
@@ -47,15 +48,12 @@ class TestLoss:
     @pytest.mark.parametrize(
         ("held", "lost"),
         [
-            (SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"})), "baseline of sensor 4"),
-            (SensorEntry(counts_per_newton=1180.0, assumed=frozenset({"mounting"})), "counts per newton of sensor 4"),
+            (SensorEntry(baseline=BASELINE, **ASSUMED), "baseline of sensor 4"),
+            (SensorEntry(counts_per_newton=1180.0, **ASSUMED), "counts per newton of sensor 4"),
             (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
-            (
-                SensorEntry(pad=Pad(thickness_mm=4.2), assumed=frozenset({"mounting"})),
-                "constants of the pad of sensor 4",
-            ),
-            (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
-            (SensorEntry(frame=PadFrame("tool0"), assumed=frozenset({"mounting"})), "place on the robot of sensor 4"),
+            (SensorEntry(pad=Pad(thickness_mm=4.2), **ASSUMED), "constants of the pad of sensor 4"),
+            (SensorEntry(Mounting(gains=GAINS), **ASSUMED), "gains of sensor 4"),
+            (SensorEntry(frame=PadFrame("tool0"), **ASSUMED), "place on the robot of sensor 4"),
         ],
     )
     def test_each_part_is_named_and_kept_where_the_file_is_given_as_well(self, tmp_path, held, lost):
@@ -88,7 +86,7 @@ class TestLoss:
 
     def test_gains_that_a_run_learned_during_the_visit_are_kept(self, tmp_path):
         path, learned = tmp_path / "s.toml", Pad(gains=GAINS, gain_half_widths=(0.05,) * 48)
-        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(**ASSUMED)}))
         known = load_sensor_file(path)
         for name in ("4", "6"):
             keep_learned(path, name, learned)
@@ -102,17 +100,13 @@ class TestLoss:
         with pytest.raises(SensorFileError, match="would be lost: counts per newton of sensor 4"):
             check_writable(good, SensorFile(), presses=True, weighs=False)
         content = good.read_text()
-        with pytest.raises(
-            SensorFileError, match=r"left as it is, because .* would be lost: order and axes of sensor 4"
-        ):
+        with pytest.raises(SensorFileError, match=r"left as it is, because .* lost: order and axes of sensor 4"):
             told("--out", good, "--weight-g", 200, link=lambda: pytest.fail("it was opened"))
         assert good.read_text() == content
 
     def test_what_was_found_of_a_device_is_not_replaced_by_what_is_emulated(self, tmp_path):
         path = tmp_path / "s.toml"
-        save_sensor_file(
-            path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"}))})
-        )
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, **ASSUMED)}))
         with pytest.raises(SensorFileError, match="would be lost: baseline of sensor 4"):
             keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE, emulated=True)
         keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
@@ -177,9 +171,7 @@ def told(*arguments, link=None, out=None):
     options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
     out = io.StringIO() if out is None else out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            examine, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()]
-        )
+        patch.setattr(examine, "links_to", lambda *_, **__: [link() if link else FakeLink([WELL], kind="replay")])
         return command.run(options, out, io.StringIO()), out.getvalue()
 
 

@@ -40,9 +40,7 @@ def remedies() -> set[str]:
 def test_each_finding_has_a_row():
     names = {text for call in findings() for text in texts(call.args[0])}
     assert {"link", "noise", "taxel order"} <= names
-    rows = {
-        name.strip() for line in PAGE.splitlines() if line.startswith("| ") for name in line.split("|")[1].split(",")
-    }
+    rows = {one.strip() for line in PAGE.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
     assert names <= rows, names - rows
 
 

@@ -99,9 +99,7 @@ def test_records_of_the_command_line_are_those_of_the_api(files, options, settin
 def test_a_source_is_used_open_and_once():
     source = open_source("demo")
     for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
-        with pytest.raises(
-            UsageError, match=r"^source demo is not open: use it in a with statement, or call open\(\)$"
-        ):
+        with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement"):
             use()
     source = Source(FakeLink([[make_scan(n)] for n in range(9)]))
     with source:

@@ -50,12 +50,10 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     assert [result.pose and result.pose.x_mm for result in results] == [None, *range(1, len(PRESSES))]
     assert results[-1].pose == PadPose(6, 0, 5, 0.5)
     last = results[-1]
-    assert last.taps_used == 2 and last.poses[1, :2] == pytest.approx(
-        [(1 - 6) * np.cos(np.radians(5)), 5 * np.sin(np.radians(5))]
-    )
-    np.testing.assert_allclose(
-        last.pattern, posed_pattern(model.contract.scale_window(last.window), last.poses), atol=1e-4
-    )
+    turn = np.radians(5)
+    assert last.taps_used == 2 and last.poses[1, :2] == pytest.approx([(1 - 6) * np.cos(turn), 5 * np.sin(turn)])
+    window = model.contract.scale_window(last.window)
+    np.testing.assert_allclose(last.pattern, posed_pattern(window, last.poses), atol=1e-4)
     assert stream.statistics.poses == len(PRESSES) - 1
 
 
@@ -102,15 +100,6 @@ def posed_records(tmp_path):
         for sink in sinks:
             sink.close()
     return made, tmp_path
-
-
-def test_records_carry_the_pose_and_those_of_the_taps(posed_records):
-    made, folder = posed_records
-    said = [json.loads(line) for line in (folder / "out.jsonl").read_text().splitlines()]
-    assert said[0]["pose"] is None and said[0]["poses"] is None
-    assert said[1]["pose"] == {"x_mm": 0.3333, "y_mm": -1.0, "turn_deg": 15.0, "error_mm": 0.2, "error_deg": 1.0}
-    assert len(said[-1]["poses"]) == 2 and said[-1]["poses"][0] == [0] * 5
-    np.testing.assert_allclose(said[-1]["poses"], made[-1].poses, atol=1e-4)
 
 
 def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(posed_records):

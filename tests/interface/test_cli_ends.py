@@ -262,7 +262,7 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
 def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
     """It may stand in a cell, a header, a key, or in the name of a file, which need not be UTF-8 either."""
     columns = [f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz"]
-    quoted = json.dumps(text)
+    key = json.dumps(text)
     name = os.fsdecode(b"\xfc") + text
     for path, content in (
         (tmp_path / "cell.csv", ",".join(columns) + "\n" + "1," * 47 + f'"{text}"\n'),
@@ -270,13 +270,11 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
         (tmp_path / f"{name}.csv", ",".join(columns) + "\n" + (",".join(["30000"] * 48) + "\n") * 40),
         (
             tmp_path / "key.toml",
-            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{quoted} = 1\n[sensors.4]\n',
+            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n',
         ),
     ):
         path.write_text(content, newline="")
-        asked = (
-            ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", "100"]
-        )
+        asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]
         done = subprocess.run([*EDGE_SR, *map(str, asked), "--sink", "jsonl:-"], capture_output=True, cwd=ROOT)
         printed = (done.stdout + done.stderr).decode()
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed

@@ -6,11 +6,9 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 
 from edge.api import Stream, open_recording, open_runtime, open_source
-from edge.cli.run_options import parser
 from edge.doctor.write_sensor_file import keep
 from edge.errors import UsageError
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import references, settled
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
@@ -60,13 +58,9 @@ PAD = Pad(thickness_mm=5.0, gains=tuple(np.linspace(0.5, 2, 48).tolist()))
 def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
     path = tmp_path / "pad.toml"
     save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, pad=PAD)}))
-    recording = pressed.removeprefix("replay:")
+    recording, other = pressed.removeprefix("replay:"), Pad(thickness_mm=4.0)
     for opened in (lambda: open_source(pressed, sensor=path), lambda: open_recording(recording, sensor=path)):
-        for settings, expected in (
-            ({}, PAD),
-            ({"pad": Pad(thickness_mm=4.0)}, Pad(thickness_mm=4.0)),
-            ({"pad": {}}, None),
-        ):
+        for settings, expected in (({}, PAD), ({"pad": other}, other), ({"pad": {}}, None)):
             model = FakeModel(make_pad_contract())
             with opened() as source:
                 results = Stream(source, open_runtime(model, source, **settings))
@@ -104,14 +98,6 @@ def test_what_is_asked_for_goes_before_the_file_but_for_another_id_map(file, pre
         open_source(pressed, sensor=file, id_map="A")
     with pytest.raises(UsageError, match=r"id map is 'C', expected one of: uSPa44, "):
         open_source(pressed, id_map="C")
-
-
-def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(file, tmp_path):
-    newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
-    save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
-    for arguments, expected in (([], BASELINE), (["--baseline", str(tmp_path / "zero.json")], newer)):
-        options = parser("doctor").parse_args(["--sensor", str(file), *arguments])
-        assert references(options.baseline, settled(options.sensor, None))["4"].id == expected.id
 
 
 def turned_rest():

@@ -62,11 +62,8 @@ def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
     rows = {name: array[order] for name, array in arrays.items() if array.shape[:1] == (len(results),)}
     for row, result in enumerate(results):
         scan = result.scan
-        assert (rows["sensor"][row], rows["scan"][row], rows["time_ns"][row]) == (
-            scan.sensor,
-            scan.number,
-            scan.time_ns,
-        )
+        known = [rows[name][row] for name in ("sensor", "scan", "time_ns")]
+        assert known == [scan.sensor, scan.number, scan.time_ns]
         assert rows["device_time_ns"][row] == (-1 if scan.device_ns is None else scan.device_ns)
         assert (rows["counts"][row] == scan.counts).all()
         assert (rows["state"][row], rows["source"][row], rows["model"][row]) == (result.state, "emulated", result.model)
@@ -97,15 +94,12 @@ def test_scans_poses_mountings_and_baselines_survive_any_way(made, tmp_path, way
         path = new
     before, after = load_recording(made[0]), load_recording(path)
     assert after.origin == "emulated" and dict(after.mountings) == dict(before.mountings) == {"4": TURNED}
-    assert {name: one.id for name, one in after.baselines.items()} == {
-        name: one.id for name, one in before.baselines.items()
-    }
+    assert after.baselines.keys() == before.baselines.keys()
     for one, other in zip(before.baselines.values(), after.baselines.values(), strict=True):
-        assert (one.counts == other.counts).all()
+        assert one.id == other.id and (one.counts == other.counts).all()
     for one, other in zip(before.tracks, after.tracks, strict=True):
-        assert (
-            one.sensor == other.sensor and (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
-        )
+        assert one.sensor == other.sensor
+        assert (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
     assert before.poses == after.poses != []
 
 
@@ -173,9 +167,7 @@ def test_files_of_version_0_1_are_read(tmp_path):
         ("press.mcap new.npz --rate-hz 9", 2, "--rate-hz is for a .csv alone: press.mcap has times of its own"),
     ],
 )
-def test_what_cannot_be_converted_is_said_in_one_line_and_nothing_is_made(
-    words, code, said, tmp_path, monkeypatch, capsys
-):
+def test_what_cannot_be_converted_is_one_line_and_makes_nothing(words, code, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     record_into(Path("press.mcap"), make_results([make_scan()]))
     for name in ("text.mcap", "text.csv", "text.npz", "taken.npz"):

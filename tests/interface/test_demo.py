@@ -52,16 +52,16 @@ def recording(tmp_path):
     return path
 
 
-def play(recording, *, lost=(), overtaken=()):
-    model = FakeModel()
+def play(recording, *, lost=(), option=False, model=None):
+    """Return the score of a recording, with the other tap in place of the second one where that is asked for."""
+    model = model or FakeModel()
     score = DemoScore(DemoRecording(recording), model)
-    runtime = Runtime(model, source="emulated", baselines={"4": BASELINE})
-    series = ScanSeries("4", USPA44)
+    runtime, series = Runtime(model, source="emulated", baselines={"4": BASELINE}), ScanSeries("4", USPA44)
     with np.load(recording) as data:
-        for index, counts in enumerate(data["counts"]):
-            if index not in lost:
-                scan = series.close(counts.copy(), index * 10_000_000)
-                score.add(runtime.push(scan, infer=index not in overtaken))
+        shown = [*data["counts"][:6], *data["option_counts"][0], data["counts"][8]] if option else data["counts"]
+    for index, counts in enumerate(shown):
+        if index not in lost:
+            score.add(runtime.push(series.close(counts.copy(), index * 10_000_000)))
     return score
 
 
@@ -86,21 +86,12 @@ def test_a_lost_scan_shifts_nothing(recording):
 
 def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
     model = FakeModel()
-    score, runtime = (
-        DemoScore(DemoRecording(recording), model),
-        Runtime(model, source="emulated", baselines={"4": BASELINE}),
-    )
-    with np.load(recording) as data:
-        shown = [*data["counts"][:6], *data["option_counts"][0], data["counts"][8]]
-    series = ScanSeries("4", USPA44)
-    for index, counts in enumerate(shown):
-        score.add(runtime.push(series.close(counts.copy(), index * 10_000_000)))
+    score = play(recording, option=True, model=model)
     first, second = score.scores()
     assert score.complete and second.pose == (2.35, 0, 0)
     np.testing.assert_allclose(second.truth, 0.1, rtol=1e-3)
-    alone = model.run(
-        np.stack([*model.contract.scale_window(second.result.window[:1]), np.zeros((3, 4, 4))], dtype="f4")
-    )
+    newest = model.contract.scale_window(second.result.window[:1])
+    alone = model.run(np.stack([*newest, np.zeros((3, 4, 4))], dtype="f4"))
     assert second.alone_percent == pytest.approx(float(rmse_percent(alone, second.truth, 2.0)))
     assert second.alone_percent != second.rmse_percent and first.alone_percent == first.rmse_percent
 
@@ -125,10 +116,7 @@ def test_each_scene_is_announced_and_then_told_how_it_went(recording, tmp_path):
     results[9 + 3] = dataclasses.replace(results[9 + 3], events=(Event(0, "tap_dropped", "4"),))
     results[9 + 7] = dataclasses.replace(results[9 + 7], trusted=False, untrusted_reason="unfamiliar")
     first, second = (told_of_scenes(part, tmp_path / "scenes.npz") for part in (results[:9], results[9:]))
-    assert [line.split(" ")[:4] for line in first[::2]] == [
-        ["now", "another", "surface", "is"],
-        ["now", "a", "magnet", "comes"],
-    ]
+    assert first[0].startswith("now another surface is ") and first[2].startswith("now a magnet comes ")
     assert second[::2] == first[::2]
     assert first[1].startswith("no tap was dropped") and first[3] == "none of 2 patterns with the magnet was checked"
     assert second[1] == "earlier taps were dropped 1 times" and second[3].startswith("1 of 2 patterns with the magnet")

@@ -42,16 +42,12 @@ def roots(tmp_path):
 
 
 def test_serial_ports_and_what_to_write_for_them(roots):
-    vscom, gripper, built_in = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
+    vscom, gripper, other = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
     assert vscom == Found(
         "serial", "/dev/ttyUSB0", "0403:6015", "D30BL366", "VScom USB-CAN Plus", True, "slcan:serial=D30BL366", ()
     )
     assert (gripper.adapter, gripper.looks_like) == (False, "FT231X USB UART by FTDI: no known adapter")
-    assert (built_in.usb_id, built_in.source, built_in.looks_like) == (
-        None,
-        "slcan:/dev/ttyS0",
-        "n/a: no known adapter",
-    )
+    assert (other.usb_id, other.source, other.looks_like) == (None, "slcan:/dev/ttyS0", "n/a: no known adapter")
 
 
 def test_ports_that_share_a_serial_number_are_named_by_path_and_may_not_be_permitted(roots):
@@ -199,16 +195,15 @@ def test_for_programs(plugged, capsys):
 
 
 def test_usb_that_cannot_be_read_hides_no_port(plugged, capsys, monkeypatch):
+    why = "libusb cannot be loaded: pip install libusb-package"
+
     def fail():
-        raise DeviceError("libusb cannot be loaded: pip install libusb-package")
+        raise DeviceError(why)
 
     monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", fail)
     plugged["ports"] = [VSCOM]
     assert cli.main(["devices"]) == 0
-    assert capsys.readouterr().out.splitlines()[-2:] == [
-        "libusb cannot be loaded: pip install libusb-package",
-        SERVER_HINT,
-    ]
+    assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]
 
 
 def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):

@@ -22,6 +22,7 @@ from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import layout_c
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
@@ -129,8 +130,8 @@ def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
     runtime = Runtime(model, source="device", geometry=source.sensor_file.geometry, baselines={"4": baseline})
     counts = rest.copy()
     counts[2, 5, 0] += 5000
-    scans = replace_scan(counts)
-    pattern = [runtime.push(scan) for scan in scans][-1].pattern
+    series = ScanSeries("4", pad)
+    pattern = [runtime.push(series.close(counts + number, number * 10_000_000)) for number in range(3)][-1].pattern
     assert pattern is not None and pattern.shape == (24, 24) and pattern[20:, :4].min() > 0 == pattern[:20].max()
     with pytest.raises(SensorFileError, match="id map 'mine'"):
         save_sensor_file(tmp_path / "s.toml", replace(source.sensor_file, sensors={"4": SensorEntry()}))
@@ -138,13 +139,6 @@ def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
         layout_c(replace(pad, rows=9))
     with pytest.raises(ValueError, match="1 to 64"):
         layout_c(replace(pad, rows=8, cols=9))
-
-
-def replace_scan(counts):
-    from firmware_bridge.scans.scan import ScanSeries
-
-    series = ScanSeries("4", SensorGeometry("mine", *counts.shape[1:], 1, 1, 1))
-    return [series.close(counts + number, number * 10_000_000) for number in range(3)]
 
 
 def test_a_sensor_file_has_the_grid_of_its_model(tmp_path):

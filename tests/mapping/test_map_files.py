@@ -55,21 +55,17 @@ def test_layers_come_back_and_the_picture_shows_them(tmp_path):
 
 
 def test_files_of_an_emulated_sensor_say_so_also_in_a_replay(tmp_path):
-    for source, origin, emulated in (
-        ("emulated", None, True),
-        ("replay", "emulated", True),
-        ("replay", "device", False),
-    ):
+    for source, origin, marked in (("emulated", None, 1), ("replay", "emulated", 1), ("replay", "device", 0)):
         npz, png_path = tmp_path / f"{source}-{origin}.npz", tmp_path / f"{source}-{origin}.png"
         sink = MapSink(ObjectMap(), npz=npz, png=png_path, origin=origin)
         pressed(sink, source=source)
         sink.close()
         with np.load(npz) as data, Image.open(png_path) as picture:
-            assert {str(data["origin"]), picture.info["origin"]} == {"emulated" if emulated else "device"}
+            assert {str(data["origin"]), picture.info["origin"]} == {"emulated" if marked else "device"}
             assert picture.info["source"] == source
             line = np.asarray(picture)[:-480]
-        assert sink.summary().startswith("map (EMULATED): 1 " if emulated else "map: 1 ")
-        assert (line.shape[0] > 20) == emulated and set(np.unique(line)) == ({0, 255} if emulated else set())
+        assert sink.summary().startswith("map (EMULATED): 1 " if marked else "map: 1 ")
+        assert (line.shape[0] > 20) == marked and set(np.unique(line)) == ({0, 255} if marked else set())
 
 
 def test_a_reset_ends_a_map_and_begins_the_next(tmp_path):

@@ -80,17 +80,6 @@ def test_a_field_that_varies_little_is_estimated_from_neighbours(taxels):
     assert told.filled == twice.filled == "neighbours"
 
 
-def test_the_force_is_better_than_with_nothing_for_the_dead():
-    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    newest = frozen.newest[15::16].astype(np.float32)  # ends of taps
-    whole, without, told = newest[:, 2].sum(axis=(1, 2)), [], []
-    for taxel in range(16):
-        filler = estimator().filler(dead(taxel))
-        told.append([filler(scan).z_counts for scan in newest] - whole)
-        without.append(-newest[:, 2].reshape(-1, 16)[:, taxel])
-    assert np.std(told) < 0.6 * np.std(without)
-
-
 @pytest.mark.parametrize(
     "covariances",
     [np.eye(47)[None], np.eye(48), np.empty((0, 48, 48)), np.full((1, 48, 48), np.nan), -np.eye(48)[None]],

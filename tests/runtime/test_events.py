@@ -4,11 +4,10 @@
 import re
 
 import pytest
-from edge_samples import BASELINE, ROOT
-from runtime_samples import Pushed, make_runtime
+from edge_samples import ROOT
+from runtime_samples import Pushed
 
 from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
-from firmware_bridge.silence import TAXEL_SILENT_SCANS
 
 PAGE = [path for path in (ROOT / "edge" / "view").rglob("*") if path.suffix in (".html", ".js")]
 
@@ -50,11 +49,3 @@ def test_a_result_has_once_what_happened_before_it():
     assert result.event == joined(result.events) == "; ".join(event.text for event in result.events)
     after = pad.push()
     assert after.events == () and after.event is None
-
-
-def test_notes_are_kinds_beside_their_text():
-    pad = Pushed(make_runtime(baselines={"6": BASELINE}), absent=(5,))
-    result = pad.push()
-    assert [note.kind for note in result.notes] == ["no_stored_baseline"] and result.note == result.notes[0].text
-    result = [pad.push() for _ in range(TAXEL_SILENT_SCANS + 1)][-1]
-    assert result.notes[0].kind == "dead" and result.note == joined(result.notes)

@@ -119,10 +119,8 @@ class TestReasons:
         certain.use_pad(np.append(PAD_ROW[:-1], np.float32(1)))
         pattern = np.kron(make_tap()[2], np.ones((10, 10), dtype=np.float32))
         traction = np.zeros((3, 8, 8), dtype=np.float32)
-        of_certain, of_unsure = (
-            check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, unsure)
-        )
-        assert of_certain is not None and of_unsure is not None and of_certain > of_unsure
+        more, less = (check.judge(0, tap, pattern, None, traction, 0).mismatch for check in (certain, unsure))
+        assert more is not None and less is not None and more > less
 
 
 ODD, GOOD = make_tap(x=2), make_tap()

@@ -78,11 +78,7 @@ class TestOvertaking:
         statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
         made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
         assert calls == [4, 4, 4, 2]
-        assert made == [
-            *((0, name) for name in "0123"),
-            *((1, name) for name in "4501"),
-            *((2, name) for name in "230145"),
-        ]
+        assert made == [(number, name) for number, names in enumerate(("0123", "4501", "230145")) for name in names]
         assert statistics.dropped == 4
         assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 

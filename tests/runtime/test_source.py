@@ -144,16 +144,6 @@ class TestScripts:
             gate.set()
             assert numbers(take_all(source), "slow/4") == [0]
 
-    def test_a_notice_comes_before_the_scans_given_with_it(self):
-        class Telling(FakeLink):
-            def notices(self):
-                return [Notice(self.reads, "back", f"before read {self.reads}")]
-
-        link = Telling([[make_scan(n)] for n in range(20)])
-        with Source(link, LastingLink(FakeLink([]), None, name="other")) as source:
-            told = order(take_all(source))
-        assert told[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
-
     def test_one_that_gives_up_ends_all_after_its_scans(self):
         lost = FakeLink([[make_scan(0)]], error=LinkLostError("gone"))
         told = [Notice(0, "lost", "told")]

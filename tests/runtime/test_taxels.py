@@ -228,19 +228,6 @@ class TestRuntime:
         pad = Pushed(make_runtime(baselines=None), noise=4)
         assert {pad.push(absent=tuple(range(8))).state for _ in range(400)} == {"zeroing"}
 
-    def test_an_absent_taxel_keeps_its_newest_reading_for_a_while(self):
-        pad = Pushed()
-        pad.push(PRESS / 2)
-        pad.push(PRESS)
-        for _ in range(HOLD_SCANS):
-            result = pad.push(PRESS, absent=(5,))
-            assert result.state == "contact" and result.force_counts == PRESS
-        result = pad.push(PRESS, absent=(5,))
-        assert result.state == "incomplete" and result.baseline is BASELINE
-        assert result.pattern is result.contact is result.force_counts is None
-        states = [pad.push(PRESS).state for _ in range(BACK_SCANS)]
-        assert states == ["incomplete"] * (BACK_SCANS - 1) + ["contact"]
-
     @pytest.mark.parametrize("stamped", [True, False])
     def test_a_reading_that_came_late_is_held_since_it_was_taken(self, stamped):
         """Readings that a delayed reader fetches together were not taken together."""

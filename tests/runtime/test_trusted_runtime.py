@@ -9,7 +9,6 @@ from edge_samples import FakeModel, make_contract, make_pad_contract, write_mode
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, WrongModel, make_trusted_contract
 
-from edge.errors import EdgeError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.pad_geometry import USPA44
@@ -57,15 +56,6 @@ class TestTaps:
         result = pad.push(PRESS)
         assert [share >= 0.5 for share in result.tap_mismatch] == [False, True]
         assert result.taps_used == len(result.window) == 2 and pad.kinds == []
-
-    def test_with_a_dropped_tap_it_is_the_pattern_of_fewer(self):
-        pad, alone = make_pad(), make_pad()
-        pad.tap(taxel=ELSEWHERE)
-        while pad.number > alone.number:
-            alone.push()
-        with_drop, without = pad.push(PRESS), alone.push(PRESS)
-        assert with_drop.taps_used == without.taps_used == 1
-        assert with_drop.pattern is not None and np.array_equal(with_drop.pattern, without.pattern)
 
     def test_a_lighter_press_drops_a_tap_for_this_scan_only(self):
         pad = make_pad(options=replace(EVERY, every_scan=False))
@@ -130,13 +120,3 @@ def test_a_model_without_checks_says_that_it_does_not_know(tmp_path, contract):
         assert (result.trusted, result.untrusted_reason, result.mismatch) == (None, None, None)
         assert result.tap_mismatch is None
     assert result.taps_used == 2
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_no_record_of_a_pattern_that_is_not_finite_is_believed(bad):
-    try:
-        with np.errstate(all="ignore"):
-            result = make_pad(WrongModel(make_trusted_contract(), bad)).push(PRESS)
-    except EdgeError:
-        return
-    assert result.trusted is not True

@@ -190,11 +190,8 @@ class TestRos2:
 
     def transform(self, parent, child, x_m, y_m, rotation):
         place = {"x": x_m, "y": y_m, "z": 0.0}
-        return {
-            "header": self.header(parent),
-            "child_frame_id": child,
-            "transform": {"translation": place, "rotation": rotation},
-        }
+        moved = {"translation": place, "rotation": rotation}
+        return {"header": self.header(parent), "child_frame_id": child, "transform": moved}
 
     def test_a_pose_with_its_stamp_comes_to_the_runtime(self, opened, publish):
         queue = opened("4=ros2:/arm/pose")

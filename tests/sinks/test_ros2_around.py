@@ -73,12 +73,7 @@ def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
     assert status[0] == Level.WARN
     assert status[1].startswith("pattern not to be believed: the pattern does not explain its readings")
     clock.now_ns += 1_000_000_000
-    doubt = {
-        "state": "baseline_in_doubt",
-        "contact": None,
-        "trusted": False,
-        "notes": (Note("baseline_in_doubt", "why"),),
-    }
+    doubt = {"state": "baseline_in_doubt", "contact": None, "notes": (Note("baseline_in_doubt", "why"),)}
     sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubt), {"dropped": 2})
     assert statuses() == [(Level.ERROR, "why")]
     published.clear()
@@ -169,9 +164,8 @@ def test_an_environment_that_ros_would_not_take_is_refused(environment, said):
 
 def test_a_configuration_that_is_none_is_told(capfd):
     with pytest.raises(SinkError, match=r"cannot join DDS domain 7 .*CYCLONEDDS_URI"):
-        Ros2Sink(
-            "skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"}
-        )
+        nonsense = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
+        Ros2Sink("skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": nonsense})
 
 
 def test_without_the_package_one_line_says_how_to_get_it():

@@ -97,6 +97,9 @@ class TestWhatIsThere:
             sink.write(make_result(sensor="one-more"), {})
 
 
+REASONS = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline")
+
+
 class TestLayout:
     def test_what_readers_of_version_1_know_lies_where_it_did(self):
         offsets, known = offsets_of(MEMBERS), [tuple(one.split(":")) for one in VERSION_1.split()]
@@ -108,9 +111,7 @@ class TestLayout:
             "state": ("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"),
             "filled": ("rest", "neighbours"),
             "wrench_origin": ("nominal", "calibrated"),
-            "untrusted_reason": (
-                *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
-            ),
+            "untrusted_reason": REASONS,
         }
 
     def test_the_header_tells_where_maps_lie(self, sink, name):

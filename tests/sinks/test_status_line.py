@@ -184,11 +184,3 @@ class TestStatus:
         sink.close()
         with contextlib.suppress(OSError):  # it still has what nobody took
             stream.close()
-
-    def test_nothing_where_there_is_no_terminal(self):
-        stream = io.StringIO()
-        sink = StatusSink(stream)
-        sink.write(make_results(1)[0], {})
-        sink.wait()
-        sink.close()
-        assert stream.getvalue() == ""

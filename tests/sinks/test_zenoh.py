@@ -66,9 +66,8 @@ class TestMessages:
                 expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
             if number == 20:
                 sink.tell(event, counters)
-                expected.append(
-                    ("grip/event", "application/json", plain(event_record(event, counters, "emulated")), {})
-                )
+                said = plain(event_record(event, counters, "emulated"))
+                expected.append(("grip/event", "application/json", said, {}))
         sink.close()
         messages, lives = consumer.until_gone()
         alive = f"grip/alive/{sink.zid}"
@@ -116,9 +115,7 @@ class TestWhoComesAndGoes:
             sink, (result,) = ZenohSink(f"grip?connect={endpoint}"), make_results(1)
             assert sink.trouble is None
             sink.write(result, {})
-            assert (
-                sink.trouble == f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
-            )
+            assert str(sink.trouble).startswith(f"nobody subscribes to zenoh:grip?connect={endpoint}: check its ")
             for key in ("grip/*/scan", "grip/4/pattern", "grip/event"):
                 reader = place.declare_subscriber(key)
                 wait_for(lambda: sink.write(result, {}) or sink.trouble is None)

@@ -63,9 +63,8 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     np.testing.assert_array_equal(maps["deviation"], result.deviation)
     np.testing.assert_array_equal(maps["zeroed"], result.zeroed)
     np.testing.assert_array_equal(maps["taps"], result.window[: result.taps_used, 2])
-    assert header["trace"] == [
-        [0.0, round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4), None]
-    ]
+    drawn = [round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4)]
+    assert header["trace"] == [[0.0, *drawn, None]]
 
 
 def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
@@ -128,9 +127,8 @@ AGAIN = Event(0, "zeroed", "4", "again")
 def test_memory_does_not_grow_with_the_run(heard):
     idle = Press().next(0)
     for number in range(20_000):
-        heard.write(
-            replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), events=(AGAIN,)), {}
-        )
+        scan = replace(idle.scan, number=number, time_ns=number * PERIOD_NS)
+        heard.write(replace(idle, scan=scan, events=(AGAIN,)), {})
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
 
 
@@ -141,11 +139,9 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
     clock.now_ns += 2 * 10**9
     got = look(viewer, heard, clock)
     assert [header["note"] for header, _ in got] == [f"gone {number}" for number in range(5, EVENTS + 5)]
-    last, said = (
-        got[-1][0],
-        event_record(Event(EVENTS + 4, "lost", None, f"gone {EVENTS + 4}"), {"outages": EVENTS + 4}, "emulated"),
-    )
-    assert last == said | {"kind": "event", "number": EVENTS + 5, "age_s": 2.0, "maps": []}
+    last = Event(EVENTS + 4, "lost", None, f"gone {EVENTS + 4}")
+    said = event_record(last, {"outages": EVENTS + 4}, "emulated")
+    assert got[-1][0] == said | {"kind": "event", "number": EVENTS + 5, "age_s": 2.0, "maps": []}
     assert look(viewer, heard, clock) == []
     heard.tell(Event(1, "back", None, "again"), {})
     assert [header["note"] for header, _ in look(viewer, heard, clock)] == ["again"]
@@ -157,9 +153,8 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     heard.write(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
     heard.write(press.next(), {})
     event, result = look(viewer, heard, clock)
-    assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == (
-        *("zeroed", "4", "sensor 4 zeroed on demand: baseline b"),
-    )
+    said = [event[0][key] for key in ("event", "sensor", "note")]
+    assert said == ["zeroed", "4", "sensor 4 zeroed on demand: baseline b"]
     assert result[0]["scan"] == 2
 
 
