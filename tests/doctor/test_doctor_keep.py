@@ -9,6 +9,7 @@ from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, recording
 
+from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli import main as cli
 from edge.cli.run_options import parser
 from edge.doctor import command, examine
@@ -16,16 +17,12 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.gain_keeper import keep_learned
-from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.zeroing.baseline import Baseline
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
 WHOLE = SensorEntry(Mounting(swap_xy=True, gains=GAINS), 1180.0, BASELINE)
@@ -72,9 +69,8 @@ class TestLoss:
     def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, monkeypatch, tmp_path):
         path, free = tmp_path / "s.toml", healthy_counts(200)
         baseline = Baseline.from_counts("4", free, 1.79e9)
-        save_sensor_file(
-            path, SensorFile(sensors={"4": SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))})
-        )
+        entry = SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))
+        save_sensor_file(path, SensorFile(sensors={"4": entry}))
         pressed = free.copy()
         pressed[:, 2] += 800
         for counts, stored in ((pressed, False), (free, True)):

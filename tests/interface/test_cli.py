@@ -1,6 +1,5 @@
 """`edge-sr` as a user runs it: help, recordings, models, baselines, and refusals."""
 
-import json
 import re
 import subprocess
 import sys
@@ -8,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_samples import TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
+from cli_samples import assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
 
 from edge import __version__
@@ -82,27 +81,6 @@ class TestReplay:
         assert re.search(r"rate held: (29|30)\.\d Hz \(sensor 4\), 30 Hz asked for", done.stderr)
         assert "p50" in done.stderr and "\x1b" not in done.stderr
 
-    def test_a_reset_on_stdin_forgets_the_taps(self, files, tmp_path):
-        taps = write_recording(tmp_path / "many.npz", ([0] * 5 + [3000] * 5) * 12)
-        process = start(*base_options(files), "--source", f"replay:{taps}", "--sink", "jsonl:-", stdin=subprocess.PIPE)
-        assert process.stdout is not None and process.stdin is not None
-        used = []
-        for line in process.stdout:
-            record = json.loads(line)
-            used.append(record["taps_used"])
-            if used[-1] == 4:
-                process.stdin.write('{"cmd": "reset"}\nnonsense\n')
-                process.stdin.flush()
-                break
-        rest = [json.loads(line) for line in process.stdout]
-        refused = [record["note"] for record in rest if record["state"] == "event" and record["event"] == "refused"]
-        assert len(refused) == 1 and "a line on stdin is refused: 'nonsense', expected " in refused[0]
-        used += [record["taps_used"] for record in rest if record["state"] != "event"]
-        assert process.wait(TIMEOUT_S) == 0
-        after = used[used.index(4) :]
-        assert 1 in after and after.index(1) < 30
-        assert process.stderr is not None and "refused: 1 lines or messages were not commands" in process.stderr.read()
-
 
 class TestModels:
     def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
@@ -154,7 +132,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
 @pytest.mark.parametrize(
     ("code", "typed", "words"),
     [
-        (2, "--rate-hz 0", ["--rate-hz: '0' is not a positive number"]),
         (2, "--rate-hz 1e-300", ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
         (2, "--counts-per-newton 1e8", ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
         (2, "--mode x", ["unrecognized arguments: --mode", "did you mean --model? edge-sr --help"]),

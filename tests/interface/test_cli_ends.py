@@ -124,33 +124,6 @@ class TestEnds:
         assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
         wait_for(lambda: not emulator.adapter.channel_open)
 
-    def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
-        """A link named by its adapter, as udev does, that leads to a new port each time."""
-        port, out = tmp_path / "by-id", tmp_path / "out.jsonl"
-        process = None
-        for _ in range(2):
-            with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
-                port.unlink(missing_ok=True)
-                port.symlink_to(emulator.port)
-                if process is None:
-                    process = start(*base_options(files), "--source", f"slcan:{port}", "--sink", f"jsonl:{out}")
-                    wait_for(lambda: out.exists() and out.read_text().count("\n") > 10)
-                else:
-                    wait_for(lambda: '"back"' in out.read_text().rpartition("lost")[2])
-                    wait_for(lambda: out.read_text().rpartition('"back"')[2].count("\n") > 10)
-        process.send_signal(signal.SIGINT)
-        _, errors = self.rest(process)
-        assert process.returncode == 0
-        got = records(out.read_text())
-        kinds = [record.get("event") for record in got if record["state"] == "event"]
-        assert kinds[:2] == ["lost", "back"]
-        assert "trying again until it is back" in errors and "is back after" in errors
-        back = got.index(next(record for record in got if record.get("event") == "back"))
-        scans = [record for record in got if record["state"] != "event"]
-        assert [record["scan"] for record in scans] == list(range(len(scans)))
-        assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
-        assert [record["counters"] for record in scans if "counters" in record][-1]["missed"] > 0
-
     def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
         leader, follower = pty.openpty()
         name = f"slcan:{os.ttyname(follower)}"

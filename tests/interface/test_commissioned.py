@@ -5,16 +5,11 @@ import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 
-from edge.api import Stream, open_recording, open_runtime, open_source
+from edge.api import Pad, RecordingError, Scan, Source, Stream, UsageError, open_recording, open_runtime, open_source
 from edge.doctor.write_sensor_file import keep
-from edge.errors import UsageError
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
-from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines

@@ -13,16 +13,13 @@ from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_scan
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
 
+from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
-from edge.perception.result import Result
 from edge.perception.result_fields import MAPS
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.scans.scan import Scan
 
 OLD = Path(__file__).parent / "first_version"
 

@@ -8,18 +8,12 @@ from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
-from edge.api import load_model
+from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, UsageError, demo_recording, load_model
 from edge.cli import main as cli
 from edge.cli import run_command as run
 from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
-from edge.errors import UsageError
 from edge.evaluation.metrics import psnr_db, rmse_percent
-from edge.inference.bundled import POSED_MODEL, demo_recording
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.event import Event
-from edge.perception.runtime import Runtime
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 from train.demo import TAP_FRAMES
@@ -241,12 +235,8 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
     path = tmp_path / "posed.onnx"
     trust = make_posed_trust(100.0).to_json()
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
-    write_posed_model(
-        path,
-        make_posed_contract(
-            interval_factor=1.6, trust=trust, pad_inputs=pad_inputs, takes_gains=True, output_full_scale=100.0
-        ),
-    )
+    takes = {"trust": trust, "pad_inputs": pad_inputs, "takes_gains": True}
+    write_posed_model(path, make_posed_contract(interval_factor=1.6, output_full_scale=100.0, **takes))
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
     done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")
     assert done.returncode == 0, done.stderr
@@ -286,15 +276,11 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_
         (["demo"], "demo"),
     ],
 )
-def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(monkeypatch, arguments, source):
+def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(monkeypatch, capsys, arguments, source):
     """In a container, as a service or before `tee` as well: a page needs no terminal."""
 
-    class AskedError(UsageError):
-        pass
+    def ask(*names, **_):
+        raise UsageError(*names)
 
-    def ask(options, give_up_s):
-        raise AskedError(*options.source)
-
-    monkeypatch.setattr(cli, "_open_source", ask)
-    monkeypatch.setattr(cli, "_exit_code", lambda error: str(error))
-    assert cli.main(arguments) == source
+    monkeypatch.setattr(cli, "open_source", ask)
+    assert cli.main(arguments) == 2 and capsys.readouterr().err == f"edge-sr: {source}\n"

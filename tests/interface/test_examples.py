@@ -15,10 +15,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
 from trust_samples import make_trusted_contract
 
-from edge.api import Result, find_model
-from edge.perception.event import Note
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.errors import LinkLostError
+from edge.api import LinkLostError, Note, Result, Source, find_model
 from firmware_bridge.links.base import Notice
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -306,39 +303,17 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     assert out[-1].startswith("not handed over: it is not better than stsr-int8. Train it for longer")
 
 
-@pytest.fixture
-def trained(monkeypatch, tmp_path):
-    """The example on a machine without an adapter, whose training takes no time; it counts its trainings."""
-    module = loaded("train_and_deploy")
-    module.trainings = []
-
-    def train(mesh, out, **_):
-        module.trainings.append(mesh)
-        (out / "checkpoints").mkdir(parents=True, exist_ok=True)
-        (out / "checkpoints" / "ball.onnx").touch()
-        return out / "checkpoints" / "ball.onnx"
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "train", train)
-    module.compare = module.is_better
-    monkeypatch.setattr(module, "is_better", lambda *_: True)
-    monkeypatch.setattr(module, "tried", lambda mesh: (0.02, 0.2))
-    monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", list)
-    return module
-
-
-def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(trained, monkeypatch, tmp_path, capsys):
+def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(monkeypatch, tmp_path, capsys):
+    example = loaded("train_and_deploy")
     trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
-    trained.JUDGED = 12
+    example.JUDGED = 12
     good, poor = find_model("stsr"), write_model(tmp_path / "poor.onnx", make_contract(taps=1))
     for own, bundled, better in ((good, poor, True), (poor, good, False)):
-        monkeypatch.setattr(trained, "find_model", lambda name, path=bundled: path)
-        assert trained.compare(own, tmp_path / "box.stl", tmp_path, 1) == better
+        monkeypatch.setattr(example, "find_model", lambda name, path=bundled: path)
+        assert example.is_better(own, tmp_path / "box.stl", tmp_path, 1) == better
         assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 
 
-def test_a_source_that_does_not_exist_is_refused_before_the_training(trained, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x"])
-    with pytest.raises(SystemExit, match=r"train_and_deploy: source is 'slcna:x', expected one of"):
-        trained.main()
-    assert trained.trainings == []
+def test_a_source_that_does_not_exist_is_refused_before_the_training(empty):
+    code, out, errors = run(empty, "train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x")
+    assert code == 1 and out == [] and errors[0].startswith("train_and_deploy: source is 'slcna:x', expected one of")

@@ -9,23 +9,17 @@ from edge_samples import make_contract, write_model
 from mcap_samples import arrays_of
 
 from edge import api
+from edge.api import USPA44, USPA46, Baseline, ModelError, Pad, Runtime, SensorGeometry, Stream, UsageError, layout_c
 from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
-from edge.errors import ModelError, UsageError
-from edge.perception.runtime import Runtime
-from edge.pipeline.result_stream import Stream
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.scans.can_id_maps import layout_c
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.zeroing.baseline import Baseline
 
 REST = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + 37 * np.arange(24).reshape(4, 6)
 BASELINE = Baseline.of("4", REST, 1.7e9, 100, "file")

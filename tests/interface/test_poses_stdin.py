@@ -13,17 +13,12 @@ from cli_samples import base_options, files, records, run, start, write_recordin
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
-from edge.api import MapSink, ObjectMap, Stream, open_recording, open_runtime
+from edge.api import MapSink, ObjectMap, PadPose, Runtime, Source, Stream, TimedPose, open_recording, open_runtime, pump
 from edge.mapping.map_files import check_npz
-from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
 from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
-from edge.pipeline.pump import pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS
 
 __all__ = ["files"]

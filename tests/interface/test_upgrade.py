@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from cli_samples import records, run
 from edge_samples import REST, write_model
+from golden_world import write_csv
 
 from edge.api import load_baselines, open_recording, take_baselines
 from edge.cli import main as cli
@@ -76,7 +77,6 @@ def test_a_file_that_is_replaced_stays_and_the_user_reads_where(tmp_path, capsys
     assert (tmp_path / "sensor.toml.bak").read_text() == "[no sensor file"
 
 
-COLUMNS = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
 GRIP = np.zeros((3, 4, 4))
 GRIP[2] = np.linspace(400, 1100, 16).reshape(4, 4)
 DRIFT = np.zeros((3, 4, 4))
@@ -84,13 +84,10 @@ DRIFT[2] = 560 + 90 * np.cos(np.arange(16)).reshape(4, 4)
 DRIFT[0] = -110
 
 
-def write_csv(path, *parts, seed=0):
+def write_parts(path, *parts, seed=0):
     """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
-    rng = np.random.default_rng(seed)
-    rows = [REST + felt + rng.normal(0, 2, (3, 4, 4)) for scans, felt in parts for _ in range(scans)]
-    lines = [",".join(f"{value:.1f}" for value in np.rint(row).reshape(3, 16).T.ravel()) for row in rows]
-    path.write_text("\n".join([COLUMNS, *lines]) + "\n")
-    return path
+    felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
+    return write_csv(path, np.rint(REST + felt + np.random.default_rng(seed).normal(0, 2, felt.shape)).astype(int))
 
 
 def moving(scans):
@@ -113,9 +110,9 @@ def played(folder, *arguments):
 
 
 def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
-    held = write_csv(folder / "monday" / "a held left.csv", *moving(150))
+    held = write_parts(folder / "monday" / "a held left.csv", *moving(150))
     held = held.rename(folder / "monday" / "left.csv")
-    released = write_csv(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
+    released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
     shown, stderr = played(folder, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
     first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
@@ -131,7 +128,7 @@ def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_print
 
 
 def test_a_baseline_of_a_recording_is_as_old_as_the_recording_or_of_unknown_age(folder):
-    path = write_csv(folder / "left.csv", (120, 0))
+    path = write_parts(folder / "left.csv", (120, 0))
     for more in ([], ["--skip", "5", "--scans", "100"]):
         arguments = ["--source", f"replay:{path}", "--rate-hz", "600", *more, "--out", folder / "zero.json"]
         done = run("baseline", *arguments)
@@ -145,7 +142,7 @@ def test_a_baseline_of_a_recording_is_as_old_as_the_recording_or_of_unknown_age(
 def test_a_pad_that_only_recovers_gives_patterns(folder):
     falls = [(1, GRIP * share) for share in (0.8, 0.5, 0.2)]
     recovers = [(1, np.array([0, 0, 30.0 * (1 - n / 35)])[:, None, None]) for n in range(36)]
-    path = write_csv(folder / "left.csv", *moving(20), *falls, *recovers)
+    path = write_parts(folder / "left.csv", *moving(20), *falls, *recovers)
     shown, stderr = played(folder, path, "--rate-hz", "60")
     assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
     assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)

@@ -9,7 +9,7 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract
 from numpy.typing import NDArray
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.errors import EdgeError
+from edge.api import USPA44, EdgeError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
@@ -17,7 +17,6 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)

@@ -12,11 +12,10 @@ from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_p
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
-from edge.errors import UsageError, WindowError
+from edge.api import PadPose, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
-from firmware_bridge.poses.pad_pose import PadPose
 
 POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5)]
 

@@ -14,8 +14,7 @@ import pytest
 from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
-from edge.errors import ModelError
-from edge.inference.contract import Contract
+from edge.api import Contract, ModelError
 from edge.inference.forward_model import GRID, KPA, condensed, features
 from edge.inference.onnx_session import ModelSession
 from edge.inference.small_network import (

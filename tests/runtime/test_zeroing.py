@@ -9,15 +9,12 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, make_contract, mak
 from mcap_samples import arrays_of
 from runtime_samples import make_runtime
 
+from edge.api import BaselineRefusedError, DeviceError, LinkLostError, Scan, Source, take_baselines
 from edge.perception.zeroing import GIVE_UP_NS
-from edge.pipeline.baseline_capture import take_baselines
-from edge.pipeline.scan_reader import Source
 from edge.sinks.json_encoding import record
 from edge.sinks.mcap import McapSink
 from edge.sinks.status_line import StatusSink
-from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Notice
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import deformation
 
 DAY_S = 86_400.0

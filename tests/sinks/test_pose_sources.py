@@ -14,8 +14,7 @@ from bridge_samples import make_recording
 from cli_samples import base_options, files, records, start
 from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
-from edge.errors import UsageError
-from edge.perception.runtime import Runtime
+from edge.api import Runtime, UsageError
 from edge.pipeline.pose_intake import PoseIntake
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses

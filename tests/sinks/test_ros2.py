@@ -14,8 +14,7 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import make_contract, make_wrench_result
 
-from edge.perception.event import Event
-from edge.pipeline.commands import Command, Commands
+from edge.api import Command, Commands, Event
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages

@@ -17,17 +17,8 @@ from edge_samples import ROOT, make_pad_contract, make_wrench_result
 from shm_samples import fields, latest, make_result, name, sink, values
 
 from edge.errors import SinkError
-from edge.sinks.shm import (
-    HEADER,
-    HEARTBEAT_AT,
-    IN_MEMORY,
-    MEMBERS,
-    SLOTS,
-    Layout,
-    SharedMemorySink,
-    offsets_of,
-    struct_of,
-)
+from edge.sinks import shm
+from edge.sinks.shm import HEADER, IN_MEMORY, MEMBERS, SLOTS, Layout, SharedMemorySink, offsets_of
 
 sys.path.append(str(ROOT / "examples"))
 from shm_read import attach
@@ -117,10 +108,8 @@ class TestLayout:
     def test_the_header_tells_where_maps_lie(self, sink, name):
         memory = attach(name)
         layout, offsets = Layout(4, 4, 40, 40), offsets_of(HEADER)
-        told = dict(zip((field for field, _ in HEADER), struct_of(HEADER).unpack_from(memory), strict=True))
-        assert {map_name: told[f"{map_name}_at"] for map_name in layout.maps} == {
-            map_name: at for map_name, (_, _, at) in layout.maps.items()
-        }
+        told = dict(zip((field for field, _ in HEADER), shm.struct_of(HEADER).unpack_from(memory), strict=True))
+        assert {one: told[f"{one}_at"] for one in layout.maps} == {one: at for one, (_, _, at) in layout.maps.items()}
         assert (told["writer_pid"], told["pattern_unit"].rstrip(b"\0")) == (os.getpid(), b"mm")
         assert len(memory) == layout.total_bytes and offsets["writer_pid"] == 64
 
@@ -133,7 +122,7 @@ class TestLayout:
             for table in (HEADER, MEMBERS)
             for field, kind in table
         ]
-        heartbeat = (str(HEARTBEAT_AT), "heartbeat_ns", "i64")
+        heartbeat = (str(shm.HEARTBEAT_AT), "heartbeat_ns", "i64")
         assert documented == [*tables[: len(HEADER)], heartbeat, *tables[len(HEADER) :]]
 
     def test_a_wrench_and_its_traction_are_there_while_they_hold(self, name):

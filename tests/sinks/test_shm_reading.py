@@ -14,22 +14,11 @@ from struct import unpack_from
 
 import numpy as np
 import pytest
+import shm_samples
 from edge_samples import ROOT, ended
-from shm_samples import (
-    CONTRACT,
-    ENVIRONMENT,
-    fields,
-    heartbeat_ns,
-    latest,
-    make_result,
-    name,
-    sink,
-    start_writer,
-    writing,
-)
+from shm_samples import CONTRACT, fields, heartbeat_ns, latest, make_result, name, sink, start_writer, writing
 
-from edge.errors import SinkError
-from edge.perception.event import Event
+from edge.api import Event, SinkError
 from edge.sinks.shm import Layout, SharedMemorySink
 
 sys.path.append(str(ROOT / "examples"))
@@ -145,7 +134,7 @@ class TestReading:
         start_writer()
         command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, *words]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, **pipes)) as reader:
+        with ended(subprocess.Popen(command, env=shm_samples.ENVIRONMENT, text=True, **pipes)) as reader:
             while not re.fullmatch(line, told := reader.stdout.readline().rstrip()):
                 assert told.startswith("nothing to act on: the newest reading is")  # its writer had no turn for 50 ms
             Path("/dev/shm", name).unlink()

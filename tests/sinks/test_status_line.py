@@ -10,9 +10,7 @@ import pytest
 from edge_samples import BASELINE, FakeModel, make_scan
 from sink_samples import RUN, Terminal, make_results
 
-from edge.perception.event import Event, Note
-from edge.perception.result import NextTap
-from edge.perception.runtime import Runtime
+from edge.api import Event, NextTap, Note, Runtime
 from edge.sinks.status_line import MessageSink, StatusSink
 
 

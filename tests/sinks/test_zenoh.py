@@ -15,22 +15,13 @@ from urllib.parse import unquote
 import numpy as np
 import orjson
 import pytest
+import zenoh_samples
 from bridge_samples import write_recording
 from edge_samples import ROOT, ended, make_scan, wait_for, write_model
 from test_listening import reachable
-from zenoh_samples import (
-    CONTRACT,
-    ENVIRONMENT,
-    consume,
-    endpoint,
-    free_endpoint,
-    hear_interrupts,
-    listening,
-    make_results,
-)
+from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts, listening, make_results
 
-from edge.errors import SinkError
-from edge.perception.event import Event
+from edge.api import Event, SinkError
 from edge.pipeline.sink import RunFacts
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
@@ -223,7 +214,7 @@ class TestListening:
 @pytest.mark.parametrize("by_file", [False, True])
 def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
     """Zenoh peers report others that they are connected to."""
-    endpoint, others = free_endpoint(), free_endpoint()
+    endpoint, others = zenoh_samples.free_endpoint(), zenoh_samples.free_endpoint()
     config = tmp_path / "zenoh.json5"
     config.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))
     with listening(endpoint) as known, listening(others, endpoint) as other:

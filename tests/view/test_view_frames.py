@@ -67,19 +67,6 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     assert header["trace"] == [[0.0, *drawn, None]]
 
 
-def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
-    press, viewer, traced = Press(), Viewer(), []
-    for scans in (1, 4, 0, 7, 200):
-        for result in press.take(scans):
-            heard.write(result, {})
-        got = look(viewer, heard, clock)
-        assert len(got) == (scans > 0)
-        for header, _ in got:
-            assert header["scan"] == press.number - 1
-            traced += numbers(header)
-    assert traced == list(range(212)) and header["rate_hz"] == 100.0
-
-
 def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     press, viewer = Press(), Viewer()
     heard.write(press.next(), {})
@@ -156,20 +143,6 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     said = [event[0][key] for key in ("event", "sensor", "note")]
     assert said == ["zeroed", "4", "sensor 4 zeroed on demand: baseline b"]
     assert result[0]["scan"] == 2
-
-
-def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_trace(heard, clock):
-    press, viewer = Press(), Viewer()
-    heard.write(press.next(), {})
-    look(viewer, heard, clock)
-    viewer.paused = True
-    for result in press.take(9):
-        heard.write(result, {})
-    heard.tell(Event(1, "lost", None, "gone"), {})
-    assert [header["kind"] for header, _ in look(viewer, heard, clock)] == ["event"]
-    viewer.paused = False
-    [(header, _)] = look(viewer, heard, clock)
-    assert header["scan"] == 9 and numbers(header) == list(range(1, 10))
 
 
 def test_state_tells_of_what_is_recorded_and_played():

@@ -1,17 +1,19 @@
-"""Recordings that a viewer of the live page asks for."""
+"""Recordings that a viewer of the live page asks for, and what `edge-sr --view` does with a port and a recording."""
 
+import json
 import re
+import socket
 import threading
 import time
 
 import numpy as np
 import pytest
+from bridge_samples import make_counts, write_recording
 from edge_samples import wait_for
 from view_samples import CONTRACT, TIMEOUT_S, Press
 
-from edge.errors import SinkError
-from edge.perception.event import Event
-from edge.pipeline.sink import Sink
+from edge.api import Event, Sink, SinkError
+from edge.cli.main import main
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
 from firmware_bridge.recording.formats import load_recording
@@ -170,3 +172,22 @@ def test_one_that_cannot_be_finished_is_told(tmp_path):
     ask(recorder, told, True)
     recorder.close()
     assert told[-1].kind == "sink" and told[-1].text.endswith("could not be finished: no room for the end")
+
+
+def test_a_port_in_use_is_one_line_and_5(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
+    assert capsys.readouterr().err == (
+        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: address in use; "
+        "name another port with --view, or 0 for any free one\n"
+    )
+
+
+def test_a_recording_is_played_as_if_live_where_somebody_is_to_look(tmp_path):
+    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
+    for number, (options, live) in enumerate((([], False), (["--paced"], True), (["--view", "0"], True))):
+        records, begun_ns = tmp_path / f"{number}.jsonl", time.monotonic_ns()
+        assert main(["replay", str(path), "--sink", f"jsonl:{records}", *options]) == 0
+        first = json.loads(records.read_text().splitlines()[0])
+        assert (first["time_ns"] >= begun_ns) == live, options
