@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli_samples import assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
+from golden_world import write_csv
 
 from edge import __version__
 from edge.cli import main as cli
@@ -24,9 +25,7 @@ __all__ = ["files"]
 
 
 def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
-    recording = tmp_path / "rest.csv"
-    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
-    recording.write_text("\n".join([header, *[",".join(["30000.0"] * 48)] * 3, ""]))
+    recording = write_csv(tmp_path / "rest.csv", np.full((3, 3, 4, 4), 30_000))
     for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr7-int8")):
         done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
         assert {record["model"] for record in records(done.stdout)} == {model}

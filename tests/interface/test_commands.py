@@ -25,10 +25,9 @@ OPEN = []
 
 def lines_of(descriptor):
     commands = Commands()
-    lines = CommandLines(commands, descriptor)
-    OPEN.append(lines)
-    commands.ask(lines.read)
-    return lines, commands
+    OPEN.append(CommandLines(commands, descriptor))
+    commands.ask(OPEN[-1].read)
+    return commands
 
 
 def polled_stdin():
@@ -44,14 +43,12 @@ def pipe():
     while OPEN:
         OPEN.pop().close()
     for end in ends:
-        try:
+        with contextlib.suppress(OSError):
             os.close(end)
-        except OSError:
-            continue
 
 
 def test_commands_come_as_lines_however_they_are_cut(pipe):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     assert commands.poll() == []
     for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"'):
         os.write(pipe[1], piece)
@@ -74,14 +71,14 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
     ],
 )
 def test_other_lines_are_counted(pipe, line):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
     assert commands.poll() == [RESET]
     assert commands.refused == 1
 
 
 def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     for _ in range(20):
         os.write(pipe[1], b"x" * 4000)
         assert commands.poll() == []
@@ -91,7 +88,7 @@ def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
 
 
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     os.write(pipe[1], b'{"cmd": "zero", "sensor": null, "force": true}')
     assert commands.poll() == []
     os.close(pipe[1])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
+from golden_world import write_csv
 
 from edge.api import Pad, RecordingError, Scan, Source, Stream, UsageError, open_recording, open_runtime, open_source
 from edge.doctor.write_sensor_file import keep
@@ -102,12 +103,9 @@ def turned_rest():
 
 def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
     """Sensor 4 of left and sensor 4 of right may sit in other ways."""
-    scan = make_scan()
-    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
-    row = ",".join(map(str, scan.counts.reshape(3, 16).T.ravel()))
     for folder in ("left", "right"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "4.csv").write_text("\n".join([header, row, ""]))
+        write_csv(tmp_path / folder / "4.csv", make_scan().counts[None])
     texts = [f"{name}=replay:{tmp_path}/{name}/4.csv" for name in ("left", "right")]
     found = {}
     with Source(*open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])})) as source:

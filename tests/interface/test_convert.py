@@ -191,6 +191,9 @@ sys.exit(cli.main(["convert", *sys.argv[2:]]))
 """
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
 @pytest.mark.parametrize(
     ("source", "new"), [("press.mcap", "new.npz"), ("old.npz", "new.mcap"), ("press.mcap", "new.csv")]
 )
@@ -199,18 +202,18 @@ def test_a_full_disk_leaves_nothing(source, new, tmp_path):
     record_into(tmp_path / "press.mcap", make_results(scans))
     arrays_of(tmp_path / "press.mcap")
     (tmp_path / "press.npz").rename(tmp_path / "old.npz")
-    where = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RUN, "10000", source, new]
-    done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old.npz", "press.mcap"]
 
 
 def test_ctrl_c_leaves_nothing(tmp_path):
     write_recording(tmp_path / "long.csv", np.tile(make_counts(100), (100, 1, 1, 1)), rate_hz=100)
-    where = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
-    with subprocess.Popen(command, cwd=tmp_path, env=where, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         while not list(tmp_path.glob(".new.mcap.*/new.mcap")) and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)

@@ -191,19 +191,12 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
 
 @dataclasses.dataclass
 class Tap:
-    """Tap of the demo's figure as its records show it.
+    """Tap of the demo's figure as its records show it."""
 
-    Attributes:
-        place: x, y in [mm] and turn in [deg].
-        breaks: how often, before its end, scans had stopped, or taxels had fallen silent or come back.
-        used: number of taps that each of its patterns is made of.
-        proposed: x, y in [mm] of the proposal after it; None without one.
-    """
-
-    place: tuple[float, ...]
-    breaks: int = 0
-    used: list[int] = dataclasses.field(default_factory=list)
-    proposed: tuple[float, ...] | None = None
+    place: tuple[float, ...]  # x, y in [mm] and turn in [deg]
+    breaks: int = 0  # times that scans had stopped before its end, or taxels had fallen silent or come back
+    used: list[int] = dataclasses.field(default_factory=list)  # number of taps that each of its patterns is made of
+    proposed: tuple[float, ...] | None = None  # x, y in [mm] of the proposal after it
 
 
 STOPPED_NS = 500_000_000

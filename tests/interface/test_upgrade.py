@@ -110,8 +110,7 @@ def played(folder, *arguments):
 
 
 def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
-    held = write_parts(folder / "monday" / "a held left.csv", *moving(150))
-    held = held.rename(folder / "monday" / "left.csv")
+    held = write_parts(folder / "monday" / "left.csv", *moving(150))
     released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
     shown, stderr = played(folder, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}

@@ -75,6 +75,7 @@ def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     [(first, _)] = unpacked(viewer.due(frames))
     [(second, _)] = look(viewer, heard, clock)
     assert (first["scan"], numbers(first)) == (0, [0]) and (second["scan"], numbers(second)) == (1, [1])
+    assert look(viewer, heard, clock) == [], "nothing is sent twice"
 
 
 @pytest.mark.parametrize("rate_hz", [8, 100, 1000])
