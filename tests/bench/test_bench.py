@@ -42,13 +42,8 @@ def bench(tmp_path_factory):
     arguments = ["--rate-hz", "1000", "--ticks", "30", "--threads", "1", "--models", str(mine)]
     arguments += ["--only", "mine/tiny", "mine/coarse", "bilinear", "--out", str(folder / "out")]
     script = "import sys; from edge.bench import command; command.STARTS = 1; from edge.cli.main import main; "
-    done = subprocess.run(
-        [sys.executable, "-c", f"{script}sys.exit(main(['bench', *sys.argv[1:]]))", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-c", f"{script}sys.exit(main(['bench', *sys.argv[1:]]))", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     with (folder / "out" / "bench.csv").open() as file:
         return done.stdout, done.stderr, (folder / "out" / "bench.md").read_text(), list(csv.DictReader(file))
@@ -134,14 +129,8 @@ def test_a_child_that_fails_is_named_with_its_reason():
 
 def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     arguments = ["bench", "--only", "linear map", "--ticks", "100000", "--threads", "1", "--out", str(tmp_path)]
-    with subprocess.Popen(
-        [sys.executable, "-m", "edge.cli.main", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen([sys.executable, "-m", "edge.cli.main", *arguments], cwd=ROOT, **how) as process:
         assert process.stdout is not None
         while "| linear map | 1 |" not in process.stdout.readline():
             pass

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import termios
 import threading
+from functools import partial
 
 import pytest
 from cli_samples import EDGE_SR, TIMEOUT_S, base_options, files, records, run, start
@@ -256,16 +257,10 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
 
 def test_odd_surroundings_end_in_one_line():
     """A terminal one column wide, and fewer descriptors than a run needs."""
-    helped = subprocess.run(
-        [*EDGE_SR, "--help"], capture_output=True, text=True, cwd=ROOT, env=os.environ | {"COLUMNS": "1"}
-    )
+    how = {"capture_output": True, "text": True, "cwd": ROOT}
+    helped = subprocess.run([*EDGE_SR, "--help"], env=os.environ | {"COLUMNS": "1"}, **how)
     assert (helped.returncode, helped.stderr) == (0, "") and "--source" in helped.stdout
-    done = subprocess.run(
-        [*EDGE_SR, "--source", "demo", "--duration-s", "1"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (14, 14)),
-    )
+    few = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (14, 14))
+    done = subprocess.run([*EDGE_SR, "--source", "demo", "--duration-s", "1"], preexec_fn=few, **how)
     assert done.returncode == 5 and "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"

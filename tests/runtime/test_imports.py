@@ -28,16 +28,9 @@ MOST_MODULES = 130
 
 
 def run(code, *arguments, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout.splitlines()
+    command, where = [sys.executable, "-c", code, *map(str, arguments)], os.environ | {"PYTHONPATH": str(ROOT)}
+    settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 120, "check": True}
+    return subprocess.run(command, cwd=ROOT, env=where | environment, **settings).stdout.splitlines()
 
 
 def test_no_module_of_the_runtime_loads_a_training_library():

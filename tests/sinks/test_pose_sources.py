@@ -88,13 +88,8 @@ with zenoh.open(config) as session:
         from zenoh_samples import ENVIRONMENT, free_endpoint
 
         endpoint = free_endpoint()
-        with subprocess.Popen(
-            [sys.executable, "-c", self.PUBLISH, endpoint],
-            env=ENVIRONMENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as process:
+        how = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+        with subprocess.Popen([sys.executable, "-c", self.PUBLISH, endpoint], **how) as process:
             assert process.stdin is not None and process.stdout is not None
             assert process.stdout.readline() == "ready\n"
 

@@ -78,13 +78,9 @@ class TestMessages:
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
         write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
         command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{tmp_path}/free.csv", "--rate-hz", "100"]
+        command += ["--model", str(model), "--sink", f"zenoh:grip?connect={endpoint}"]
         with listening(endpoint):
-            done = subprocess.run(
-                [*command, "--model", str(model), "--sink", f"zenoh:grip?connect={endpoint}"],
-                env=ENVIRONMENT,
-                capture_output=True,
-                text=True,
-            )
+            done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
         why = f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
         assert done.returncode == 0 and f"edge-sr: {why}\n" in done.stderr and f"\nsinks: {why}\n" in done.stderr
 
