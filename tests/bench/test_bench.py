@@ -1,4 +1,4 @@
-"""`edge-sr bench` as a whole, and the errors that it reports."""
+"""`edge-sr bench` as a whole, the cost of the whole program, and reports that know their age."""
 
 import csv
 import os
@@ -7,20 +7,23 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from edge_samples import ROOT, make_contract, write_model
 
-from edge.bench import command
+from edge.bench import command, system
+from edge.bench import provenance as reports
 from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
 from edge.bench.contenders import Subject, subjects
 from edge.bench.errors import BenchError
-from edge.bench.provenance import read_provenance, with_head
+from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
+from edge.bench.system import measured
 from edge.cli.main import main
 from edge.errors import ModelError
 from edge.evaluation.test_set import load_frozen_set
-from edge.inference.bundled import BUNDLE_DIR, find_model
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 
 FROZEN = load_frozen_set(BUNDLE_DIR / "frozen.npz")
@@ -39,13 +42,8 @@ def bench(tmp_path_factory):
     arguments = ["--rate-hz", "1000", "--ticks", "30", "--threads", "1", "--models", str(mine)]
     arguments += ["--only", "mine/tiny", "mine/coarse", "bilinear", "--out", str(folder / "out")]
     script = "import sys; from edge.bench import command; command.STARTS = 1; from edge.cli.main import main; "
-    done = subprocess.run(
-        [sys.executable, "-c", f"{script}sys.exit(main(['bench', *sys.argv[1:]]))", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-c", f"{script}sys.exit(main(['bench', *sys.argv[1:]]))", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     with (folder / "out" / "bench.csv").open() as file:
         return done.stdout, done.stderr, (folder / "out" / "bench.md").read_text(), list(csv.DictReader(file))
@@ -131,14 +129,8 @@ def test_a_child_that_fails_is_named_with_its_reason():
 
 def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     arguments = ["bench", "--only", "linear map", "--ticks", "100000", "--threads", "1", "--out", str(tmp_path)]
-    with subprocess.Popen(
-        [sys.executable, "-m", "edge.cli.main", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen([sys.executable, "-m", "edge.cli.main", *arguments], cwd=ROOT, **how) as process:
         assert process.stdout is not None
         while "| linear map | 1 |" not in process.stdout.readline():
             pass
@@ -152,3 +144,99 @@ def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     with (tmp_path / "bench.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert row["method"] == "linear map" and "paced_p50_us" not in row
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    monkeypatch.setattr(system, "SETTLE_S", 0.5)
+    monkeypatch.setattr(system, "ROUNDS", 1)
+
+
+def test_the_page_and_the_table_tell_it(brief, tmp_path, capsys):
+    assert main(["bench", "--sensors", "5", "--ticks", "30", "--out", str(tmp_path)]) == 0
+    rows = list(csv.DictReader((tmp_path / "bench.csv").open()))
+    assert [row["method"] for row in rows] == ["at rest, 5 sensors", "in contact, 5 sensors"]
+    assert all(float(row["CPU %"].split()[0]) > 0 and float(row["MB"].split()[0]) > 20 for row in rows)
+    assert capsys.readouterr().out.count("| in contact, 5 sensors |") == 1
+    assert read_provenance((tmp_path / "bench.md").read_text()) is not None
+
+
+def test_a_record_is_later_than_the_last_byte_of_its_scan(brief):
+    for _ in range(5):  # frames may be lost on a busy machine, and then nothing is said of the time
+        cost = measured("in contact", 1, 0.5)
+        if cost.p50_us is not None:
+            assert cost.p99_us >= cost.p50_us > 50
+            return
+    pytest.skip("the machine is too busy: frames were lost in five rounds")
+
+
+def test_a_commit_that_is_not_here_is_named(tmp_path):
+    with pytest.raises(BenchError, match="no-such-commit: fatal"):
+        system.tree_of("no-such-commit", tmp_path)
+
+
+SOURCE = "edge/bench/errors.py"
+
+
+@pytest.fixture(scope="module")
+def made():
+    return provenance('python x.py --out "a b"', [ROOT / SOURCE, "edge/bench"], [find_model(DEFAULT_MODEL)], seed=3)
+
+
+def listed(folder: Path, made, capsys, name="mine.md"):
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text(with_head("# mine\n\nWhat was measured.\n", made))
+    reports.main([str(folder)])
+    return capsys.readouterr().out
+
+
+def test_a_head_is_read_as_it_was_written(made):
+    page = with_head("# mine\n\nText.\n", made)
+    assert page.startswith("# mine\n\n```toml\ncommand = ") and page.endswith("```\n\nText.\n")
+    assert read_provenance(page) == made
+    bare = replace(made, seed=None, models={})
+    assert read_provenance(with_head("# b\n", bare)) == bare
+
+
+def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs(made):
+    assert made.sources == {name: file_hash(ROOT / name) for name in (SOURCE, "edge/bench")} and made.seed == 3
+    assert made.models == {f"edge/models/{DEFAULT_MODEL}.onnx": file_hash(find_model(DEFAULT_MODEL))}
+    assert made.tree in {"clean", "changed", UNKNOWN} and len(set(made.sources.values())) == 2
+
+
+@pytest.mark.parametrize(
+    "page", ["# no head\n", "# a\n\n```toml\ncommand = \n```\n", '# a\n\n```toml\ncommand = "x"\n```\n']
+)
+def test_a_head_that_lacks_or_is_damaged_is_none(page):
+    assert read_provenance(page) is None
+
+
+def test_a_report_just_made_is_fresh(made, tmp_path, capsys):
+    assert listed(tmp_path, made, capsys) == f"mine.md: fresh ({made.commit})\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"models": {"README.md": "0" * 12}}, "README.md has changed"),
+        ({"models": {"gone.onnx": "0" * 12}}, "gone.onnx is not here"),
+        ({"sources": {SOURCE: "0" * 12}}, f"{SOURCE} has changed"),
+        ({"sources": {"gone.py": "0" * 12}}, "gone.py is not here"),
+        ({"sources": {SOURCE: UNKNOWN}}, f"of {SOURCE} no hash was kept"),
+    ],
+)
+def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys, change, why):
+    line = listed(tmp_path, replace(made, **change), capsys, "load/mine.md")
+    assert line == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
+
+
+def test_a_report_without_a_head_is_named(tmp_path, capsys):
+    (tmp_path / "old.md").write_text("# old\n")
+    reports.main([str(tmp_path)])
+    assert capsys.readouterr().out == "old.md: no head: make it again with its command\n"
+
+
+def test_every_report_has_a_head():
+    pages = sorted((ROOT / "reports").rglob("*.md"))
+    assert [page.name for page in pages if read_provenance(page.read_text()) is None] == []
+    assert len(pages) > 5

@@ -1,11 +1,14 @@
-"""A sensor that is well gives no finding but ok, and each fault by itself gives its own and only that."""
+"""A sensor that is well gives no finding but ok, each fault only its own, and all are on the page for users."""
+
+import ast
 
 import numpy as np
 import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
+from edge_samples import ROOT
 
 from edge.doctor.examine import Watched, judge
-from edge.doctor.findings import Finding, page, worst
+from edge.doctor.findings import Finding, page
 from edge.doctor.link_checks import LineFacts, capacity_hz, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
@@ -21,15 +24,12 @@ FREE = Baseline.of("4", REST, created_unix_s=1000.0, scans=100, origin="file")
 def faults(scans, **changes):
     """Return names and verdicts of the findings that are not ok, where every input is available."""
     changes.setdefault("references", {"4": FREE})
-    return {
-        finding.name: finding.verdict
-        for finding in judge(watched(scans, **changes), 0.0).findings
-        if finding.verdict != "ok"
-    }
+    found = judge(watched(scans, **changes), 0.0).findings
+    return {finding.name: finding.verdict for finding in found if finding.verdict != "ok"}
 
 
 def remedy_of(name, scans, **changes):
-    findings = judge(watched(scans, **changes), 0.0).findings
+    findings = judge(watched(scans, **{"references": {"4": FREE}} | changes), 0.0).findings
     return next(finding.remedy for finding in findings if finding.name == name)
 
 
@@ -44,6 +44,30 @@ def with_taxel(counts, taxel, readings):
     counts = counts.copy()
     counts.reshape(*counts.shape[:2], 16)[:, :, taxel] = readings
     return counts
+
+
+def pressed(counts_more, since=0):
+    """Return a change that loads one taxel from a scan on."""
+
+    def press(counts):
+        counts[since:, 2, 1, 1] += counts_more
+        return counts
+
+    return press
+
+
+def torn_at_every_taxel(counts):
+    for scan in range(0, 400, 8):
+        counts = silenced(counts, [scan // 8 % 16], slice(scan, scan + 1))
+    return counts
+
+
+def swaying(counts):
+    counts[:, 2, 1, 1] += (20 * np.cos(np.arange(400) * np.pi / 50)).astype(np.int32)
+    return counts
+
+
+REVERSED = {"mountings": {"4": Mounting(signs=(1, 1, -1))}}
 
 
 class TestSensor:
@@ -79,27 +103,33 @@ class TestSensor:
             (lambda counts: with_taxel(counts, 15, counts[:, :, 3, 3] + [0, 15_000, 0]), {"rest levels": "look"} | NEW),
             (lambda counts: with_taxel(counts, 10, [30_000, 30_000, 65_535]), {"rest levels": "look"} | STUCK | NEW),
             (lambda counts: (counts - SEAM) % 65_536, NEW),
+            (torn_at_every_taxel, {"torn scans": "wrong"}),
+            (swaying, {"baseline": "wrong"}),
+            (pressed(800), {"load": "wrong"}),
+            (pressed(800), NEW),  # without an earlier baseline a load cannot be seen
             (lambda counts: silenced(counts, [1, 2, 3], slice(0, 1)), {}),  # a first scan cut in mid-cycle
         ],
     )
     def test_readings_by_themselves(self, change, expected):
-        references = {} if "load" in expected else {"4": FREE}
+        references = {} if expected.get("load") == "not known" else {"4": FREE}
         assert faults(as_scans(change(healthy_counts())), references=references) == expected
 
-    def test_scans_torn_at_every_taxel(self):
-        counts = healthy_counts()
-        for scan in range(0, 400, 8):
-            counts = silenced(counts, [scan // 8 % 16], slice(scan, scan + 1))
-        assert faults(as_scans(counts)) == {"torn scans": "wrong"}
-
-    def test_a_taxel_that_comes_and_goes_is_named(self):
-        scans = as_scans(silenced(healthy_counts(), [6], slice(0, 400, 10)))
-        assert "taxel 6 comes and goes" in remedy_of("torn scans", scans)
-
-    def test_all_stuck_is_an_old_scan_sent_for_ever(self):
-        scans = as_scans(np.repeat(healthy_counts(1), 400, axis=0))
-        assert "one old scan" in remedy_of("stuck taxels", scans)
-        assert worst(judge(watched(scans), 0.0).findings) == "wrong"
+    @pytest.mark.parametrize(
+        ("scans", "change", "given", "name", "words"),
+        [
+            (400, lambda counts: silenced(counts, [6], slice(0, 400, 10)), {}, "torn scans", "taxel 6 comes and goes"),
+            (400, lambda counts: np.repeat(counts[:1], 400, axis=0), {}, "stuck taxels", "one old scan"),
+            (400, swaying, {}, "baseline", "keep the pad still"),
+            (400, pressed(800), {}, "load", "free the pad"),
+            (400, pressed(-800), {}, "load", "taken of a loaded pad"),
+            (400, pressed(-800), REVERSED, "load", "free the pad"),  # a lower reading is a press where z is reversed
+            (400, pressed(800), REVERSED, "load", "taken of a loaded pad"),
+            (6000, pressed(150, since=5000), {}, "drift", "warm up for ten minutes"),
+            (6000, pressed(800, since=5000), {}, "drift", "something pressed"),
+        ],
+    )
+    def test_what_to_do_fits_the_fault(self, scans, change, given, name, words):
+        assert words in remedy_of(name, as_scans(change(healthy_counts(scans))), **given)
 
     @pytest.mark.parametrize(("counts_moved", "verdict"), [(15, "look"), (60, "wrong")])
     def test_drift_of_all_taxels(self, counts_moved, verdict):
@@ -108,39 +138,6 @@ class TestSensor:
         drift[:, 2] = np.linspace(0, counts_moved * 1.12, 6000)[:, None, None]
         counts = np.rint(healthy_counts(6000) + drift).astype(np.int32)
         assert faults(as_scans(counts, times_ns(6000)), duration_s=60.0) == {"drift": verdict}
-
-    @pytest.mark.parametrize(
-        ("pressed_counts", "remedy"), [(150, "warm up for ten minutes"), (800, "something pressed")]
-    )
-    def test_a_press_that_begins_meanwhile_is_not_warming_up(self, pressed_counts, remedy):
-        counts = healthy_counts(6000)
-        counts[5000:, 2, 1, 1] += pressed_counts
-        assert remedy in remedy_of("drift", as_scans(counts, times_ns(6000)))
-
-    def test_a_loaded_pad_is_seen_against_an_earlier_baseline_alone(self):
-        counts = healthy_counts()
-        counts[:, 2, 1, 1] += 800
-        scans = as_scans(counts)
-        assert faults(scans) == {"load": "wrong"}
-        assert "free the pad" in remedy_of("load", scans, references={"4": FREE})
-        assert faults(scans, references={}) == {"load": "not known"}
-        counts[:, 2, 1, 1] -= 1600
-        assert "taken of a loaded pad" in remedy_of("load", as_scans(counts), references={"4": FREE})
-
-    def test_a_load_is_told_by_the_pads_own_z(self):
-        """A lower reading is a press where z is reversed."""
-        counts = healthy_counts()
-        counts[:, 2, 1, 1] -= 800
-        given = {"references": {"4": FREE}, "mountings": {"4": Mounting(signs=(1, 1, -1))}}
-        assert "free the pad" in remedy_of("load", as_scans(counts), **given)
-        counts[:, 2, 1, 1] += 1600
-        assert "taken of a loaded pad" in remedy_of("load", as_scans(counts), **given)
-
-    def test_a_pad_that_moves_cannot_be_zeroed(self):
-        counts = healthy_counts()
-        counts[:, 2, 1, 1] += (20 * np.cos(np.arange(400) * np.pi / 50)).astype(np.int32)
-        assert faults(as_scans(counts)) == {"baseline": "wrong"}
-        assert "keep the pad still" in remedy_of("baseline", as_scans(counts))
 
     def test_lost_scans_are_counted_by_the_gaps(self):
         kept = np.ones(400, dtype=bool)
@@ -246,10 +243,8 @@ class TestIdMap:
         sensor = {"uSPa44": "4", "uSPa46": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
         ids = [can_id for can_id, _ in ID_MAPS[spoken].wire_order(sensor)]
         heard, closed, counters = heard_of(ID_MAPS[asked], ids)
-        found = {
-            one.name: one
-            for one in judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0).findings
-        }
+        examined = judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0)
+        found = {one.name: one for one in examined.findings}
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
             sensor = {"AB": "7b"}.get(spoken + asked, sensor)
             assert found["id map"].verdict == "ok" and f"sensor {sensor} received" in found["id map"].measured
@@ -300,3 +295,30 @@ def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
         assert max(map(len, text.splitlines())) <= columns
     assert text.splitlines()[0] == "link" and "WRONG noise: 9.9 counts (norm: 2 counts)" in text
     assert "-> keep the motors away" in text and "?     load: nothing" in text
+
+
+PAGE = (ROOT / "docs" / "trouble.md").read_text()
+
+
+def trees() -> list[ast.AST]:
+    return [ast.parse(path.read_text()) for path in sorted((ROOT / "edge" / "doctor").glob("*.py"))]
+
+
+def findings() -> list[ast.Call]:
+    return [
+        node
+        for tree in trees()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
+    ]
+
+
+def texts(node: ast.AST) -> list[str]:
+    return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+
+
+def test_each_finding_has_a_row():
+    names = {text for call in findings() for text in texts(call.args[0])}
+    assert {"link", "noise", "taxel order"} <= names
+    rows = {one.strip() for line in PAGE.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
+    assert names <= rows, names - rows

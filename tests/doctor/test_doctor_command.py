@@ -16,6 +16,7 @@ from cli_samples import start, write_recording
 from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
 from edge_samples import FakeLink
 
+from edge.api import USPA44, load_sensor_file
 from edge.cli import main as cli
 from edge.cli.run_options import parser
 from edge.doctor import command, examine
@@ -23,10 +24,8 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file.model import load_sensor_file
 
 WEIGHT_COUNTS = 2400.0
 
@@ -146,15 +145,6 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
     assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
     assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
-
-
-def test_the_wrong_id_map_names_the_right_one(monkeypatch):
-    with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--id-map", "XR1944")
-    found = verdicts(done)
-    assert found.pop("id map") == "wrong" and found == {"silent taxels": "not known"} and done.code == 1
-    remedies = {one["name"]: one["remedy"] for one in json.loads(done.out)["findings"]}
-    assert remedies["id map"] == "--id-map uSPa44"
 
 
 def test_another_line_speed_than_the_adapters(monkeypatch):

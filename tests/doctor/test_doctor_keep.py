@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -10,6 +9,7 @@ from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, recording
 
+from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli import main as cli
 from edge.cli.run_options import parser
 from edge.doctor import command, examine
@@ -17,20 +17,17 @@ from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
 from edge.pipeline.gain_keeper import keep_learned
-from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.zeroing.baseline import Baseline
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())
 WHOLE = SensorEntry(Mounting(swap_xy=True, gains=GAINS), 1180.0, BASELINE)
 NONE: dict = {}
+ASSUMED: dict = {"assumed": frozenset({"mounting"})}
 
 
 @pytest.fixture
@@ -40,21 +37,6 @@ def good(tmp_path):
 
 
 class TestLoss:
-    def test_a_visit_that_found_no_baseline_leaves_a_good_file(self, monkeypatch, good):
-        content = good.read_text()
-        with Emulator([recording(healthy_counts(2), rate_hz=0.01)], loop=True, acknowledges=False) as emulator:
-            monkeypatch.setattr("edge.doctor.examine.GIVEN_UP_S", 0.5)
-            asked = ["doctor", "--source", f"slcan:{emulator.port}", "--out", str(good), "--drift-s", "5"]
-            with monkeypatch.context() as streams:
-                err = io.StringIO()
-                streams.setattr(sys, "stderr", err)
-                code = cli.main([*asked, "--weight-g", "200"])
-        assert code == 2 and good.read_text() == content and load_sensor_file(good).sensors["4"].baseline is not None
-        assert (
-            "good.toml: left as it is, because it holds what would be lost: order and axes of sensor 4"
-            in err.getvalue()
-        )
-
     def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
         with pytest.raises(SensorFileError, match=r"s\.toml: not written, because nothing was measured"):
             keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
@@ -63,15 +45,12 @@ class TestLoss:
     @pytest.mark.parametrize(
         ("held", "lost"),
         [
-            (SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"})), "baseline of sensor 4"),
-            (SensorEntry(counts_per_newton=1180.0, assumed=frozenset({"mounting"})), "counts per newton of sensor 4"),
+            (SensorEntry(baseline=BASELINE, **ASSUMED), "baseline of sensor 4"),
+            (SensorEntry(counts_per_newton=1180.0, **ASSUMED), "counts per newton of sensor 4"),
             (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
-            (
-                SensorEntry(pad=Pad(thickness_mm=4.2), assumed=frozenset({"mounting"})),
-                "constants of the pad of sensor 4",
-            ),
-            (SensorEntry(Mounting(gains=GAINS), assumed=frozenset({"mounting"})), "gains of sensor 4"),
-            (SensorEntry(frame=PadFrame("tool0"), assumed=frozenset({"mounting"})), "place on the robot of sensor 4"),
+            (SensorEntry(pad=Pad(thickness_mm=4.2), **ASSUMED), "constants of the pad of sensor 4"),
+            (SensorEntry(Mounting(gains=GAINS), **ASSUMED), "gains of sensor 4"),
+            (SensorEntry(frame=PadFrame("tool0"), **ASSUMED), "place on the robot of sensor 4"),
         ],
     )
     def test_each_part_is_named_and_kept_where_the_file_is_given_as_well(self, tmp_path, held, lost):
@@ -90,9 +69,8 @@ class TestLoss:
     def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, monkeypatch, tmp_path):
         path, free = tmp_path / "s.toml", healthy_counts(200)
         baseline = Baseline.from_counts("4", free, 1.79e9)
-        save_sensor_file(
-            path, SensorFile(sensors={"4": SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))})
-        )
+        entry = SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))
+        save_sensor_file(path, SensorFile(sensors={"4": entry}))
         pressed = free.copy()
         pressed[:, 2] += 800
         for counts, stored in ((pressed, False), (free, True)):
@@ -104,7 +82,7 @@ class TestLoss:
 
     def test_gains_that_a_run_learned_during_the_visit_are_kept(self, tmp_path):
         path, learned = tmp_path / "s.toml", Pad(gains=GAINS, gain_half_widths=(0.05,) * 48)
-        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(**ASSUMED)}))
         known = load_sensor_file(path)
         for name in ("4", "6"):
             keep_learned(path, name, learned)
@@ -117,14 +95,14 @@ class TestLoss:
         check_writable(good, load_sensor_file(good), presses=False, weighs=False)
         with pytest.raises(SensorFileError, match="would be lost: counts per newton of sensor 4"):
             check_writable(good, SensorFile(), presses=True, weighs=False)
-        with pytest.raises(SensorFileError, match="would be lost: order and axes of sensor 4"):
-            check_writable(good, SensorFile(), presses=False, weighs=True)
+        content = good.read_text()
+        with pytest.raises(SensorFileError, match=r"left as it is, because .* lost: order and axes of sensor 4"):
+            told("--out", good, "--weight-g", 200, link=lambda: pytest.fail("it was opened"))
+        assert good.read_text() == content
 
     def test_what_was_found_of_a_device_is_not_replaced_by_what_is_emulated(self, tmp_path):
         path = tmp_path / "s.toml"
-        save_sensor_file(
-            path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, assumed=frozenset({"mounting"}))})
-        )
+        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, **ASSUMED)}))
         with pytest.raises(SensorFileError, match="would be lost: baseline of sensor 4"):
             keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE, emulated=True)
         keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
@@ -189,9 +167,7 @@ def told(*arguments, link=None, out=None):
     options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
     out = io.StringIO() if out is None else out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            examine, "links_to", lambda *_, **__: [FakeLink([WELL], kind="replay") if link is None else link()]
-        )
+        patch.setattr(examine, "links_to", lambda *_, **__: [link() if link else FakeLink([WELL], kind="replay")])
         return command.run(options, out, io.StringIO()), out.getvalue()
 
 

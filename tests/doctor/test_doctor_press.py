@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 from doctor_samples import finger, visit
 
-from edge.doctor.guided_press import (
-    PATIENCE_S,
-    Answer,
-    GuidedPress,
-    Press,
-    find_axes,
-    find_order,
-    judge_press,
-    orders,
-    z_sign,
-)
+from edge.doctor import guided_press
+from edge.doctor.guided_press import Answer, GuidedPress, Press, find_axes, find_order, judge_press, orders
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
@@ -111,7 +102,7 @@ class TestAnswers:
 
     def test_z_that_does_both_is_wrong(self):
         presses = [press(place, z=-4000.0 if place == 15 else 4000.0) for place in USPA44.corners]
-        assert z_sign(presses) is None
+        assert guided_press.z_sign(presses) is None
         findings, mounting = judge_press(Answer(presses), False, False)
         assert findings[1].verdict == "wrong" and "falls under others" in findings[1].measured and mounting is None
 
@@ -141,7 +132,7 @@ class TestPerson:
         assert judged(guide)[1] == Mounting()
 
     def test_nobody_there(self):
-        asked, guide = answer_to(np.zeros((700, 3, 4, 4)), period_s=PATIENCE_S / 600)
+        asked, guide = answer_to(np.zeros((700, 3, 4, 4)), period_s=guided_press.PATIENCE_S / 600)
         assert guide.done and len(asked) == 1
         findings, mounting = judged(guide)
         assert mounting is None and {one.verdict for one in findings.values()} == {"not known"}

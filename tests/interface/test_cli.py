@@ -1,6 +1,5 @@
 """`edge-sr` as a user runs it: help, recordings, models, baselines, and refusals."""
 
-import json
 import re
 import subprocess
 import sys
@@ -8,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_samples import TIMEOUT_S, assert_refused, base_options, files, records, run, start, write_recording
+from cli_samples import assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
+from golden_world import write_csv
 
 from edge import __version__
 from edge.cli import main as cli
@@ -17,7 +17,6 @@ from edge.cli import models_command
 from edge.inference import bundled as bundle
 from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
-from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import load_baselines
@@ -26,9 +25,7 @@ __all__ = ["files"]
 
 
 def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
-    recording = tmp_path / "rest.csv"
-    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
-    recording.write_text("\n".join([header, *[",".join(["30000.0"] * 48)] * 3, ""]))
+    recording = write_csv(tmp_path / "rest.csv", np.full((3, 3, 4, 4), 30_000))
     for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr-int8")):
         done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
         assert {record["model"] for record in records(done.stdout)} == {model}
@@ -64,9 +61,7 @@ class TestHelp:
             "import sys\nfrom edge.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
             "sys.exit('onnxruntime' in sys.modules)"
         )
-        subprocess.run(
-            [sys.executable, "-c", script], cwd=ROOT, check=True, stdout=subprocess.DEVNULL, timeout=TIMEOUT_S
-        )
+        subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, stdout=subprocess.DEVNULL, timeout=60)
 
 
 class TestReplay:
@@ -76,9 +71,7 @@ class TestReplay:
         got = records(done.stdout)
         assert [record["scan"] for record in got] == list(range(40))
         assert {record["source"] for record in got} == {"replay"}
-        assert [record["taps_used"] for record in got if record["contact"]] == [
-            t for t in (1, 2, 3, 4) for _ in range(5)
-        ]
+        assert [one["taps_used"] for one in got if one["contact"]] == [t for t in (1, 2, 3, 4) for _ in range(5)]
         assert {record["baseline"] for record in got} == {BASELINE.id}
         assert all(record["force_n"] is None for record in got)
         lines = done.stderr.splitlines()
@@ -86,45 +79,6 @@ class TestReplay:
         assert re.match(r"REPLAY replay:.*taps.npz: 40 scans, \d+ patterns \(\d+ reused\), \d+ dropped", lines[1])
         assert re.search(r"rate held: (29|30)\.\d Hz \(sensor 4\), 30 Hz asked for", done.stderr)
         assert "p50" in done.stderr and "\x1b" not in done.stderr
-
-    def test_two_sensors_and_several_sinks_at_once(self, files, tmp_path):
-        other = write_recording(tmp_path / "other.csv.npz", [0] * 10)
-        data = dict(np.load(other))
-        data["sensor"] = np.array(["6"] * 10)
-        np.savez(other, **data)
-        done = run(
-            *base_options(files), "--source", f"replay:{files}/taps.npz,{other}",
-            "--sink", "jsonl:-", "--sink", f"jsonl:{tmp_path}/copy.jsonl", "--sink", f"mcap:{tmp_path}/out.mcap",
-        )  # fmt: skip
-        assert done.returncode == 0
-        assert (tmp_path / "copy.jsonl").read_text() == done.stdout
-        assert [len(track.counts) for track in load_recording(tmp_path / "out.mcap").tracks] == [40, 10]
-
-    def test_duration_ends_it(self, files, tmp_path):
-        slow = write_recording(tmp_path / "slow.npz", [0] * 3, period_ns=10**11)
-        done = run(*base_options(files), "--source", f"replay:{slow}", "--duration-s", "0.3", "--sink", "jsonl:-")
-        assert done.returncode == 0 and len(records(done.stdout)) == 1
-
-    def test_a_reset_on_stdin_forgets_the_taps(self, files, tmp_path):
-        taps = write_recording(tmp_path / "many.npz", ([0] * 5 + [3000] * 5) * 12)
-        process = start(*base_options(files), "--source", f"replay:{taps}", "--sink", "jsonl:-", stdin=subprocess.PIPE)
-        assert process.stdout is not None and process.stdin is not None
-        used = []
-        for line in process.stdout:
-            record = json.loads(line)
-            used.append(record["taps_used"])
-            if used[-1] == 4:
-                process.stdin.write('{"cmd": "reset"}\nnonsense\n')
-                process.stdin.flush()
-                break
-        rest = [json.loads(line) for line in process.stdout]
-        refused = [record["note"] for record in rest if record["state"] == "event" and record["event"] == "refused"]
-        assert len(refused) == 1 and "a line on stdin is refused: 'nonsense', expected " in refused[0]
-        used += [record["taps_used"] for record in rest if record["state"] != "event"]
-        assert process.wait(TIMEOUT_S) == 0
-        after = used[used.index(4) :]
-        assert 1 in after and after.index(1) < 30
-        assert process.stderr is not None and "refused: 1 lines or messages were not commands" in process.stderr.read()
 
 
 class TestModels:
@@ -151,16 +105,14 @@ class TestModels:
         assert 0 < int(p50) <= int(p99) and figures == ["33.2", "2.10", "-"] and max(map(len, (head, row))) <= 80
 
 
-class TestDemo:
-    def test_a_demo_that_ends_before_its_first_tap_says_so(self, files, capsys):
-        assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
-        assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
+def test_a_demo_that_ends_before_its_first_tap_says_so(files, capsys):
+    assert cli.main(["demo", "--model", f"{files}/tiny.onnx", "--duration-s", "0.2"]) == 0
+    assert capsys.readouterr().out == "\nnone of 4 taps scored: the run ended before a tap had a pattern\n"
 
 
 @pytest.fixture
 def there(files, tmp_path):
     """Folder with what the refused commands name."""
-    (tmp_path / "text.onnx").write_text("text")
     write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
     (tmp_path / "kept.npz").write_text("old")
     (tmp_path / "kept.jsonl").write_text("old")
@@ -179,23 +131,17 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
 @pytest.mark.parametrize(
     ("code", "typed", "words"),
     [
-        (2, "--rate-hz 0", ["--rate-hz: '0' is not a positive number"]),
         (2, "--rate-hz 1e-300", ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
         (2, "--counts-per-newton 1e8", ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
-        (2, "--duration-s nan", ["--duration-s: 'nan' is not a positive number"]),
         (2, "--mode x", ["unrecognized arguments: --mode", "did you mean --model? edge-sr --help"]),
-        (2, "--sorce demo --vieww", ["unrecognized arguments: --sorce demo --vieww (did you mean --source?"]),
         (2, "replay x.csv --vieww", ["did you mean --view? edge-sr replay --help lists all options"]),
         (2, "demo --source gs_usb", ["unrecognized arguments: --source gs_usb"]),
         (2, "model", ["no command 'model': did you mean models?"]),
-        (2, "press", ["no command 'press': commands are demo, record, replay"]),
-        (2, "models x", ["unrecognized arguments: x", "edge-sr models --help"]),
         (2, "baseline", ["--out"]),
         (2, "baseline --out x --scans 29", ["'29' is not a whole number from 30"]),
         (2, "baseline --out x --source demo --scans 99", ["scans is 99", "from 100"]),
         (2, "baseline --out x --skip -1", ["--skip"]),
         (2, "replay --view a.mcap", ["'a.mcap' is not a port", "write FILE or command before it"]),
-        (2, "--view 65536", ["'65536' is not a port: expected 0 to 65535"]),
         (2, "--source demo --view-host 0.0.0.0", ["--view-host requires --view"]),
         (2, "--source demo --view-token xxxxxxxxxxxxxxxxxxxx", ["--view-token requires --view"]),
         (2, "--source demo --view-record-dir .", ["--view-record-dir requires --view"]),
@@ -203,11 +149,9 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "--source demo --view 0 --view-token short", ["a token of 5 characters for the live page: expected at"]),
         (5, "--source demo --view 0 --view-host 192.0.2.1", ["192.0.2.1 is not an address of this machine; name one"]),
         (5, "--source demo --view 0 --view-host no.invalid", ["no.invalid is not an address of this machine; name"]),
-        (2, "--source serial:x", ["'serial:x'", "slcan:/dev/ttyUSB0", "replay:FILE", "demo"]),
         (2, "--source replay:none\nsuch.npz", ["none such.npz"]),
         (2, "--source replay:none.npz", ["none.npz", "No such file"]),
         (2, "--source demo --baseline none.json", ["none.json", "No such file"]),
-        (2, "--poses mqtt:x", ["no source of poses 'mqtt:x'"]),
         (2, "--source demo --sensor {tmp}/bad.toml", ["'format': 1, expected 'tactile-sensor'"]),
         (2, "--sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
         (2, "baseline --out x --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
@@ -223,10 +167,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (3, f"{ZERO}{{files}}/taps.npz --skip 1", ["ended before 100 complete scans"]),
-        (4, f"{REST} --model none", ["no model 'none'", "bundled: "]),
-        (4, f"{REST} --model {{tmp}}/text.onnx", ["text.onnx"]),
         (4, f"{REST} --model {{tmp}}/other.onnx", ["'pitch_mm' is 5.0", "4.7"]),
-        (5, f"{KNOWN} {REST} --sink jsonl:{{tmp}}/none/x", ["none/x", "No such file"]),
     ],
 )
 def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, words, files, there):
@@ -240,14 +181,9 @@ def test_a_refusal_is_one_line_with_its_code_and_all_files_stay(code, typed, wor
     ("wrong", "words"),
     [
         (["--contact-on-counts", "10"], ["on 10", "off 750"]),
-        (["--sink", "csv:x"], ["'csv:x'", "jsonl:FILE", "mcap:FILE"]),
-        (["--sink", "npz:x.npz"], ["record by --sink mcap:x.mcap, then edge-sr convert x.mcap x.npz"]),
         (["--sink", "jsonl:-", "--fields", "force_n,patern"], ["no field 'patern'", "did you mean pattern?"]),
-        (["--sink", "jsonl:-", "--fields", "x"], ["no field 'x'", "expected time_ns, sensor, "]),
         (["--fields", "force_n"], ["--fields requires a sink of JSON records"]),
-        (["--sink", "mcap:/dev/full"], ["'mcap:/dev/full'", "a file whose name ends in .mcap"]),
         (["--sink", "jsonl:-", "--sink", "jsonl:-"], ["'jsonl:-' is there 2 times", "leave one"]),
-        (["--sink", "ros2:4fingers"], ["'4fingers'", "no digit first"]),
         (["--sink", "zenoh:a//b"], ["'a//b'", "words with '/' between"]),
     ],
 )
@@ -267,12 +203,6 @@ def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(m
         assert word in err
 
 
-def test_a_demo_that_is_not_installed_is_2(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-    assert cli.main(["--source", "demo"]) == 2
-    assert "demo.npz is missing" in capsys.readouterr().err
-
-
 def test_a_full_disk_is_5_after_the_summary(files):
     done = run(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:/dev/full")
     lines = done.stderr.splitlines()
@@ -281,21 +211,6 @@ def test_a_full_disk_is_5_after_the_summary(files):
     with Path("/dev/full").open("w") as full:
         process = start(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:-", stdout=full)
         assert "cannot write records to stdout: No space left" in process.communicate()[1] and process.returncode == 5
-
-
-def test_a_baseline_is_taken_kept_and_used(files, tmp_path):
-    zero = tmp_path / "zero.json"
-    done = run("baseline", "--source", f"replay:{files}/rest.npz", "--rate-hz", "1000", "--skip", "5", "--out", zero)
-    assert done.returncode == 0 and done.stderr == ""
-    baseline = load_baselines(zero)["4"]
-    assert done.stdout == f"sensor 4: baseline {baseline.id} of 100 scans (REPLAY) -> {zero}\n"
-    assert np.abs(baseline.counts - BASELINE.counts).max() <= 2
-    done = run(
-        "--model", files / "tiny.onnx", "--source", f"replay:{files}/taps.npz",
-        "--baseline", zero, "--sink", "jsonl:-",
-    )  # fmt: skip
-    assert {record["baseline"] for record in records(done.stdout)} == {baseline.id}
-    assert any(record["contact"] for record in records(done.stdout))
 
 
 def test_of_a_recording_a_few_free_scans_are_enough(files, tmp_path):

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import termios
 import threading
+from functools import partial
 
 import pytest
 from cli_samples import EDGE_SR, TIMEOUT_S, base_options, files, records, run, start
@@ -123,33 +124,6 @@ class TestEnds:
         assert cli.main(["--model", str(path), "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
         wait_for(lambda: not emulator.adapter.channel_open)
-
-    def test_the_cable_back_under_another_name_goes_on_and_records_tell_of_it(self, files, tmp_path):
-        """A link named by its adapter, as udev does, that leads to a new port each time."""
-        port, out = tmp_path / "by-id", tmp_path / "out.jsonl"
-        process = None
-        for _ in range(2):
-            with Emulator([load_recording(files / "taps.npz")], loop=True) as emulator:
-                port.unlink(missing_ok=True)
-                port.symlink_to(emulator.port)
-                if process is None:
-                    process = start(*base_options(files), "--source", f"slcan:{port}", "--sink", f"jsonl:{out}")
-                    wait_for(lambda: out.exists() and out.read_text().count("\n") > 10)
-                else:
-                    wait_for(lambda: '"back"' in out.read_text().rpartition("lost")[2])
-                    wait_for(lambda: out.read_text().rpartition('"back"')[2].count("\n") > 10)
-        process.send_signal(signal.SIGINT)
-        _, errors = self.rest(process)
-        assert process.returncode == 0
-        got = records(out.read_text())
-        kinds = [record.get("event") for record in got if record["state"] == "event"]
-        assert kinds[:2] == ["lost", "back"]
-        assert "trying again until it is back" in errors and "is back after" in errors
-        back = got.index(next(record for record in got if record.get("event") == "back"))
-        scans = [record for record in got if record["state"] != "event"]
-        assert [record["scan"] for record in scans] == list(range(len(scans)))
-        assert got[back + 1]["taps_used"] <= 1 and got[back + 1]["counters"]["outages"] == 1
-        assert [record["counters"] for record in scans if "counters" in record][-1]["missed"] > 0
 
     def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):
         leader, follower = pty.openpty()
@@ -262,7 +236,7 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
 def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
     """It may stand in a cell, a header, a key, or in the name of a file, which need not be UTF-8 either."""
     columns = [f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz"]
-    quoted = json.dumps(text)
+    key = json.dumps(text)
     name = os.fsdecode(b"\xfc") + text
     for path, content in (
         (tmp_path / "cell.csv", ",".join(columns) + "\n" + "1," * 47 + f'"{text}"\n'),
@@ -270,13 +244,11 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
         (tmp_path / f"{name}.csv", ",".join(columns) + "\n" + (",".join(["30000"] * 48) + "\n") * 40),
         (
             tmp_path / "key.toml",
-            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{quoted} = 1\n[sensors.4]\n',
+            f'format = "tactile-sensor"\nversion = 1\nmodel = "uSPa44"\n{key} = 1\n[sensors.4]\n',
         ),
     ):
         path.write_text(content, newline="")
-        asked = (
-            ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", "100"]
-        )
+        asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]
         done = subprocess.run([*EDGE_SR, *map(str, asked), "--sink", "jsonl:-"], capture_output=True, cwd=ROOT)
         printed = (done.stdout + done.stderr).decode()
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed
@@ -285,16 +257,10 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
 
 def test_odd_surroundings_end_in_one_line():
     """A terminal one column wide, and fewer descriptors than a run needs."""
-    helped = subprocess.run(
-        [*EDGE_SR, "--help"], capture_output=True, text=True, cwd=ROOT, env=os.environ | {"COLUMNS": "1"}
-    )
+    how = {"capture_output": True, "text": True, "cwd": ROOT}
+    helped = subprocess.run([*EDGE_SR, "--help"], env=os.environ | {"COLUMNS": "1"}, **how)
     assert (helped.returncode, helped.stderr) == (0, "") and "--source" in helped.stdout
-    done = subprocess.run(
-        [*EDGE_SR, "--source", "demo", "--duration-s", "1"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (14, 14)),
-    )
+    few = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (14, 14))
+    done = subprocess.run([*EDGE_SR, "--source", "demo", "--duration-s", "1"], preexec_fn=few, **how)
     assert done.returncode == 5 and "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"

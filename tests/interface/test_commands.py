@@ -8,7 +8,6 @@ import select
 import signal
 import sys
 import termios
-import threading
 import time
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, write_model
 
 from edge.cli.user_commands import user_commands
-from edge.pipeline.commands import RESET, ZERO, Command, CommandLines, Commands, obey, read_stdin
+from edge.pipeline.commands import RESET, Command, CommandLines, Commands, obey, read_stdin
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []
@@ -26,10 +25,9 @@ OPEN = []
 
 def lines_of(descriptor):
     commands = Commands()
-    lines = CommandLines(commands, descriptor)
-    OPEN.append(lines)
-    commands.ask(lines.read)
-    return lines, commands
+    OPEN.append(CommandLines(commands, descriptor))
+    commands.ask(OPEN[-1].read)
+    return commands
 
 
 def polled_stdin():
@@ -45,14 +43,12 @@ def pipe():
     while OPEN:
         OPEN.pop().close()
     for end in ends:
-        try:
+        with contextlib.suppress(OSError):
             os.close(end)
-        except OSError:
-            continue
 
 
 def test_commands_come_as_lines_however_they_are_cut(pipe):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     assert commands.poll() == []
     for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"'):
         os.write(pipe[1], piece)
@@ -75,14 +71,14 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
     ],
 )
 def test_other_lines_are_counted(pipe, line):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
     assert commands.poll() == [RESET]
     assert commands.refused == 1
 
 
 def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
-    _, commands = lines_of(pipe[0])
+    commands = lines_of(pipe[0])
     for _ in range(20):
         os.write(pipe[1], b"x" * 4000)
         assert commands.poll() == []
@@ -92,11 +88,11 @@ def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
 
 
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
-    _, commands = lines_of(pipe[0])
-    os.write(pipe[1], b'{"cmd": "reset"}')
+    commands = lines_of(pipe[0])
+    os.write(pipe[1], b'{"cmd": "zero", "sensor": null, "force": true}')
     assert commands.poll() == []
     os.close(pipe[1])
-    assert commands.poll() == [RESET]
+    assert commands.poll() == [Command("zero", None, True)]
     assert commands.poll() == []
     os.close(pipe[0])
     assert commands.poll() == [], "a pipe that has ended is not touched again"
@@ -112,21 +108,6 @@ def test_a_terminal_and_a_missing_stdin_are_left_alone(monkeypatch):
     monkeypatch.setattr(sys, "stdin", None)
     assert polled_stdin() == []
     os.close(leader)
-
-
-@pytest.mark.parametrize(
-    ("line", "command"),
-    [
-        (b'{"cmd": "zero"}', ZERO),
-        (b'{"cmd": "zero", "sensor": "4"}', Command("zero", "4")),
-        (b'{"cmd": "zero", "sensor": null, "force": true}', Command("zero", None, True)),
-        (b'{"force": false, "sensor": "6", "cmd": "zero"}', Command("zero", "6", False)),
-    ],
-)
-def test_zeroing_names_a_sensor_or_all_and_may_be_forced(pipe, line, command):
-    _, commands = lines_of(pipe[0])
-    os.write(pipe[1], line + b"\n")
-    assert commands.poll() == [command] and commands.refused == 0
 
 
 class Told:
@@ -153,26 +134,6 @@ def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
             assert everything.refused == 1
     runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
     assert runtime.done == ["reset", ("4", True)]
-
-
-def test_commands_of_many_threads_come_each_once_and_in_their_threads_order():
-    commands, got = Commands(), []
-
-    def ask(name):
-        for number in range(200):
-            commands.put(Command("zero", f"{name}/{number}"))
-            commands.refuse()
-
-    threads = [threading.Thread(target=ask, args=(name,)) for name in "abcd"]
-    for thread in threads:
-        thread.start()
-    while any(thread.is_alive() for thread in threads):
-        got += commands.poll()
-    got += commands.poll()
-    for name in "abcd":
-        mine = [one.sensor for one in got if one.sensor and one.sensor.startswith(name)]
-        assert mine == [f"{name}/{number}" for number in range(200)]
-    assert len(got) == commands.refused == 800
 
 
 TIMEOUT_S = 60.0

@@ -1,25 +1,16 @@
 """Effects of a sensor file on a run, and options that take precedence."""
 
-import json
-
 import numpy as np
 import pytest
-from cli_samples import records, run, write_recording
-from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan, write_model
+from cli_samples import write_recording
+from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
+from golden_world import write_csv
 
-from edge.api import Stream, open_recording, open_runtime, open_source
-from edge.cli.run_options import parser
+from edge.api import Pad, RecordingError, Scan, Source, Stream, UsageError, open_recording, open_runtime, open_source
 from edge.doctor.write_sensor_file import keep
-from edge.errors import UsageError
-from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import references, settled
-from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
-from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting
-from firmware_bridge.scans.pad_constants import Pad
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
@@ -47,12 +38,6 @@ def first(pressed, sensor=None, id_map=None, **settings):
         return next(iter(Stream(source, open_runtime(FakeModel(), source, **settings))))
 
 
-def test_without_a_file_everything_is_as_it_was(pressed):
-    assert open_source(pressed).sensor_file == SensorFile(USPA44_MAP.name)
-    result = first(pressed)
-    assert result.state == "zeroing" and result.note is None
-
-
 def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, monkeypatch):
     adapter = Port("/dev/ttyUSB5", (0x0403, 0x6015), "D30BL366", "VScom")
     monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", lambda: [adapter])
@@ -69,13 +54,9 @@ PAD = Pad(thickness_mm=5.0, gains=tuple(np.linspace(0.5, 2, 48).tolist()))
 def test_a_pad_goes_from_the_file_into_every_runtime(pressed, tmp_path):
     path = tmp_path / "pad.toml"
     save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, pad=PAD)}))
-    recording = pressed.removeprefix("replay:")
+    recording, other = pressed.removeprefix("replay:"), Pad(thickness_mm=4.0)
     for opened in (lambda: open_source(pressed, sensor=path), lambda: open_recording(recording, sensor=path)):
-        for settings, expected in (
-            ({}, PAD),
-            ({"pad": Pad(thickness_mm=4.0)}, Pad(thickness_mm=4.0)),
-            ({"pad": {}}, None),
-        ):
+        for settings, expected in (({}, PAD), ({"pad": other}, other), ({"pad": {}}, None)):
             model = FakeModel(make_pad_contract())
             with opened() as source:
                 results = Stream(source, open_runtime(model, source, **settings))
@@ -115,40 +96,16 @@ def test_what_is_asked_for_goes_before_the_file_but_for_another_id_map(file, pre
         open_source(pressed, id_map="C")
 
 
-def test_the_doctor_compares_with_the_baseline_of_the_file_or_with_a_newer_one(file, tmp_path):
-    newer = Baseline.of("4", REST + 5, 2000.0, 100, "file")
-    save_baselines(tmp_path / "zero.json", [newer], {"4": TURNED.order})
-    for arguments, expected in (([], BASELINE), (["--baseline", str(tmp_path / "zero.json")], newer)):
-        options = parser("doctor").parse_args(["--sensor", str(file), *arguments])
-        assert references(options.baseline, settled(options.sensor, None))["4"].id == expected.id
-
-
 def turned_rest():
     """Return the readings of the free pad where its taxels lie, (3, 4, 4)."""
     return REST.reshape(3, 16)[:, list(TURNED.order)].reshape(3, 4, 4)
 
 
-def test_a_run_goes_by_it(tmp_path):
-    """A recording by edge-sr is in place; its axes are raw, and z falls where this sensor is pressed."""
-    write_model(tmp_path / "tiny.onnx")
-    write_recording(tmp_path / "taps.npz", [0] * 5 + [-3000] * 5)
-    entry = SensorEntry(Mounting(AS_MAPPED, signs=(1, 1, -1)), 1500.0, BASELINE)
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": entry}))
-    replay = ("--source", f"replay:{tmp_path}/taps.npz", "--model", tmp_path / "tiny.onnx", "--sink", "jsonl:-")
-    made = records(run("--sensor", tmp_path / "s.toml", *replay).stdout)
-    assert [record["contact"] for record in made] == [False] * 5 + [True] * 5
-    assert made[-1]["force_n"] == pytest.approx(2.0, abs=0.1) and made[-1]["counts"][2][1][1] < REST[2, 1, 1]
-    assert made[-1]["baseline"] == BASELINE.id and json.dumps(made[-1]["dead"]) == "{}"
-
-
 def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
     """Sensor 4 of left and sensor 4 of right may sit in other ways."""
-    scan = make_scan()
-    header = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
-    row = ",".join(map(str, scan.counts.reshape(3, 16).T.ravel()))
     for folder in ("left", "right"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "4.csv").write_text("\n".join([header, row, ""]))
+        write_csv(tmp_path / folder / "4.csv", make_scan().counts[None])
     texts = [f"{name}=replay:{tmp_path}/{name}/4.csv" for name in ("left", "right")]
     found = {}
     with Source(*open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])})) as source:

@@ -13,16 +13,13 @@ from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, make_scan
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
 
+from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
-from edge.perception.result import Result
 from edge.perception.result_fields import MAPS
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.scans.scan import Scan
 
 OLD = Path(__file__).parent / "first_version"
 
@@ -62,11 +59,8 @@ def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
     rows = {name: array[order] for name, array in arrays.items() if array.shape[:1] == (len(results),)}
     for row, result in enumerate(results):
         scan = result.scan
-        assert (rows["sensor"][row], rows["scan"][row], rows["time_ns"][row]) == (
-            scan.sensor,
-            scan.number,
-            scan.time_ns,
-        )
+        known = [rows[name][row] for name in ("sensor", "scan", "time_ns")]
+        assert known == [scan.sensor, scan.number, scan.time_ns]
         assert rows["device_time_ns"][row] == (-1 if scan.device_ns is None else scan.device_ns)
         assert (rows["counts"][row] == scan.counts).all()
         assert (rows["state"][row], rows["source"][row], rows["model"][row]) == (result.state, "emulated", result.model)
@@ -97,15 +91,12 @@ def test_scans_poses_mountings_and_baselines_survive_any_way(made, tmp_path, way
         path = new
     before, after = load_recording(made[0]), load_recording(path)
     assert after.origin == "emulated" and dict(after.mountings) == dict(before.mountings) == {"4": TURNED}
-    assert {name: one.id for name, one in after.baselines.items()} == {
-        name: one.id for name, one in before.baselines.items()
-    }
+    assert after.baselines.keys() == before.baselines.keys()
     for one, other in zip(before.baselines.values(), after.baselines.values(), strict=True):
-        assert (one.counts == other.counts).all()
+        assert one.id == other.id and (one.counts == other.counts).all()
     for one, other in zip(before.tracks, after.tracks, strict=True):
-        assert (
-            one.sensor == other.sensor and (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
-        )
+        assert one.sensor == other.sensor
+        assert (one.counts == other.counts).all() and (one.time_ns == other.time_ns).all()
     assert before.poses == after.poses != []
 
 
@@ -173,9 +164,7 @@ def test_files_of_version_0_1_are_read(tmp_path):
         ("press.mcap new.npz --rate-hz 9", 2, "--rate-hz is for a .csv alone: press.mcap has times of its own"),
     ],
 )
-def test_what_cannot_be_converted_is_said_in_one_line_and_nothing_is_made(
-    words, code, said, tmp_path, monkeypatch, capsys
-):
+def test_what_cannot_be_converted_is_one_line_and_makes_nothing(words, code, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     record_into(Path("press.mcap"), make_results([make_scan()]))
     for name in ("text.mcap", "text.csv", "text.npz", "taken.npz"):
@@ -202,6 +191,9 @@ sys.exit(cli.main(["convert", *sys.argv[2:]]))
 """
 
 
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
 @pytest.mark.parametrize(
     ("source", "new"), [("press.mcap", "new.npz"), ("old.npz", "new.mcap"), ("press.mcap", "new.csv")]
 )
@@ -210,18 +202,18 @@ def test_a_full_disk_leaves_nothing(source, new, tmp_path):
     record_into(tmp_path / "press.mcap", make_results(scans))
     arrays_of(tmp_path / "press.mcap")
     (tmp_path / "press.npz").rename(tmp_path / "old.npz")
-    where = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RUN, "10000", source, new]
-    done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old.npz", "press.mcap"]
 
 
 def test_ctrl_c_leaves_nothing(tmp_path):
     write_recording(tmp_path / "long.csv", np.tile(make_counts(100), (100, 1, 1, 1)), rate_hz=100)
-    where = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
-    with subprocess.Popen(command, cwd=tmp_path, env=where, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         while not list(tmp_path.glob(".new.mcap.*/new.mcap")) and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)

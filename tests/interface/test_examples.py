@@ -15,10 +15,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
 from trust_samples import make_trusted_contract
 
-from edge.api import Result, find_model
-from edge.perception.event import Note
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.errors import LinkLostError
+from edge.api import LinkLostError, Note, Result, Source, find_model
 from firmware_bridge.links.base import Notice
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -70,11 +67,8 @@ def test_the_force_is_printed_scan_by_scan(empty):
 def test_the_gripper_stops_on_contact_and_never_moves_by_what_is_emulated_unasked(empty):
     demo = ("stop_on_area.py", "--source", "demo", "--area-mm2", "20", *PATIENT)
     code, out, errors = run(empty, *demo)
-    assert (
-        code == 1
-        and out == []
-        and errors == ["stop_on_area: demo is emulated, not a sensor: pass --pretend to accept it"]
-    )
+    assert (code, out, len(errors)) == (1, [], 1)
+    assert errors[0] == "stop_on_area: demo is emulated, not a sensor: pass --pretend to accept it"
     code, out, errors = run(empty, *demo, "--pretend")
     assert (code, errors) == (0, []) and out[:2] == ["gripper: closing", "gripper: stopped"]
     assert " mm2 touch, as felt " in out[2] and len(out) == 3
@@ -309,57 +303,17 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     assert out[-1].startswith("not handed over: it is not better than stsr-int8. Train it for longer")
 
 
-@pytest.fixture
-def trained(monkeypatch, tmp_path):
-    """The example on a machine without an adapter, whose training takes no time; it counts its trainings."""
-    module = loaded("train_and_deploy")
-    module.trainings = []
-
-    def train(mesh, out, **_):
-        module.trainings.append(mesh)
-        (out / "checkpoints").mkdir(parents=True, exist_ok=True)
-        (out / "checkpoints" / "ball.onnx").touch()
-        return out / "checkpoints" / "ball.onnx"
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(module, "train", train)
-    module.compare = module.is_better
-    monkeypatch.setattr(module, "is_better", lambda *_: True)
-    monkeypatch.setattr(module, "tried", lambda mesh: (0.02, 0.2))
-    monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", list)
-    return module
-
-
-def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(trained, monkeypatch, tmp_path, capsys):
+def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(monkeypatch, tmp_path, capsys):
+    example = loaded("train_and_deploy")
     trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
-    trained.JUDGED = 12
+    example.JUDGED = 12
     good, poor = find_model("stsr"), write_model(tmp_path / "poor.onnx", make_contract(taps=1))
     for own, bundled, better in ((good, poor, True), (poor, good, False)):
-        monkeypatch.setattr(trained, "find_model", lambda name, path=bundled: path)
-        assert trained.compare(own, tmp_path / "box.stl", tmp_path, 1) == better
+        monkeypatch.setattr(example, "find_model", lambda name, path=bundled: path)
+        assert example.is_better(own, tmp_path / "box.stl", tmp_path, 1) == better
         assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ("", "about 56.8 minutes on this machine: 3.0 to simulate 9000 presses, 53.3 for 16000 steps of training, "),
-        (
-            "--minutes 4 --figures 9000",
-            "about 4.0 minutes on this machine: 0.4 to simulate 1062 presses, 3.1 for 944 steps of training, ",
-        ),
-    ],
-)
-def test_the_time_is_printed_before_the_training_and_can_be_chosen(trained, monkeypatch, capsys, options, line):
-    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", *options.split()])
-    trained.main()
-    out = capsys.readouterr().out.splitlines()
-    assert out[0].startswith(line) and len(trained.trainings) == 1
-    assert out[2].startswith("not tried on a sensor: ") and out[-1] == "from now on: edge-sr --model ball/ball.onnx"
-
-
-def test_a_source_that_does_not_exist_is_refused_before_the_training(trained, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x"])
-    with pytest.raises(SystemExit, match=r"train_and_deploy: source is 'slcna:x', expected one of"):
-        trained.main()
-    assert trained.trainings == []
+def test_a_source_that_does_not_exist_is_refused_before_the_training(empty):
+    code, out, errors = run(empty, "train_and_deploy.py", "ball.stl", "--out", "ball", "--source", "slcna:x")
+    assert code == 1 and out == [] and errors[0].startswith("train_and_deploy: source is 'slcna:x', expected one of")

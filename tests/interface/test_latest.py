@@ -8,24 +8,14 @@ import threading
 import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
 
-from edge.api import (
-    Baseline,
-    Commands,
-    Event,
-    LinkLostError,
-    NoResultError,
-    PadPose,
-    Stream,
-    UsageError,
-    open_runtime,
-    paired,
-    take_baselines,
-)
-from edge.pipeline.commands import Command
+from edge.api import Baseline, LinkLostError, NoResultError, Stream, UsageError, open_runtime, paired, take_baselines
+from edge.perception.event import Event
+from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink
+from firmware_bridge.poses.pad_pose import PadPose
 from firmware_bridge.poses.timed_pose import TimedPose
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
@@ -113,25 +103,16 @@ def test_it_says_that_the_link_is_lost_and_that_it_is_back():
 
 def test_a_link_or_a_sensor_that_is_down_is_so_for_its_own_sensors_alone():
     newest = NewestResults()
-    states = []
-    for kind, sensor, sensors in (
-        ("lost", None, "left/"),
-        ("silent", "right/4", ""),
-        ("back", None, "left/"),
-        ("trouble", None, "left/"),
-        ("back", "right/4", ""),
-        ("silent", None, ""),
+    for kind, sensor, sensors, states in (
+        ("lost", None, "left/", ["lost", "up", "up"]),
+        ("silent", "right/4", "", ["lost", "silent", "up"]),
+        ("back", None, "left/", ["up", "silent", "up"]),
+        ("trouble", None, "left/", ["up", "silent", "up"]),
+        ("back", "right/4", "", ["up", "up", "up"]),
+        ("silent", None, "", ["silent", "silent", "silent"]),
     ):
         newest.tell(Event(0, kind, sensor, "", sensors))
-        states.append([newest.take(name, 0).link for name in ("left/4", "right/4", "right/41")])
-    assert states == [
-        ["lost", "up", "up"],
-        ["lost", "silent", "up"],
-        ["up", "silent", "up"],
-        ["up", "silent", "up"],
-        ["up", "up", "up"],
-        ["silent", "silent", "silent"],
-    ]
+        assert [newest.take(name, 0).link for name in ("left/4", "right/4", "right/41")] == states
 
 
 def test_a_link_that_is_lost_for_good_is_an_error_at_every_call():

@@ -98,14 +98,9 @@ print(camera.read().shape, flush=True)
 @pytest.mark.parametrize(("end", "code"), [("", 0), ("raise RuntimeError('of the robot')", 1)])
 def test_a_program_ends_that_never_disconnects(end, code):
     folders = [ROOT, ROOT / "tests/support", PACKAGE / "src"]
-    done = subprocess.run(
-        [sys.executable, "-c", UNCLOSED.format(stand_in=not REAL, end=end)],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))},
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    where = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
+    command = [sys.executable, "-c", UNCLOSED.format(stand_in=not REAL, end=end)]
+    done = subprocess.run(command, env=where, capture_output=True, text=True, timeout=30, check=False)
     assert (done.returncode, done.stdout) == (code, "(40, 40, 3)\n"), done.stderr
     assert done.stderr == "" if code == 0 else done.stderr.endswith("RuntimeError: of the robot\n")
 

@@ -9,22 +9,17 @@ from edge_samples import make_contract, write_model
 from mcap_samples import arrays_of
 
 from edge import api
+from edge.api import USPA44, USPA46, Baseline, ModelError, Pad, Runtime, SensorGeometry, Stream, UsageError, layout_c
 from edge.doctor.guided_press import Press, corner_taxel, find_axes, find_order, orders
-from edge.errors import ModelError, UsageError
-from edge.perception.runtime import Runtime
-from edge.pipeline.result_stream import Stream
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import RecordingError, SensorFileError
-from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
-from firmware_bridge.scans.can_id_maps import layout_c
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from firmware_bridge.zeroing.baseline import Baseline
 
 REST = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None] + 37 * np.arange(24).reshape(4, 6)
 BASELINE = Baseline.of("4", REST, 1.7e9, 100, "file")
@@ -129,8 +124,8 @@ def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
     runtime = Runtime(model, source="device", geometry=source.sensor_file.geometry, baselines={"4": baseline})
     counts = rest.copy()
     counts[2, 5, 0] += 5000
-    scans = replace_scan(counts)
-    pattern = [runtime.push(scan) for scan in scans][-1].pattern
+    series = ScanSeries("4", pad)
+    pattern = [runtime.push(series.close(counts + number, number * 10_000_000)) for number in range(3)][-1].pattern
     assert pattern is not None and pattern.shape == (24, 24) and pattern[20:, :4].min() > 0 == pattern[:20].max()
     with pytest.raises(SensorFileError, match="id map 'mine'"):
         save_sensor_file(tmp_path / "s.toml", replace(source.sensor_file, sensors={"4": SensorEntry()}))
@@ -138,13 +133,6 @@ def test_a_pad_of_a_programs_own_is_an_object(tmp_path):
         layout_c(replace(pad, rows=9))
     with pytest.raises(ValueError, match="1 to 64"):
         layout_c(replace(pad, rows=8, cols=9))
-
-
-def replace_scan(counts):
-    from firmware_bridge.scans.scan import ScanSeries
-
-    series = ScanSeries("4", SensorGeometry("mine", *counts.shape[1:], 1, 1, 1))
-    return [series.close(counts + number, number * 10_000_000) for number in range(3)]
 
 
 def test_a_sensor_file_has_the_grid_of_its_model(tmp_path):

@@ -13,17 +13,12 @@ from cli_samples import base_options, files, records, run, start, write_recordin
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
-from edge.api import MapSink, ObjectMap, Stream, open_recording, open_runtime
+from edge.api import MapSink, ObjectMap, PadPose, Runtime, Source, Stream, TimedPose, open_recording, open_runtime, pump
 from edge.mapping.map_files import check_npz
-from edge.perception.runtime import Runtime
 from edge.pipeline.commands import RESET, CommandLines, Commands
 from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
 from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
-from edge.pipeline.pump import pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 from firmware_bridge.silence import POSES_SILENT_NS
 
 __all__ = ["files"]
@@ -73,32 +68,32 @@ class TestFields:
 
 
 class TestLines:
-    def test_poses_and_commands_part_and_bad_lines_stop_nothing(self):
-        read_end, write_end = os.pipe()
-        commands = Commands()
+    @pytest.fixture
+    def lines(self):
+        """Commands, and the lines that they come from through the end of a pipe."""
+        (read_end, write_end), commands = os.pipe(), Commands()
         lines = CommandLines(commands, read_end)
-        commands.ask(lines.read)
+        yield commands, lines, write_end
+        os.close(write_end)
+        lines.close()
+        os.close(read_end)
+
+    def test_poses_and_commands_part_and_bad_lines_stop_nothing(self, lines):
+        commands, reader, write_end = lines
+        commands.ask(reader.read)
         os.write(write_end, f'{WHOLE}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{WHOLE}\n'.encode())
         assert commands.poll() == [RESET]
         assert [one.time_ns for one in commands.poses.take()] == [123, 123]
         assert (commands.refused, commands.poses.refused) == (1, 1)
         assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
-        os.close(write_end)
-        lines.close()
-        os.close(read_end)
 
-    def test_the_time_of_arrival_is_that_of_the_line_while_the_loop_waits(self):
-        read_end, write_end = os.pipe()
-        commands = Commands()
-        lines = CommandLines(commands, read_end)
+    def test_the_time_of_arrival_is_that_of_the_line_while_the_loop_waits(self, lines):
+        commands, _, write_end = lines
         before_ns = time.monotonic_ns()
         os.write(write_end, b'{"cmd": "pose", "x_mm": 1, "y_mm": 2}\n')
         poses = []
         wait_for(lambda: poses.extend(commands.poses.take()) or poses)  # nobody polls: its own thread reads
         assert before_ns <= poses[0].time_ns <= time.monotonic_ns()
-        lines.close()
-        os.close(write_end)
-        os.close(read_end)
 
 
 class TestQueue:
@@ -223,9 +218,8 @@ def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
         sent = 0
         process.stdin.write('{"cmd": "pose", "x_mm": "left"}\n' * 50)
         while sent < 1000:
-            process.stdin.write(
-                "".join(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 0}}\n' for number in range(sent, sent + 10))
-            )
+            numbers = range(sent, sent + 10)
+            process.stdin.write("".join(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 0}}\n' for number in numbers))
             process.stdin.flush()
             sent += 10
             time.sleep(0.008)
@@ -255,11 +249,8 @@ def centre_of(path):
     with np.load(path) as data:
         rows, cols = np.nonzero(data["coverage"])
         half = (len(data["coverage"]) - 1) / 2
-        places = [
-            (at.mean() - half) / float(data["px_per_mm"]) + c
-            for at, c in zip((cols, rows), data["centre_mm"], strict=True)
-        ]
-        return [round(place, 2) for place in places], int(data["fused_patterns"])
+        at = (np.array([cols.mean(), rows.mean()]) - half) / float(data["px_per_mm"]) + data["centre_mm"]
+        return at.round(2).tolist(), int(data["fused_patterns"])
 
 
 def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, long, tmp_path):

@@ -56,13 +56,8 @@ print([before, within, thread, state(), told, writing])
 
 @linux_only
 def test_what_is_permitted_is_had_by_every_thread_and_given_back():
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
+    where = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, env=where, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     before, within, thread, after, told, writing = eval(done.stdout)
     assert before == after and within == thread[0]

@@ -58,9 +58,7 @@ class Terminal:
 
 @pytest.mark.parametrize(("options", "shown"), [([], True), (["--sink", "status"], False), (["--paced"], False)])
 @pytest.mark.parametrize("to", ["-", "out.jsonl"])
-def test_a_replay_at_full_speed_shows_one_instead_of_the_live_line(
-    tmp_path, monkeypatch, capfd, terminal, options, shown, to
-):
+def test_a_replay_at_full_speed_shows_one_for_the_live_line(tmp_path, monkeypatch, capfd, terminal, options, shown, to):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(progress, "DELAY_S", 0)
     monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream))
@@ -68,9 +66,7 @@ def test_a_replay_at_full_speed_shows_one_instead_of_the_live_line(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     write_model(tmp_path / "tiny.onnx")
     path = write_recording(tmp_path / "finger.csv", make_counts(7), rate_hz=1000)
-    assert (
-        cli.main(["replay", str(path), "--model", str(tmp_path / "tiny.onnx"), "--sink", f"jsonl:{to}", *options]) == 0
-    )
+    assert cli.main(["replay", str(path), "--model", "tiny.onnx", "--sink", f"jsonl:{to}", *options]) == 0
     written = capfd.readouterr().out if to == "-" else (tmp_path / to).read_text()
     assert written.count("\n") == 7
     said = terminal.said()
@@ -146,9 +142,7 @@ def test_lines_of_others_stand_alone(terminal, clock):
         assert re.match(r"\r +\ra line\r\n\r?poses ", terminal.said())
 
 
-def test_nothing_at_all_where_no_terminal_is_and_for_all_but_the_first_of_torchruns_processes(
-    terminal, monkeypatch, clock
-):
+def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypatch, clock):
     pipe = io.StringIO()
     for stream, rank in ((pipe, "0"), (terminal.stream, "1")):
         monkeypatch.setenv("RANK", rank)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bridge_samples import REAL_RECORDINGS
 from cli_samples import records, run
 from edge_samples import REST, write_model
+from golden_world import write_csv
 
 from edge.api import load_baselines, open_recording, take_baselines
 from edge.cli import main as cli
@@ -77,7 +77,6 @@ def test_a_file_that_is_replaced_stays_and_the_user_reads_where(tmp_path, capsys
     assert (tmp_path / "sensor.toml.bak").read_text() == "[no sensor file"
 
 
-COLUMNS = ",".join(f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz")
 GRIP = np.zeros((3, 4, 4))
 GRIP[2] = np.linspace(400, 1100, 16).reshape(4, 4)
 DRIFT = np.zeros((3, 4, 4))
@@ -85,13 +84,10 @@ DRIFT[2] = 560 + 90 * np.cos(np.arange(16)).reshape(4, 4)
 DRIFT[0] = -110
 
 
-def write_csv(path, *parts, seed=0):
+def write_parts(path, *parts, seed=0):
     """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
-    rng = np.random.default_rng(seed)
-    rows = [REST + felt + rng.normal(0, 2, (3, 4, 4)) for scans, felt in parts for _ in range(scans)]
-    lines = [",".join(f"{value:.1f}" for value in np.rint(row).reshape(3, 16).T.ravel()) for row in rows]
-    path.write_text("\n".join([COLUMNS, *lines]) + "\n")
-    return path
+    felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
+    return write_csv(path, np.rint(REST + felt + np.random.default_rng(seed).normal(0, 2, felt.shape)).astype(int))
 
 
 def moving(scans):
@@ -113,22 +109,9 @@ def played(folder, *arguments):
     return [one for one in records(done.stdout) if one["state"] != "event"], done.stderr
 
 
-def test_a_free_pad_with_the_baseline_of_hours_before_is_never_a_contact(folder):
-    write_csv(folder / "monday" / "left.csv", (120, 0))
-    later = write_csv(folder / "tuesday" / "left.csv", (60, DRIFT))
-    source = f"replay:{folder}/monday/left.csv"
-    done = run("baseline", "--source", source, "--rate-hz", "60", "--out", folder / "zero.json")
-    assert done.returncode == 0, done.stderr
-    shown, stderr = played(folder, later, "--rate-hz", "60", "--baseline", folder / "zero.json")
-    assert {(one["state"], one["contact"], one["trusted"]) for one in shown} == {("baseline_in_doubt", None, False)}
-    assert all("of unknown age" in one["note"] and "zero again" in one["note"] for one in shown)
-    assert "sensor left: baseline in doubt: " in stderr
-
-
 def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_printed(folder):
-    held = write_csv(folder / "monday" / "a held left.csv", *moving(150))
-    held = held.rename(folder / "monday" / "left.csv")
-    released = write_csv(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
+    held = write_parts(folder / "monday" / "left.csv", *moving(150))
+    released = write_parts(folder / "tuesday" / "released.csv", *moving(90), (90, DRIFT))
     shown, stderr = played(folder, held, "--rate-hz", "60")
     assert not any(one["contact"] or one["trusted"] for one in shown) and {one["state"] for one in shown} != {"idle"}
     first, second = re.findall(r"edge-sr ((?:baseline|replay) .*?)(?:;| shows)", stderr)
@@ -144,7 +127,7 @@ def test_the_remedy_for_a_recording_that_is_held_throughout_works_as_it_is_print
 
 
 def test_a_baseline_of_a_recording_is_as_old_as_the_recording_or_of_unknown_age(folder):
-    path = write_csv(folder / "left.csv", (120, 0))
+    path = write_parts(folder / "left.csv", (120, 0))
     for more in ([], ["--skip", "5", "--scans", "100"]):
         arguments = ["--source", f"replay:{path}", "--rate-hz", "600", *more, "--out", folder / "zero.json"]
         done = run("baseline", *arguments)
@@ -158,22 +141,7 @@ def test_a_baseline_of_a_recording_is_as_old_as_the_recording_or_of_unknown_age(
 def test_a_pad_that_only_recovers_gives_patterns(folder):
     falls = [(1, GRIP * share) for share in (0.8, 0.5, 0.2)]
     recovers = [(1, np.array([0, 0, 30.0 * (1 - n / 35)])[:, None, None]) for n in range(36)]
-    path = write_csv(folder / "left.csv", *moving(20), *falls, *recovers)
+    path = write_parts(folder / "left.csv", *moving(20), *falls, *recovers)
     shown, stderr = played(folder, path, "--rate-hz", "60")
     assert {one["state"] for one in shown[:21]} == {"contact"} and {one["state"] for one in shown[26:]} == {"idle"}
     assert re.search(r"pressed least; it recovers there: a taxel may be off by \d+ counts", stderr)
-
-
-GRIPS = sorted(REAL_RECORDINGS.glob("*/xela_sensor1.csv"))
-
-
-@pytest.mark.skipif(not GRIPS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
-def test_every_public_recording_shows_patterns(folder):
-    zero = folder / "zero.json"
-    done = run("baseline", "--source", f"replay:{GRIPS[-1]}", "--rate-hz", "60", "--out", zero)
-    assert done.returncode == 0, done.stderr
-    for path in GRIPS[:-1]:
-        shown, _ = played(folder, path, "--rate-hz", "60", "--baseline", zero)
-        assert all(one["pattern"] is not None and one["trusted"] is False for one in shown), path
-    shown, _ = played(folder, GRIPS[-1], "--rate-hz", "60")
-    assert sum(one["pattern"] is not None for one in shown) > 170

@@ -11,11 +11,10 @@ from edge_samples import BASELINE, PERIOD_NS, FakeModel
 from runtime_samples import make_runtime
 from trust_samples import make_trusted_contract
 
+from edge.api import USPA44, Baseline
 from edge.perception.contact_options import RuntimeOptions
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
-from firmware_bridge.zeroing.baseline import Baseline
 
 NOISE_COUNTS = 2.5
 TAKEN = replace(BASELINE, origin="start-up")

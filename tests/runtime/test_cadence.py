@@ -88,13 +88,6 @@ def missed_of(arrivals):
     return cadences.missed
 
 
-def test_what_comes_in_a_burst_was_late_and_not_missed():
-    """Forty scans are held up, two are lost."""
-    times_ms = [10 * n for n in range(100)] + [1400 + 0.3 * n for n in range(40)] + [10 * n for n in range(142, 200)]
-    assert missed_of(scan(number, time_ms) for number, time_ms in enumerate(times_ms)) == 2
-    assert missed_of([scan(0, 0), scan(1, 500)]) == 0, "without a period nobody knows"
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_a_stall_that_lost_nothing_misses_nothing(seed):
     """The median of the newest intervals, 1 % off, once made a second a period too long."""

@@ -8,10 +8,8 @@ from edge_samples import make_contract, make_pad_contract
 from pose_samples import make_posed_contract
 from trust_samples import make_checked_contract, make_posed_trust, make_trust, make_trusted_contract
 
-from edge.errors import ModelError
+from edge.api import USPA44, ModelError, Pad
 from edge.inference.contract import CONTRACT_VERSION, MOST, Contract
-from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.scans.pad_constants import Pad
 
 BROKEN_VALUES = {
     "version": 1,

@@ -9,7 +9,7 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, make_contract
 from numpy.typing import NDArray
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.errors import EdgeError
+from edge.api import USPA44, EdgeError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
@@ -17,7 +17,6 @@ from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
 from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)
@@ -78,17 +77,6 @@ def test_a_field_that_varies_little_is_estimated_from_neighbours(taxels):
     assert told.z_counts == pytest.approx(float(told.counts[2].sum()))
     np.testing.assert_allclose(twice.counts, 2 * told.counts, rtol=1e-5)
     assert told.filled == twice.filled == "neighbours"
-
-
-def test_the_force_is_better_than_with_nothing_for_the_dead():
-    frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
-    newest = frozen.newest[15::16].astype(np.float32)  # ends of taps
-    whole, without, told = newest[:, 2].sum(axis=(1, 2)), [], []
-    for taxel in range(16):
-        filler = estimator().filler(dead(taxel))
-        told.append([filler(scan).z_counts for scan in newest] - whole)
-        without.append(-newest[:, 2].reshape(-1, 16)[:, taxel])
-    assert np.std(told) < 0.6 * np.std(without)
 
 
 @pytest.mark.parametrize(

@@ -10,18 +10,14 @@ from edge_samples import BASELINE, FakeLink, FakeModel, make_pad_contract
 from runtime_samples import make_runtime
 from trust_samples import make_trust
 
+from edge.api import USPA44, EdgeError, SensorFileError, Source, Stream
 from edge.cli import main as cli
-from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower, Learn, SensorPad
 from edge.perception.gain_learning import BOUND, ContactModel, GainLearner, load_contact_model
 from edge.perception.pattern_check import PatternCheck
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
-from edge.pipeline.result_stream import Stream
-from edge.pipeline.scan_reader import Source
-from firmware_bridge.errors import SensorFileError
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file

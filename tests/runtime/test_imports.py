@@ -1,6 +1,7 @@
-"""A run in a process of its own: what it loads and starts, its heap, and the traces that it leaves."""
+"""A run in a process of its own: what it loads, starts and leaves; and errors where an extra is not installed."""
 
 import ast
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -10,6 +11,9 @@ from pathlib import Path
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT
+
+from firmware_bridge import extras
+from firmware_bridge.extras import how_to_install, need
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
@@ -24,16 +28,9 @@ MOST_MODULES = 130
 
 
 def run(code, *arguments, **environment):
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout.splitlines()
+    command, where = [sys.executable, "-c", code, *map(str, arguments)], os.environ | {"PYTHONPATH": str(ROOT)}
+    settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 120, "check": True}
+    return subprocess.run(command, cwd=ROOT, env=where | environment, **settings).stdout.splitlines()
 
 
 def test_no_module_of_the_runtime_loads_a_training_library():
@@ -84,25 +81,6 @@ def test_a_run_loads_what_it_uses_and_leaves_no_trace(tmp_path):
     assert (disabled, left, with_openssl) == ("1", "[]", "False")
 
 
-_HEAPS = """
-import ctypes, sys, threading
-from edge.terminal.heap import share_one_heap
-if sys.argv[1] == "share":
-    share_one_heap()
-libc = ctypes.CDLL(None)
-libc.malloc.restype = libc.fopen.restype = ctypes.c_void_p
-barrier = threading.Barrier(4)
-def allocate():
-    barrier.wait()
-    libc.malloc(ctypes.c_size_t(1000))
-    barrier.wait()
-threads = [threading.Thread(target=allocate) for _ in range(4)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-file = ctypes.c_void_p(libc.fopen(sys.argv[2].encode(), b"w"))
-libc.malloc_info(0, file)
-libc.fclose(file)
-"""
 _GIVEN_BACK = """
 from pathlib import Path
 from edge.terminal.heap import give_back
@@ -118,10 +96,41 @@ print(full - resident())
 
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="glibc's heap is looked at on Linux")
 class TestHeap:
-    @pytest.mark.parametrize(("asked", "heaps"), [("share", 1), ("not", 5)])
-    def test_threads_share_one(self, asked, heaps, tmp_path):
-        run(_HEAPS, asked, tmp_path / "heaps.xml")
-        assert (tmp_path / "heaps.xml").read_text().count("<heap nr=") == heaps
-
     def test_free_memory_between_used_blocks_is_given_back(self):
         assert int(run(_GIVEN_BACK)[0]) > 5000, "of the 12,000 pages that are free"
+
+
+NOTHING_INSTALLED = [sys.executable, "-S"]
+
+
+def test_from_the_sources_their_folder_is_named():
+    assert how_to_install("zenoh") == f"pip install '{ROOT}[zenoh]'"
+
+
+@pytest.mark.parametrize(
+    ("extra", "wanted"),
+    [("one", "'b>=2'"), ("two", "'c>=3' 'd'"), ("both", "'b>=2' 'c>=3' 'd' 'e'"), ("none", "'tactile-edge-sr[none]'")],
+)
+def test_from_a_wheel_the_packages_are(monkeypatch, tmp_path, extra, wanted):
+    required = [
+        *("a>=1", "b>=2; extra == 'one'", "c>=3 ; extra == 'two'", 'd; sys_platform == "linux" and extra == "two"'),
+        *("tactile-edge-sr[one,two]; extra == 'both'", "e; extra == 'both'"),
+    ]
+    monkeypatch.setattr(extras, "_FOLDER", tmp_path)
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: required)
+    assert how_to_install(extra) == f"pip install {wanted}"
+
+
+@pytest.mark.parametrize("command", ["train.fit", "export.to_onnx"])
+def test_a_command_without_its_libraries_ends_in_one_line(command):
+    done = subprocess.run([*NOTHING_INSTALLED, "-m", command], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("not installed: torch, ") and done.stderr.count("\n") == 1
+    assert done.stderr.endswith(f"; pip install '{ROOT}[{command.partition('.')[0]}]'\n")
+
+
+def test_a_program_gets_an_error_it_can_catch():
+    need("train", "json")
+    with pytest.raises(ModuleNotFoundError, match=r"^not installed: no_such_module; pip install ") as missing:
+        need("train", "json", "no_such_module")
+    assert missing.value.name == "no_such_module"

@@ -14,14 +14,12 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, ended, make_contract, write_model
 from onnx import helper, numpy_helper
 
+from edge.api import ModelError, bundled_models, save_baselines
 from edge.cli import main as cli
-from edge.errors import ModelError
 from edge.inference import onnx_session as session
 from edge.inference import timed_loading as loading
-from edge.inference.bundled import bundled_models
 from edge.inference.onnx_guard import OPERATORS, check_plain
 from edge.inference.onnx_session import ModelSession, load_session
-from firmware_bridge.zeroing.baseline import save_baselines
 
 
 def of_nodes(*nodes: onnx.NodeProto, numbers: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:

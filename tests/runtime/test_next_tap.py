@@ -3,17 +3,13 @@
 import numpy as np
 import pytest
 from edge_samples import REST
-from mcap_samples import arrays_of
 from pose_samples import PosedModel, make_posed_contract
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
+from edge.api import USPA44, PadPose
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.taps import next_shift_mm
-from edge.sinks.json_encoding import record
-from edge.sinks.registry import open_sink
-from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
 
 HALF_MM = USPA44.pitch_mm / 2
 REACH_MM = 6.0
@@ -98,19 +94,3 @@ def test_nothing_is_proposed_without_what_it_needs(lacking):
         scan.counts[...] = counts
         result = pad.runtime.push(scan)
     assert result.state == "idle" and result.next_tap is None
-
-
-def test_every_output_holds_it(tmp_path):
-    pad = make_pad()
-    pressed = pad.tap(PadPose(5, -3, 90))
-    proposed = pad.results[-1].next_tap
-    in_record = record(pad.results[-1], {})["next_tap"]
-    assert in_record["dx_mm"] == pytest.approx(proposed.dx_mm) and in_record["turn_deg"] == 0
-    assert in_record["target"]["x_mm"] == pytest.approx(5 - proposed.dy_mm, abs=1e-3)
-    assert record(pressed, {})["next_tap"] is None
-    sink = open_sink(f"mcap:{tmp_path / 'out.mcap'}", contract=make_posed_contract(interval_factor=1.6))
-    for result in (pressed, pad.results[-1]):
-        sink.write(result, {})
-    sink.close()
-    held = arrays_of(tmp_path / "out.mcap")["next_tap"]
-    assert np.isnan(held[0]).all() and held[1] == pytest.approx(proposed[:3], abs=1e-3)

@@ -12,12 +12,10 @@ from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_p
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
-from edge.errors import UsageError, WindowError
+from edge.api import PadPose, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import pose_rows, scheduled_rows
-from edge.inference.trust import ERROR_UNITS, MOST_ERROR, PLACE_MM, pair_width, pose_tap_features
 from edge.perception.contact_options import RuntimeOptions
-from firmware_bridge.poses.pad_pose import PadPose
 
 POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5)]
 
@@ -236,18 +234,6 @@ class TestChecks:
         result = pad.push(PRESS)
         assert (result.taps_used, result.taps_dropped, len(result.window)) == (1, 1, 1)
         assert pad.push(PRESS).tap_mismatch is None, "they are forgotten for good"
-
-    def test_features_of_pairs_are_shapes_sizes_and_the_pose(self):
-        window, poses = random_taps(3)
-        poses[1:] = [[2.5, -5, 90, 0.5, 10], [0, 0, -30, 100, 1e5]]
-        features = pose_tap_features(window, poses)
-        assert features.shape == (2, pair_width(48))
-        again = pose_tap_features(np.stack([window[0], window[0], 10 * window[2]]), poses)
-        np.testing.assert_allclose(again[0, 48:96], 0, atol=1e-6)
-        np.testing.assert_allclose(again[1, :96], features[1, :96], atol=0.1)
-        np.testing.assert_allclose(features[0, 98:100], [2.5 / PLACE_MM, -5 / PLACE_MM])
-        np.testing.assert_allclose(features[:, 100:102], [[0, 1], [np.sqrt(3) / 2, -0.5]], atol=1e-6)
-        np.testing.assert_allclose(features[:, 102:], [[0.5, 10] / ERROR_UNITS, [MOST_ERROR] * 2])
 
 
 def random_taps(taps, seed=0):

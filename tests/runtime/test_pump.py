@@ -2,20 +2,15 @@
 # pyright: reportAssignmentType=false, reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false
 
 import contextlib
-import gc
 import itertools
 import threading
-import tracemalloc
 from dataclasses import replace
 
 import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from runtime_samples import make_runtime, presses, pumped
 
-from edge.errors import SinkClosedError
-from edge.perception.contact_options import RuntimeOptions
-from edge.pipeline.run_statistics import Statistics
-from firmware_bridge.errors import LinkLostError
+from edge.api import LinkLostError, SinkClosedError, Statistics
 from firmware_bridge.links.base import Notice
 
 MS = 1_000_000
@@ -33,24 +28,6 @@ def answered(scans):
 
 
 class TestOvertaking:
-    def test_reading_goes_on_beside_inference(self):
-        """The model waits until the link has been read again, which only another thread can do."""
-        read_again = threading.Event()
-        link, seen = FakeLink([presses([n]) for n in range(5)]), []
-        inner = link.read
-
-        def read(timeout_s):
-            if link.reads >= 3:
-                read_again.set()
-            return inner(timeout_s)
-
-        link.read = read
-        sink = ListSink()
-        pumped(link, sink, model=FakeModel(on_run=lambda: seen.append(read_again.wait(10))))
-        assert all(seen) and link.thread is not threading.current_thread()
-        assert numbers(sink) == list(range(5)), "a record of every scan, in order"
-        assert not [thread for thread in threading.enumerate() if thread.name.startswith("scan-reader")]
-
     def test_scans_between_the_calls_of_a_round_overtake(self):
         """Six sensors press; a call takes four of them, and the next scans come during each of the first two calls."""
         names = [f"{number}" for number in range(6)]
@@ -78,11 +55,7 @@ class TestOvertaking:
         statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
         made = [(one.scan.number, one.scan.sensor) for one in sink.results if one.pattern is not None]
         assert calls == [4, 4, 4, 2]
-        assert made == [
-            *((0, name) for name in "0123"),
-            *((1, name) for name in "4501"),
-            *((2, name) for name in "230145"),
-        ]
+        assert made == [(number, name) for number, names in enumerate(("0123", "4501", "230145")) for name in names]
         assert statistics.dropped == 4
         assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 
@@ -221,47 +194,3 @@ class TestDeadline:
         link, sink = answered(read)
         statistics = pumped(link, sink, clock_ns=lambda: read[len(sink.results)].time_ns + 4 * MS)
         assert statistics.scans == 24 and statistics.late == 0
-
-
-class Forgetful(FakeModel):
-    """Fake model that keeps no window."""
-
-    def run(self, window, pad=None, poses=None):
-        made = super().run(window, pad)
-        self.windows.clear()
-        self.pads.clear()
-        return made
-
-
-@pytest.mark.parametrize("press", [0, 1400])  # one taxel alone is believed up to 1500 counts
-def test_the_loop_makes_no_cycles_and_holds_no_more_memory(press):
-    """Patterns are copied for the sinks, and freed with their result; collection stands still in the loop only."""
-    runtime = make_runtime(Forgetful(), options=RuntimeOptions(contact_on_counts=1000, every_scan=True))
-    gates = [threading.Event() for _ in range(900)]
-    held, cycles, patterns = {}, [], 0
-
-    class Watcher(ListSink):
-        def write(self, result, counters):
-            nonlocal patterns
-            patterns += result.pattern is not None
-            number = result.scan.number
-            if number == 300:
-                assert not gc.isenabled() and gc.get_freeze_count() > 0
-                gc.collect()
-                tracemalloc.start(1)
-            if number in (400, 850):
-                snapshot = tracemalloc.take_snapshot().filter_traces(
-                    [tracemalloc.Filter(True, "*/edge/*"), tracemalloc.Filter(True, "*/firmware_bridge/*")]
-                )
-                held[number] = sum(trace.size for trace in snapshot.traces)
-            if number == 890:
-                tracemalloc.stop()
-                cycles.append(gc.collect())
-            gates[number].set()  # or what waits to be taken would be counted
-
-    scans = ([make_scan(n, press_counts=press, noise=3)] for n in range(len(gates)))
-    link = FakeLink([part for both in zip(scans, gates, strict=True) for part in both])
-    pumped(link, Watcher(), runtime=runtime, capacity_scans=10_000)
-    assert cycles == [0] and patterns == (len(gates) if press else 0)
-    assert held[850] - held[400] < 4096
-    assert gc.isenabled() and gc.get_freeze_count() == 0

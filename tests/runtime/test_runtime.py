@@ -1,4 +1,4 @@
-"""Runtime: what the result of a scan holds, zeroing at the start, and scans that overtake others."""
+"""Runtime: what a result holds, zeroing at the start, scans that overtake others, and those that need no pattern."""
 # pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
 # pyright: reportOptionalMemberAccess=false
 
@@ -11,15 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.errors import ModelError, UsageError, WindowError
+from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
+from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.result import mask_bits
-from edge.perception.runtime import MOST_TOGETHER
-from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.zeroing.baseline import Baseline
 
 SURE = make_contract(interval_factor=1.6)
 
@@ -102,10 +100,6 @@ class TestResult:
 
 
 class TestRefusals:
-    def test_a_sensor_that_the_model_was_not_trained_for_is_refused(self):
-        with pytest.raises(ModelError, match="'pitch_mm'"):
-            make_runtime(geometry=dataclasses.replace(USPA44, pitch_mm=5.0))
-
     def test_a_baseline_or_scan_of_another_grid_is_refused(self):
         small = Baseline.of("4", REST[:, :2], 0.0, 100, "file")
         with pytest.raises(UsageError, match=r"sensor 4 has shape \(3, 2, 4\), expected \(3, 4, 4\)"):
@@ -157,31 +151,6 @@ class TestOvertaken:
         runtime.push(make_scan(2))
         runtime.push(make_scan(3, press_counts=2000))
         assert model.windows[-1][1, 2, 1, 1] == 9.0, "the peak was in the scan without a pattern"
-
-    def test_the_newest_scan_wins_and_keeps_the_place(self):
-        """Sensor 4 sends three scans while 6 sends one, and both wait: 4 is the first all the same."""
-        runtime = make_runtime(baselines=dict.fromkeys("468", BASELINE))
-        sent = [make_scan(number, sensor="4", press_counts=PRESS * (number + 1)) for number in range(3)]
-        assert runtime.take(sent[0]) == [] and runtime.take(make_scan(0, sensor="6", press_counts=PRESS)) == []
-        overtaken = [result for scan in sent[1:] for result in runtime.take(scan)]
-        told = [(result.scan.number, result.state, result.pattern) for result in overtaken]
-        assert told == [(0, "dropped", None), (1, "dropped", None)]
-        (idle,) = runtime.take(make_scan(0, sensor="8"))
-        assert idle.state == "idle" and runtime.waiting == 2
-        newest, other = runtime.infer()
-        assert (newest.scan, other.scan.sensor, runtime.waiting) == (sent[2], "6", 0)
-        assert newest.pattern.max() == pytest.approx(3 * other.pattern.max())
-
-    def test_sensors_beyond_one_call_wait_and_none_starves(self):
-        names = [str(number) for number in range(2 * MOST_TOGETHER)]
-        runtime = make_runtime(baselines=dict.fromkeys(names, BASELINE), options=RuntimeOptions(every_scan=True))
-
-        def infer(number):
-            for name in names:
-                runtime.take(make_scan(number, sensor=name, press_counts=PRESS))
-            return [result.scan.sensor for result in runtime.infer()]
-
-        assert [infer(number) for number in range(4)] == 2 * [names[:MOST_TOGETHER], names[MOST_TOGETHER:]]
 
     @settings(max_examples=30, deadline=None)
     @given(
@@ -247,3 +216,74 @@ class TestAway:
         notes = make_runtime().push(dataclasses.replace(scan, device_ns=device_ns, unread_ns=unread_ns)).notes
         late = [one.text for one in notes if one.kind == "late"]
         assert len(late) == (note is not None) and (note is None or note in late[0])
+
+
+SHAPE = (3, 4, 4)
+BEFORE = (2000.0 * np.random.default_rng(0).random(SHAPE)).astype(np.float32)
+
+
+@pytest.fixture
+def last():
+    """The last reading, of which a model has made a pattern."""
+    last = LastReading(SHAPE)
+    last.keep(BEFORE, "model")
+    return last
+
+
+class TestLastReading:
+    def test_noise_is_no_change_and_a_little_everywhere_is(self, last):
+        noise = NOISE_COUNTS * np.random.default_rng(1).standard_normal((2001, *SHAPE), dtype=np.float32)
+        last.keep(BEFORE + noise[0], "model")
+        assert sum(last.holds(BEFORE + one, "model") for one in noise[1:]) >= 1990
+        last.keep(BEFORE, "model")
+        assert last.holds(BEFORE + np.float32(3.9), "model")
+        assert not last.holds(BEFORE + np.float32(4.0), "model")
+
+    def test_one_taxel_that_changed_is_seen(self, last):
+        for place in np.ndindex(SHAPE):
+            after = BEFORE.copy()
+            after[place] -= CHANGED_COUNTS + 1
+            assert not last.holds(after, "model")
+
+    def test_drift_is_followed_however_slowly(self, last):
+        counts, made = BEFORE, 0
+        for _ in range(400):
+            counts = counts + np.float32(0.1)
+            if not last.holds(counts, "model"):
+                last.keep(counts, "model")
+                made += 1
+        assert made == 10
+
+    def test_another_maker_or_none_makes_it_anew(self, last):
+        last.keep(BEFORE, ("model", 0, 1))
+        assert last.holds(BEFORE, ("model", 0, 1)) and not last.holds(BEFORE, ("model", 1, 1))
+        last.keep(BEFORE, None)
+        assert not last.holds(BEFORE, ("model", 0, 1)) and not LastReading(SHAPE).holds(BEFORE, "model")
+
+
+def make_pad(**settings):
+    model = FakeModel(SURE)
+    return Pushed(make_runtime(model, **settings)), model
+
+
+def test_a_still_grip_is_inferred_once():
+    pad, model = make_pad()
+    results = [pad.push(PRESS, noise=3) for _ in range(15)]
+    assert len(model.windows) == 1
+    assert [result.reused_from for result in results] == [None] + [0] * 14
+    for result in results[1:]:
+        assert result.state == "contact" and result.run_time_us is None and result.pattern is results[0].pattern
+        assert result.interval_mm == results[0].interval_mm and result.area_mm2 == results[0].area_mm2
+    moved = pad.push(PRESS + 20)
+    assert moved.reused_from is None and moved.run_time_us is not None and len(model.windows) == 2
+    pad.runtime.reset()
+    assert pad.push(PRESS + 20).reused_from is None, "a reset"
+    pad.push()
+    again = [pad.push(PRESS + 20).reused_from for _ in range(2)]
+    assert again == [None, 18] and len(model.windows) == 4, "the same touch in the next tap"
+
+
+def test_every_scan_is_inferred_where_that_is_asked_for():
+    pad, model = make_pad(options=RuntimeOptions(every_scan=True))
+    assert all(pad.push(PRESS).reused_from is None for _ in range(5))
+    assert len(model.windows) == 5

@@ -171,14 +171,3 @@ def test_a_model_of_a_newer_onnx_is_refused_with_what_to_do(tmp_path, ir, opset,
     remedy = rf"of a newer ONNX, {version}, than onnxruntime [\d.]+ reads: export it again .* or install a newer"
     with pytest.raises(ModelError, match=remedy):
         ModelSession(tmp_path / "new.onnx")
-
-
-@pytest.mark.parametrize("side_file", [True, False])
-def test_weights_in_a_side_file_are_refused_even_in_reach(tmp_path, monkeypatch, side_file):
-    model = onnx.load(write_model(tmp_path / "tiny.onnx"))
-    onnx.save(model, tmp_path / "side.onnx", save_as_external_data=True, location="side.data", size_threshold=1000)
-    if not side_file:
-        (tmp_path / "side.data").unlink()
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ModelError, match=r"side.onnx: keeps its weights in a side file, expected one file"):
-        ModelSession(tmp_path / "side.onnx")

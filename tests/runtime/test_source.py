@@ -1,25 +1,25 @@
-"""Source of one or several links: opened in a thread, read in threads, scripts and emulated adapters."""
+"""Source of one or several links: opened in a thread, read in threads at a pace, scripts and emulated adapters."""
+# pyright: reportAttributeAccessIssue=false
 
-import contextlib
-import itertools
 import threading
 import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bridge_samples import make_recording, stacked
-from edge_samples import FakeLink, make_scan
-from runtime_samples import presses
+from edge_samples import REST, FakeLink, ListSink, make_scan
+from runtime_samples import presses, pumped
 
-from edge.errors import UsageError
-from edge.pipeline.pace import Pace
-from edge.pipeline.scan_reader import Source
+from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
+from edge.pipeline.pace import Pace, PaceSetter
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.errors import LinkLostError, SourceError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scans.scan import Scan
+from firmware_bridge.recording.tracks import Recording, Track
 
 LIMIT_S = 30
 
@@ -139,14 +139,6 @@ class TestOne:
 
 
 class TestScripts:
-    def test_scans_of_each_link_keep_their_order(self):
-        links = [FakeLink([[make_scan(n)] for n in range(50)]) for _ in range(4)]
-        with Source(*(LastingLink(link, None, name=f"f{index}") for index, link in enumerate(links))) as source:
-            taken = take_all(source)
-        for index in range(4):
-            assert numbers(taken, f"f{index}/4") == list(range(50))
-        assert source.counters() == {"scans": 200}
-
     def test_a_link_that_hangs_holds_up_no_other(self):
         gate = threading.Event()
         fast, slow = FakeLink([[make_scan(n)] for n in range(5)]), FakeLink([gate, [make_scan(0)]])
@@ -155,16 +147,6 @@ class TestScripts:
             assert numbers(taken, "fast/4") == list(range(5)) and not numbers(taken, "slow/4")
             gate.set()
             assert numbers(take_all(source), "slow/4") == [0]
-
-    def test_a_notice_comes_before_the_scans_given_with_it(self):
-        class Telling(FakeLink):
-            def notices(self):
-                return [Notice(self.reads, "back", f"before read {self.reads}")]
-
-        link = Telling([[make_scan(n)] for n in range(20)])
-        with Source(link, LastingLink(FakeLink([]), None, name="other")) as source:
-            told = order(take_all(source))
-        assert told[:40] == [x for n in range(20) for x in (f"before read {n + 1}", n)]
 
     def test_one_that_gives_up_ends_all_after_its_scans(self):
         lost = FakeLink([[make_scan(0)]], error=LinkLostError("gone"))
@@ -187,66 +169,100 @@ class TestScripts:
         assert not set(threading.enumerate()) - before
 
 
-def lasting(port, name):
-    return LastingLink(SlcanSerialLink(str(port)), name=name)
+def followed(setter, scans, state="idle", *, stamped=True, begin=0):
+    for number in range(begin, begin + scans):
+        scan = make_scan(number)
+        setter.follow(SimpleNamespace(state=state, scan=replace(scan, device_ns=scan.time_ns if stamped else None)))
 
 
-class TestPorts:
-    @pytest.mark.parametrize("together_s", [0.0, 0.003])
-    def test_two_are_read_and_nothing_is_lost_or_mixed_up(self, together_s):
-        recordings = dict(zip(("left", "right"), (make_recording(60, seed=seed) for seed in (1, 2)), strict=True))
-        before = set(threading.enumerate())
-        with contextlib.ExitStack() as stack:
-            played = [stack.enter_context(Emulator([one], jitter_s=0.002, seed=1)) for one in recordings.values()]
-            links = [lasting(one.port, name) for one, name in zip(played, recordings, strict=True)]
-            of_emulators = set(threading.enumerate())
-            source = stack.enter_context(Source(*links))
-            source.pace = Pace(together_s)
-            taken = take_all(source, lambda taken: len(numbers(taken, "left/4")) >= 10)
-            assert {thread.name for thread in set(threading.enumerate()) - of_emulators} == {"scan-reader"}
-            taken += take_all(source, lambda more: min(len(numbers(more, f"{name}/4")) for name in recordings) >= 30)
-            counters = source.counters()
-        assert not set(threading.enumerate()) - before, "a thread outlived the source"
-        for name, recording in recordings.items():
-            mine = [one for one in taken if isinstance(one, Scan) and one.sensor == f"{name}/4"]
-            assert [scan.number for scan in mine] == list(range(len(mine)))
-            assert all(a.time_ns <= b.time_ns for a, b in itertools.pairwise(mine))  # what is read together, arrives so
-            counts = recording.tracks[0].counts
-            whole = [scan for scan in mine if scan.complete]
-            first = next(row for row in range(len(counts)) if np.array_equal(counts[row], whole[0].counts))
-            if counters["torn_wire"] == 0:
-                assert np.array_equal(stacked(whole, f"{name}/4"), counts[first : first + len(whole)])
-        assert counters["frames"] == counters["readings"] and counters["torn_source"] == 0
-        assert counters["outages"] == counters["reopenings"] == 0
+def test_rest_is_a_second_without_contact_of_stamped_sensors():
+    setter = PaceSetter(0.1)
+    assert setter.choose(1, 0.01) == Pace()
+    followed(setter, 50, "contact")
+    assert setter.choose(1, 0.01) == Pace()
+    followed(setter, 100, begin=50)
+    assert setter.choose(1, 0.01) == Pace() and not setter.waited(make_scan(149))
+    followed(setter, 2, begin=150)
+    rest = setter.choose(1, 0.01)
+    assert rest == Pace(0.01, 10) and setter.waited(make_scan(160))
+    assert setter.choose(1, 0.0105) is rest, "a measured period jitters"
+    followed(setter, 1, "contact", begin=152)
+    assert setter.choose(1, 0.01) == Pace()
+    assert setter.waited(make_scan(152)), "it was still on its way"
+    assert not setter.waited(make_scan(154))
 
-    def test_one_that_is_away_holds_up_no_other_and_comes_back(self, tmp_path):
-        """The left adapter is pulled out for a while; the right one's scans go on meanwhile, each of them."""
-        recordings = [make_recording(120, seed=seed) for seed in (1, 2)]
-        port = tmp_path / "left"
 
-        def readers():
-            return [thread.name for thread in threading.enumerate() if thread.name == "scan-reader"]
+@pytest.mark.parametrize(
+    ("sensors", "period_s", "patience_s", "stamped", "pace"),
+    [
+        (1, 0.01, 0.0, True, Pace()),
+        (1, 0.01, 0.1, False, Pace()),
+        (1, 0.002, 0.1, True, Pace()),
+        (1, float("inf"), 0.1, True, Pace()),
+        (3, 0.01, 0.0, True, Pace()),
+        (4, 0.01, 0.0, True, Pace(0.0025)),
+        (4, 0.1, 0.0, True, Pace()),
+        (4, 0.01, 0.1, True, Pace(0.01, 10)),
+    ],
+)
+def test_many_are_read_together_and_rest_needs_patience(sensors, period_s, patience_s, stamped, pace):
+    setter = PaceSetter(patience_s)
+    followed(setter, 200, stamped=stamped)
+    assert setter.choose(sensors, period_s) == pace
 
-        def both(taken):
-            return min(len(numbers(taken, f"{name}/4")) for name in ("left", "right")) >= 5
 
-        with Emulator(recordings[:1], loop=True, jitter_s=0) as gone, Emulator(recordings[1:], loop=True) as stays:
-            port.symlink_to(gone.port)
-            with Source(lasting(port, "left"), lasting(stays.port, "right")) as source:
-                take_all(source, both)
-                outages = source.counters()["outages"]
-                port.unlink()  # or another test's terminal of the same number would come back under this name
-                gone.__exit__(None, None, None)
-                taken = take_all(source, lambda taken: len(numbers(taken, "right/4")) >= 60)
-                assert [(one.kind, one.sensors) for one in taken if isinstance(one, Notice)] == [("lost", "left/")]
-                heard = numbers(taken, "right/4")
-                assert heard == list(range(heard[0], heard[0] + len(heard)))
-                with Emulator(recordings[:1], loop=True, jitter_s=0) as again:
-                    port.symlink_to(again.port)
-                    taken = take_all(source, lambda taken: len(numbers(taken, "left/4")) >= 10)
-                    assert [one.kind for one in taken if isinstance(one, Notice)] == ["back"]
-                    back = next(index for index, one in enumerate(taken) if isinstance(one, Notice))
-                    assert not numbers(taken[:back], "left/4"), "scans from behind the outage came before word of it"
-                    assert len(readers()) == 2
-                    assert source.counters()["outages"] == outages + 1
-        assert not readers()
+def recording(scans, pressed):
+    """Two sensors on a bus, which change in every scan, and are pressed at the end."""
+    rng = np.random.default_rng(2)
+    counts = [(REST + rng.integers(-3, 4, (scans, 3, 4, 4))).astype(np.int32) for _ in range(2)]
+    for one in counts:
+        one[pressed:, 2, 1, 1] += 3000
+    tracks = tuple(Track(name, one, None) for name, one in zip("46", counts, strict=True))
+    return Recording(Path("made.csv"), tracks, 100.0)
+
+
+@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace(0.003), Pace()])
+def test_what_is_read_does_not_depend_on_when(pace):
+    """Cycles of two sensors mix on each of two buses, and reads end within them."""
+    played = recording(100, 60)
+    with ExitStack() as closing:
+        emulators = [closing.enter_context(Emulator([played], waits=True)) for _ in range(2)]
+        named = enumerate(emulators)
+        source = Source(*(LastingLink(SlcanSerialLink(emulator.port), name=f"f{index}") for index, emulator in named))
+        closing.enter_context(source)
+        source.pace = pace
+        taken: list[list[Scan]] = []
+        end_s = time.monotonic() + 30
+        while sum(map(len, taken)) < 400 and time.monotonic() < end_s:
+            taken.append([one for one in source.take(0.1) or () if isinstance(one, Scan)])
+        counters = source.counters()
+    for name in ("f0/4", "f0/6", "f1/4", "f1/6"):
+        mine = [[scan for scan in together if scan.sensor == name] for together in taken]
+        scans = [scan for together in mine for scan in together]
+        assert [scan.number for scan in scans] == list(range(100))
+        expected = played.tracks["46".index(name[-1])].counts
+        assert (np.stack([scan.counts for scan in scans]) == expected).all()
+        assert pace.reads == 1 or max(map(len, mine)) >= 5
+    assert counters["frames"] == counters["readings"] == 6400
+
+
+@pytest.mark.parametrize("patience_s", [0.0, 0.2])
+def test_a_contact_that_waited_gets_all_its_patterns(patience_s):
+    """Its scans come together after rest: none is dropped, nor late by its pattern."""
+    rested, scans = threading.Event(), [make_scan(n, noise=3, press_counts=(n >= 150) * (3000 + n)) for n in range(156)]
+    stamped = [replace(scan, device_ns=scan.time_ns) for scan in scans]
+    link = FakeLink([[scan] for scan in stamped[:150]] + [rested, stamped[150:]])
+
+    class Patient(ListSink):
+        def write(self, result, counters):
+            super().write(result, counters)
+            if result.scan.number == 149:
+                rested.set()
+
+    sink = Patient()
+    sink.patience_s = patience_s
+    late_ns = scans[-1].time_ns + 100_000_000
+    statistics = pumped(link, sink, clock_ns=lambda: late_ns)
+    patterns = [result.pattern is not None for result in sink.results if result.scan.number >= 150]
+    assert len(patterns) == 6 and all(patterns) == (patience_s > 0)
+    assert (statistics.dropped == statistics.late == 0) == (patience_s > 0)

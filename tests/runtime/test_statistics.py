@@ -1,15 +1,17 @@
-"""Statistics of a run: what is counted, quantiles, and the summary at its end."""
+"""Statistics of a run, quantiles and the summary at its end; events and notes, each of one of a closed set of kinds."""
 # pyright: reportArgumentType=false
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, make_scan
+from edge_samples import BASELINE, ROOT, make_scan
 from hypothesis import given
 from hypothesis import strategies as st
+from runtime_samples import Pushed
 
-from edge.perception.event import Event, Note
+from edge.perception.event import KINDS, NOTE_KINDS, Event, Note, joined
 from edge.perception.result import Result
 from edge.pipeline.run_statistics import Histogram, Statistics
 
@@ -107,10 +109,7 @@ class TestSummary:
         ("results", "why"),
         [
             ([noted(0, "zeroing")], "not zeroed, too few scans; or pass --baseline, of the free pad"),
-            (
-                [noted(0, "zeroing"), noted(1, "zeroing", "it moved")],
-                "not zeroed, it moved; or pass --baseline, of the",
-            ),
+            ([noted(0, "zeroing"), noted(1, "zeroing", "it moved")], "not zeroed, it moved; or pass --baseline"),
             ([noted(0, "incomplete", "taxel 3 is dead"), noted(1, "zeroing")], "taxel 3 is dead"),
             ([noted(0, "zeroing", "it moved"), noted(1, "idle")], "no contact: its readings never reached"),
             ([noted(0, "idle"), noted(1, "dropped"), noted(2, "idle")], "newer scans overtook all"),
@@ -127,12 +126,51 @@ class TestSummary:
         assert line.startswith("sensor 7 has no pattern: not zeroed")
 
     def test_it_tells_rates_over_more_than_a_second(self):
-        results = [
-            at(n, n * period_ns, sensor) for n in range(111) for sensor, period_ns in (("4", 10**7), ("6", 10**8))
-        ]
+        results = [at(n, n * ns, sensor) for n in range(111) for sensor, ns in (("4", 10**7), ("6", 10**8))]
         statistics = counted([*results, at(0, 0, "7")])
         assert statistics.rate_hz() == pytest.approx({"4": 100.0, "6": 10.0})
         assert "rate held: 100.0 Hz (sensor 4), 10.0 Hz (sensor 6)" in statistics.summary(source="x")
         burst = counted(at(n, n * 265_000) for n in range(6))
         short = counted(at(n, max(n - 5, 0) * 10_000_000) for n in range(20))  # behind a few that came at once
         assert short.rate_hz()["4"] > 135 and "rate" not in burst.summary(source="x") + short.summary(source="x")
+
+
+PAGE = [path for path in (ROOT / "edge" / "view").rglob("*") if path.suffix in (".html", ".js")]
+
+
+def test_each_kind_has_a_text_and_a_place_in_the_docs():
+    with pytest.raises(ValueError, match="'runtime', expected one of back, baseline_cleared, baseline_doubted"):
+        Event(0, "runtime", None, "told")
+    with pytest.raises(ValueError, match="note kind is 'old', expected one of baseline_in_doubt"):
+        Note("old", "told")
+    assert all(Event(0, kind, "4", "detail").text for kind in KINDS)
+    text = (ROOT / "docs" / "formats.md").read_text()
+    assert not {kind for kind in KINDS | NOTE_KINDS if f"`{kind}`" not in text}
+
+
+def test_the_page_goes_by_kinds_that_there_are():
+    page = "".join(path.read_text() for path in PAGE)
+    lists = re.findall(r"COUNTED = \[(.*?)\]|\[([^\]]*)\]\.includes\(event\)|event === (\"\w+\")", page)
+    named = set(re.findall(r'"(\w+)"', str(lists)))
+    assert {"refused", "in_contact", "rest_level", "lost"} <= named <= KINDS
+    notes = set(re.findall(r"\(kind\) => kind !== \"(\w+)\"", page))
+    assert notes and notes <= NOTE_KINDS
+
+
+def test_a_result_has_once_what_happened_before_it():
+    pad = Pushed()
+    pad.runtime.zero()
+    first = pad.push()
+    assert [(event.kind, event.sensor) for event in first.events] == [("refused", None)]
+    assert first.event == "zeroing refused: no scan has arrived yet"
+    pad.runtime.reset()
+    pad.runtime.zero("9")
+    pad.runtime.zero("4")
+    pad.runtime.lose_touch()
+    result = pad.push()
+    told = [("reset", None), ("refused", None), ("given_up", "4")]
+    assert [(event.kind, event.sensor) for event in result.events] == told
+    assert {event.time_ns for event in result.events} == {result.scan.time_ns}
+    assert result.event == joined(result.events) == "; ".join(event.text for event in result.events)
+    after = pad.push()
+    assert after.events == () and after.event is None

@@ -10,27 +10,13 @@ from chaos_judge import HELD_CYCLES, RATE_HZ
 from edge_samples import BASELINE, PERIOD_NS, REST, make_scan
 from runtime_samples import PRESS, Pushed, make_runtime
 
-from edge.inference.bundled import demo_recording
+from edge.api import USPA44, Baseline, demo_recording
+from edge.perception import taxel_health as health
 from edge.perception.event import joined
-from edge.perception.taxel_health import (
-    BACK_SCANS,
-    FAR_SCANS,
-    FROZEN_SCANS,
-    FROZEN_SENSOR_SCANS,
-    HOLD_NS,
-    HOLD_SCANS,
-    LONE_COUNTS,
-    RANGE_ENDS,
-    REST_COUNTS,
-    STUCK_SCANS,
-    TAXEL_SILENT_SCANS,
-    TaxelWatch,
-)
-from firmware_bridge.pad_geometry import USPA44
+from edge.perception.taxel_health import BACK_SCANS, FAR_SCANS, HOLD_SCANS, STUCK_SCANS, TAXEL_SILENT_SCANS, TaxelWatch
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
-from firmware_bridge.zeroing.baseline import Baseline
 
 SPHERE_SHARE = 0.030
 """Reading of the largest neighbour as a share of the taxel under a sphere of 1.5 mm, simulated."""
@@ -120,13 +106,13 @@ class TestWatch:
 
     def test_a_sensor_that_repeats_one_scan_is_frozen_after_ten(self):
         pad = Pad(noise_counts=0)
-        assert not any(pad.read(FROZEN_SENSOR_SCANS))
+        assert not any(pad.read(health.FROZEN_SENSOR_SCANS))
         assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
         assert not pad.watch.may_be_estimated
         assert pad.note() == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
     @pytest.mark.parametrize(
-        ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, FROZEN_SCANS)]
+        ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, health.FROZEN_SCANS)]
     )
     def test_the_stuck_are_found_among_the_few_that_are_left(self, stuck, after):
         pad = Pad()
@@ -145,16 +131,16 @@ class TestWatch:
 
     def test_a_taxel_alone_far_from_rest_is_not_pressed(self):
         pad = Pad()
-        assert pad.read(FAR_SCANS, shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far"}
+        assert pad.read(FAR_SCANS, shifted(5, 2 * health.LONE_COUNTS))[-1] == {5: "far"}
         # While something is touched it may be as it should; it is believed once it is seen at rest.
-        assert pad.read(50, pressed(5, 3 * REST_COUNTS))[-1] == {5: "far"}
+        assert pad.read(50, pressed(5, 3 * health.REST_COUNTS))[-1] == {5: "far"}
         assert pad.read(BACK_SCANS)[-1] == {}
 
     def test_what_a_dead_taxel_last_read_hides_no_other_one(self):
         pad = Pad()
         pad.read(5, pressed(7, 8000))
         pad.read(HOLD_SCANS + 1, silent(7))
-        assert pad.read(FAR_SCANS, silent(7), shifted(5, 2 * LONE_COUNTS))[-1] == {5: "far", 7: "silent"}
+        assert pad.read(FAR_SCANS, silent(7), shifted(5, 2 * health.LONE_COUNTS))[-1] == {5: "far", 7: "silent"}
 
     def test_a_taxel_without_reading_or_rest_is_never_believed(self):
         pad = Pad()
@@ -173,32 +159,11 @@ class TestWatch:
         """In an hour no taxel came nearer to stuck than four scans in a row."""
         assert not any(Pad(seed=3).read(3000))
 
-    def test_what_is_told(self):
-        pad = Pad()
-        pad.read(STUCK_SCANS + 3, at(3, 1, 2, 3), silent(7))
-        (estimated,) = pad.watch.notes("neighbours")
-        assert estimated.kind == "estimated" and estimated.text in (
-            "taxel 7 silent, taxel 3 stuck: estimated from their neighbours",
-            "taxel 3 stuck, taxel 7 silent: estimated from their neighbours",
-        )
-        told = [("dead", "no pattern, taxel 3 stuck: it may be broken"), ("dead", "no pattern, taxel 7 silent")]
-        assert sorted((note.kind, note.text) for note in pad.watch.notes(None)) == told
-
-    def test_one_at_its_end_is_held_from_the_first_scan(self):
-        pad = Pad()
-        pad.read(3)
-        pad.read(1, pressed(0, 5000, share=1))
-        before = pad.watch.held[2, 1, 1]
-        assert 65535 - BASELINE.counts[2, 1, 1] < 27_000, "as a contact might read"
-        pad.read(1, pressed(0, 5000, share=1), at(5, 16_185, 16_585, 65535))
-        assert pad.watch.held[2, 1, 1] == before
-        assert "its last reading is held, taxel 5 at the end of its range" in pad.note()
-
     def test_no_reading_is_held_for_too_long(self):
         """A pause, the longest that a scan may have, may lie between a reading and the end of its own scan."""
-        assert (HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
+        assert (health.HOLD_NS + LONGEST_PAUSE_NS) / 1e9 <= HELD_CYCLES / RATE_HZ
 
-    @pytest.mark.parametrize(("pause_ns", "held"), [(HOLD_NS, True), (HOLD_NS + 1, False)])
+    @pytest.mark.parametrize(("pause_ns", "held"), [(health.HOLD_NS, True), (health.HOLD_NS + 1, False)])
     @pytest.mark.parametrize("torn_before", [False, True])
     def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
         """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
@@ -249,19 +214,6 @@ class TestRuntime:
         pad = Pushed(make_runtime(baselines=None), noise=4)
         assert {pad.push(absent=tuple(range(8))).state for _ in range(400)} == {"zeroing"}
 
-    def test_an_absent_taxel_keeps_its_newest_reading_for_a_while(self):
-        pad = Pushed()
-        pad.push(PRESS / 2)
-        pad.push(PRESS)
-        for _ in range(HOLD_SCANS):
-            result = pad.push(PRESS, absent=(5,))
-            assert result.state == "contact" and result.force_counts == PRESS
-        result = pad.push(PRESS, absent=(5,))
-        assert result.state == "incomplete" and result.baseline is BASELINE
-        assert result.pattern is result.contact is result.force_counts is None
-        states = [pad.push(PRESS).state for _ in range(BACK_SCANS)]
-        assert states == ["incomplete"] * (BACK_SCANS - 1) + ["contact"]
-
     @pytest.mark.parametrize("stamped", [True, False])
     def test_a_reading_that_came_late_is_held_since_it_was_taken(self, stamped):
         """Readings that a delayed reader fetches together were not taken together."""
@@ -286,7 +238,7 @@ class TestRuntime:
         assert notes[-1] == f"{named}: {remedy}"
         assert [pad.push().note for _ in range(BACK_SCANS)][-1] is None
 
-    @pytest.mark.parametrize("counts", RANGE_ENDS)
+    @pytest.mark.parametrize("counts", health.RANGE_ENDS)
     def test_a_chip_at_the_end_of_its_range_has_no_reading(self, counts):
         """The last reading is held for a while, as of a silent taxel; then there is no pattern."""
         pad = Pushed()
@@ -304,6 +256,6 @@ class TestRuntime:
 
     def test_silent_ones_are_named_with_one_at_its_end(self):
         pad, half = Pushed(), tuple(range(8, 16))
-        note = [saturated(pad, RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
+        note = [saturated(pad, health.RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
         assert "taxel 5 at the end of its range" in note
         assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")

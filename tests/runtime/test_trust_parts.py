@@ -14,19 +14,11 @@ import pytest
 from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
-from edge.errors import ModelError
-from edge.inference.contract import Contract
+from edge.api import Contract, ModelError
+from edge.inference import small_network as networks
 from edge.inference.forward_model import GRID, KPA, condensed, features
 from edge.inference.onnx_session import ModelSession
-from edge.inference.small_network import (
-    MOST_INPUTS,
-    MOST_LAYERS,
-    MOST_UNITS,
-    SmallNetwork,
-    packed,
-    small_network,
-    unpacked,
-)
+from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network, unpacked
 from edge.inference.trust import check_of, contact_features, trust_of
 
 GAIN_ERROR = 0.075
@@ -132,7 +124,7 @@ class TestSmallNetwork:
             ([], "0 layers"),
             (layers(*[2] * (MOST_LAYERS + 1), 1), "layers"),
             (layers(MOST_INPUTS + 1, 1), "inputs"),
-            (layers(4, MOST_UNITS + 1, 1), "a layer of"),
+            (layers(4, networks.MOST_UNITS + 1, 1), "a layer of"),
             ([*layers(4, 3), *layers(4, 1)], "after 3 units"),
             (layers(4, 2), "2 outputs"),
             ([(np.ones((1, 4)), np.ones(2))], "a layer of"),

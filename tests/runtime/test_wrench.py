@@ -1,6 +1,5 @@
 """Force and torque of a traction, against closed forms, and in sinks."""
 
-import json
 import math
 
 import numpy as np
@@ -10,16 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
-from edge.api import find_model, load_model
+from edge.api import USPA44, find_model, load_model
 from edge.inference.forward_model import features
 from edge.perception.wrench import LEAST_FORCE_N, Balance, wrench_of
-from edge.sinks.jsonl import record_line
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
 from edge.sinks.ros2.map_messages import image_map
 from edge.sinks.ros2.ros_types import WRENCH_STAMPED
-from firmware_bridge.pad_geometry import USPA44
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS
@@ -114,19 +111,6 @@ def test_where_nothing_presses_the_traction_stays(press):
     balance, pattern, traction, readings, row, _ = press
     assert balance(traction, pattern, -readings, 0, row) is traction
     assert balance(traction * np.float32(0.001), pattern, readings, 0, row).max() == traction.max() * np.float32(0.001)
-
-
-def test_a_record_has_the_traction_summed_up():
-    told = json.loads(record_line(make_wrench_result(), {}))
-    assert told["wrench"] == {
-        "force_n": [0, 0, round(FORCE_N, 4)],
-        "torque_n_mm": [round(-2.35 * FORCE_N, 3), round(2.35 * FORCE_N, 3), 0],
-        "centre_of_pressure_mm": [-2.35, -2.35],
-    }
-    assert told["wrench_origin"] == "nominal" and np.shape(told["traction"]) == (3, 8, 8)
-    assert np.max(told["traction"]) == 20
-    idle = json.loads(record_line(make_wrench_result(press_counts=0), {}))
-    assert idle["state"] == "idle" and idle["wrench"] is idle["wrench_origin"] is idle["traction"] is None
 
 
 def test_a_recording_holds_it_as_messages_and_as_arrays(tmp_path):

@@ -9,15 +9,12 @@ from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, make_contract, mak
 from mcap_samples import arrays_of
 from runtime_samples import make_runtime
 
+from edge.api import BaselineRefusedError, DeviceError, LinkLostError, Scan, Source, take_baselines
 from edge.perception.zeroing import GIVE_UP_NS
-from edge.pipeline.baseline_capture import take_baselines
-from edge.pipeline.scan_reader import Source
 from edge.sinks.json_encoding import record
 from edge.sinks.mcap import McapSink
 from edge.sinks.status_line import StatusSink
-from firmware_bridge.errors import BaselineRefusedError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Notice
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import deformation
 
 DAY_S = 86_400.0
@@ -64,10 +61,7 @@ class Lost(FakeLink):
 class TestCapture:
     def test_every_sensor_that_is_read_gets_its_baseline(self):
         baselines = take(FakeLink(rest_scans(150, "4", "6"), endless=True))
-        assert [(name, one.sensor, one.scans) for name, one in sorted(baselines.items())] == [
-            ("4", "4", 100),
-            ("6", "6", 100),
-        ]
+        assert {name: (one.sensor, one.scans) for name, one in baselines.items()} == {"4": ("4", 100), "6": ("6", 100)}
         assert np.abs(baselines["6"].counts - REST).max() <= 2
 
     def test_the_first_scans_can_be_left_out(self):
@@ -294,11 +288,3 @@ class TestDrift:
         assert results[-1].force_counts == pytest.approx(16 * 40, abs=100)
         bench.runtime.lose_touch()
         assert len(events(bench.play(400))) == 1  # back where it was
-
-    def test_nothing_of_it_changes_in_contact(self):
-        bench = Bench()
-        bench.play(300)
-        grip = np.linspace(50, 400, 16).reshape(4, 4)
-        held = bench.play(1000, lambda n: grip * (1 + n / 10_000))
-        assert len({id(result.baseline) for result in held[1:]}) == 1
-        assert held[-1].force_counts == pytest.approx(grip.sum() * 1.1, abs=100)

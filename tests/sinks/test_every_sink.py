@@ -14,17 +14,11 @@ from mcap_samples import messages_of
 from sink_readers import CONTRACT, EVENTS, KINDS, PERIOD_NS, Jsonl, Mcap, Ros2, every_kind, told
 from sink_samples import RUN, make_results, make_sure_results
 
-from edge.errors import SinkClosedError, SinkError, UsageError
-from edge.perception.event import Event
-from edge.pipeline.sink import Sink
-from edge.sinks.fan_out import Fan
+from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
 from edge.sinks.json_encoding import COUNTED_NS
 from edge.sinks.jsonl import JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
 from edge.sinks.ros2.cdr_messages import RESULT
-from firmware_bridge.errors import LinkLostError
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__.lower())

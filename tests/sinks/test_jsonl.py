@@ -1,24 +1,25 @@
-"""JSON Lines: one record per scan, and what becomes of them on pipes and full disks."""
+"""JSON Lines: one record per scan, and what becomes of them on pipes and full disks; and binary messages."""
 
 import fcntl
 import json
 import os
+import struct
 import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import RUN, make_results, make_sure_results
 
-from edge.perception.event import Event
-from edge.perception.runtime import Runtime
+from edge.api import Event, MessageError, Runtime
 from edge.pipeline.sink import RunFacts
+from edge.sinks.binary_message import pack, unpack
 from edge.sinks.json_encoding import ALWAYS
 from edge.sinks.jsonl import JsonLinesSink, has_room, record_line
-from firmware_bridge.scans.scan import ABSENT, VendorReading
+from firmware_bridge.scans.scan import VendorReading
 
 
 class TestJsonLines:
@@ -55,65 +56,6 @@ class TestJsonLines:
         assert whole.pattern is not None and {"source", "state", "trusted", "note", "pattern_unit"} < record.keys()
         assert record.keys() == {*ALWAYS, "counters", *more}
         assert record == {name: expected[name] for name in record}
-
-    def test_a_record_says_all_of_a_contact(self):
-        ticks = iter([0, 123_456])
-        runtime = Runtime(
-            FakeModel(),
-            source="emulated",
-            baselines={"4": BASELINE},
-            counts_per_newton=1200,
-            clock_ns=lambda: next(ticks),
-            unix_time_s=lambda: 1012.34,
-        )
-        result = runtime.push(make_scan(7, press_counts=3000, stale=(0, 15)))
-        record = json.loads(record_line(result, RUN))
-        pattern = record.pop("pattern")
-        assert np.shape(pattern) == (40, 40)
-        np.testing.assert_allclose(pattern, result.pattern, rtol=1e-5)
-        assert record.pop("counts") == result.scan.counts.tolist()
-        assert record.pop("centroid_mm") == pytest.approx([-2.35, -2.35])
-        assert record.pop("deviation") is record.pop("traction") is None
-        assert record.pop("wrench") is record.pop("wrench_origin") is record.pop("shear_ratio") is None
-        unknown = (
-            "device_time_ns interval_mm expected_rmse_mm another_tap next_tap trusted untrusted_reason "
-            "taps_dropped mismatch tap_mismatch pose poses reused_from latency_us filled gains_certainty event"
-        )
-        assert record == dict.fromkeys(unknown.split()) | {
-            "time_ns": 8 * PERIOD_NS,
-            "sensor": "4",
-            "scan": 7,
-            "source": "emulated",
-            "state": "contact",
-            "fresh": 0xFFFF,
-            "renewed": 0x7FFE,
-            "contact": True,
-            "taps_used": 1,
-            "force_counts": 3000.0,
-            "force_n": 2.5,
-            "area_mm2": 22.09,
-            "run_time_us": 123.5,
-            "baseline": BASELINE.id,
-            "baseline_origin": "file",
-            "baseline_age_s": 12.3,
-            "drift_counts": {"common": [0.0, 0.0, 0.0], "own": 0.0, "step": 0.0},
-            "model": "fake",
-            "dead": {},
-            "note": "not checked: the model has no checks",
-            "counters": RUN,
-            "pattern_unit": "mm",
-        }
-
-    def test_absent_is_null(self):
-        record = json.loads(record_line(Runtime(FakeModel(), source="device").push(make_scan(absent=(2,))), {}))
-        absent = (
-            "contact force_counts force_n area_mm2 centroid_mm interval_mm run_time_us pattern deviation baseline "
-            "baseline_age_s baseline_origin drift_counts"
-        )
-        assert {record[name] for name in absent.split()} == {None}
-        assert record["state"] == "zeroing" and record["fresh"] == 0xFFFF - 4
-        assert [axis[0][2] for axis in record["counts"]] == [None] * 3
-        assert ABSENT not in np.array(record["counts"]).ravel().tolist()
 
     def test_what_the_vendor_says_is_told_where_it_does(self):
         runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
@@ -197,3 +139,54 @@ def _read(descriptor):
         return os.read(descriptor, 1 << 20)
     except BlockingIOError:
         return b""
+
+
+NAMES = st.text(max_size=8)
+SHAPES = st.lists(st.integers(0, 4), max_size=3).map(tuple)
+HEADERS = st.dictionaries(NAMES.filter(lambda name: name != "maps"), st.none() | st.integers(-(2**53), 2**53) | NAMES)
+
+
+@given(HEADERS, st.dictionaries(NAMES, SHAPES, max_size=4))
+def test_what_was_packed_is_unpacked(header, shapes):
+    rng = np.random.default_rng(1)
+    maps = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    message = pack(header, maps)
+    got_header, got_maps = unpack(message)
+    assert got_header == {**header, "maps": [[name, list(shape)] for name, shape in shapes.items()]}
+    assert got_maps.keys() == maps.keys()
+    for name, values in maps.items():
+        assert np.array_equal(got_maps[name], values) and got_maps[name].shape == values.shape
+
+
+def test_the_layout_is_as_documented():
+    message = pack({"a": 1}, {"z": np.array([[1, 2.5]]), "y": np.array([3])})
+    (length,) = struct.unpack("<I", message[:4])
+    assert (4 + length) % 4 == 0
+    assert json.loads(message[4 : 4 + length]) == {"a": 1, "maps": [["z", [1, 2]], ["y", [1]]]}
+    assert message[4 + length :] == struct.pack("<3f", 1, 2.5, 3)
+
+
+GOOD = pack({"kind": "result"}, {"pattern": np.ones((2, 2))})
+
+
+@pytest.mark.parametrize("end", range(len(GOOD)))
+def test_a_message_cut_short_is_refused(end):
+    with pytest.raises(MessageError):
+        unpack(GOOD[:end])
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"",
+        GOOD + b"0000",
+        struct.pack("<I", 2) + b"[]",
+        struct.pack("<I", 12) + b'{"maps": 1} ',
+        struct.pack("<I", 24) + b'{"maps": [["a", [-1]]]} ',
+        struct.pack("<I", 32) + b'{"maps": [["a", [99999999999]]]}',
+        struct.pack("<I", 0xFFFFFFFF) + b"{}",
+    ],
+)
+def test_what_is_no_message_is_refused(bad):
+    with pytest.raises(MessageError):
+        unpack(bad)

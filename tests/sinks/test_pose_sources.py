@@ -14,8 +14,7 @@ from bridge_samples import make_recording
 from cli_samples import base_options, files, records, start
 from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
-from edge.errors import UsageError
-from edge.perception.runtime import Runtime
+from edge.api import Runtime, UsageError
 from edge.pipeline.pose_intake import PoseIntake
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses
@@ -89,13 +88,8 @@ with zenoh.open(config) as session:
         from zenoh_samples import ENVIRONMENT, free_endpoint
 
         endpoint = free_endpoint()
-        with subprocess.Popen(
-            [sys.executable, "-c", self.PUBLISH, endpoint],
-            env=ENVIRONMENT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        ) as process:
+        how = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+        with subprocess.Popen([sys.executable, "-c", self.PUBLISH, endpoint], **how) as process:
             assert process.stdin is not None and process.stdout is not None
             assert process.stdout.readline() == "ready\n"
 
@@ -190,11 +184,8 @@ class TestRos2:
 
     def transform(self, parent, child, x_m, y_m, rotation):
         place = {"x": x_m, "y": y_m, "z": 0.0}
-        return {
-            "header": self.header(parent),
-            "child_frame_id": child,
-            "transform": {"translation": place, "rotation": rotation},
-        }
+        moved = {"translation": place, "rotation": rotation}
+        return {"header": self.header(parent), "child_frame_id": child, "transform": moved}
 
     def test_a_pose_with_its_stamp_comes_to_the_runtime(self, opened, publish):
         queue = opened("4=ros2:/arm/pose")

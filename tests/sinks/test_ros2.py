@@ -14,8 +14,7 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import make_contract, make_wrench_result
 
-from edge.perception.event import Event
-from edge.pipeline.commands import Command, Commands
+from edge.api import Command, Commands, Event
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
@@ -206,9 +205,7 @@ def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     assert told(replace(result, scan=scan, force_n=1.9)) == ([], 1.9), "x and y of another calibration than z"
     wrenches, force_z_n = told(result)
     assert not wrenches and math.isnan(force_z_n), "counts in place of newtons"
-    said = {
-        force: diagnose(replace(result, force_n=force), {}, {}, 0.0, None).values["wrench"] for force in (None, 1.9)
-    }
+    said = {z: diagnose(replace(result, force_n=z), {}, {}, 0.0, None).values["wrench"] for z in (None, 1.9)}
     assert "counts only" in said[None] and "on force_z_n" in said[1.9]
     assert ros_messages.force_and_torque(replace(result, scan=scan, force_n=2.0), pad_of(3, 3)) is None, "no places"
 

@@ -17,17 +17,8 @@ from edge_samples import ROOT, make_pad_contract, make_wrench_result
 from shm_samples import fields, latest, make_result, name, sink, values
 
 from edge.errors import SinkError
-from edge.sinks.shm import (
-    HEADER,
-    HEARTBEAT_AT,
-    IN_MEMORY,
-    MEMBERS,
-    SLOTS,
-    Layout,
-    SharedMemorySink,
-    offsets_of,
-    struct_of,
-)
+from edge.sinks import shm
+from edge.sinks.shm import HEADER, IN_MEMORY, MEMBERS, SLOTS, Layout, SharedMemorySink, offsets_of
 
 sys.path.append(str(ROOT / "examples"))
 from shm_read import attach
@@ -68,27 +59,16 @@ class TestWhatIsThere:
             np.testing.assert_array_equal(values(half, map_name), getattr(result, map_name))
         np.testing.assert_array_equal(values(half, "counts"), result.scan.counts)
 
-    def test_nothing_is_left_of_a_pattern_that_is_over(self, sink, name):
+    def test_what_is_over_or_was_not_read_is_not_there(self, sink, name):
         sink.write(make_result(0, press_counts=3000), {})
-        sink.write(make_result(1), {})
-        half = latest(attach(name), "4")
-        assert half is not None
-        said = fields(half)
-        assert (said["scan"], said["state"], said["contact"], said["has_pattern"]) == (1, 3, 0, 0)
-        assert np.isnan(values(half, "pattern")).all() and np.isnan(values(half, "deviation")).all()
-
-    def test_a_sensor_without_a_baseline_has_no_zeroed_counts(self, sink, name):
+        sink.write(replace(make_result(1), dead={0: "stuck", 15: "silent"}, filled="neighbours"), {})
         sink.write(make_result(0, sensor="6", absent=(3,)), {})
-        half = latest(attach(name), "6")
-        assert half is not None
-        assert (fields(half)["state"], fields(half)["contact"]) == (1, -1)
-        assert np.isnan(values(half, "zeroed")).all()
-        assert values(half, "counts")[:, 0, 3].tolist() == [-1, -1, -1]
-
-    def test_dead_taxels_are_told(self, sink, name):
-        sink.write(replace(make_result(), dead={0: "stuck", 15: "silent"}, filled="neighbours"), {})
-        half = latest(attach(name), "4")
-        assert half is not None and (fields(half)["dead"], fields(half)["filled"]) == (0x8001, 2)
+        over, zeroing = (latest(attach(name), sensor) or b"" for sensor in "46")
+        said = [fields(over)[key] for key in ("scan", "state", "contact", "has_pattern", "dead", "filled")]
+        assert said == [1, 3, 0, 0, 0x8001, 2]
+        assert np.isnan(values(over, "pattern")).all() and np.isnan(values(over, "deviation")).all()
+        assert (fields(zeroing)["state"], fields(zeroing)["contact"]) == (1, -1)
+        assert np.isnan(values(zeroing, "zeroed")).all() and values(zeroing, "counts")[:, 0, 3].tolist() == [-1] * 3
 
     def test_memory_that_nobody_wrote_is_no_sensor(self, sink, name):
         assert latest(attach(name), "") is None and latest(attach(name), "4") is None
@@ -108,6 +88,9 @@ class TestWhatIsThere:
             sink.write(make_result(sensor="one-more"), {})
 
 
+REASONS = ("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline")
+
+
 class TestLayout:
     def test_what_readers_of_version_1_know_lies_where_it_did(self):
         offsets, known = offsets_of(MEMBERS), [tuple(one.split(":")) for one in VERSION_1.split()]
@@ -119,18 +102,14 @@ class TestLayout:
             "state": ("zeroing", "incomplete", "idle", "contact", "dropped", "baseline_in_doubt"),
             "filled": ("rest", "neighbours"),
             "wrench_origin": ("nominal", "calibrated"),
-            "untrusted_reason": (
-                *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
-            ),
+            "untrusted_reason": REASONS,
         }
 
     def test_the_header_tells_where_maps_lie(self, sink, name):
         memory = attach(name)
         layout, offsets = Layout(4, 4, 40, 40), offsets_of(HEADER)
-        told = dict(zip((field for field, _ in HEADER), struct_of(HEADER).unpack_from(memory), strict=True))
-        assert {map_name: told[f"{map_name}_at"] for map_name in layout.maps} == {
-            map_name: at for map_name, (_, _, at) in layout.maps.items()
-        }
+        told = dict(zip((field for field, _ in HEADER), shm.struct_of(HEADER).unpack_from(memory), strict=True))
+        assert {one: told[f"{one}_at"] for one in layout.maps} == {one: at for one, (_, _, at) in layout.maps.items()}
         assert (told["writer_pid"], told["pattern_unit"].rstrip(b"\0")) == (os.getpid(), b"mm")
         assert len(memory) == layout.total_bytes and offsets["writer_pid"] == 64
 
@@ -143,7 +122,7 @@ class TestLayout:
             for table in (HEADER, MEMBERS)
             for field, kind in table
         ]
-        heartbeat = (str(HEARTBEAT_AT), "heartbeat_ns", "i64")
+        heartbeat = (str(shm.HEARTBEAT_AT), "heartbeat_ns", "i64")
         assert documented == [*tables[: len(HEADER)], heartbeat, *tables[len(HEADER) :]]
 
     def test_a_wrench_and_its_traction_are_there_while_they_hold(self, name):

@@ -14,22 +14,11 @@ from struct import unpack_from
 
 import numpy as np
 import pytest
+import shm_samples
 from edge_samples import ROOT, ended
-from shm_samples import (
-    CONTRACT,
-    ENVIRONMENT,
-    fields,
-    heartbeat_ns,
-    latest,
-    make_result,
-    name,
-    sink,
-    start_writer,
-    writing,
-)
+from shm_samples import CONTRACT, fields, heartbeat_ns, latest, make_result, name, sink, start_writer, writing
 
-from edge.errors import SinkError
-from edge.perception.event import Event
+from edge.api import Event, SinkError
 from edge.sinks.shm import Layout, SharedMemorySink
 
 sys.path.append(str(ROOT / "examples"))
@@ -145,11 +134,9 @@ class TestReading:
         start_writer()
         command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, *words]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, text=True, **pipes)) as reader:
+        with ended(subprocess.Popen(command, env=shm_samples.ENVIRONMENT, text=True, **pipes)) as reader:
             while not re.fullmatch(line, told := reader.stdout.readline().rstrip()):
-                assert told.startswith("nothing to act on: the newest reading is"), (
-                    "of the writer, which had no turn for 50 ms"
-                )
+                assert told.startswith("nothing to act on: the newest reading is")  # its writer had no turn for 50 ms
             Path("/dev/shm", name).unlink()
             _, errors = reader.communicate()
         assert reader.returncode == 1
@@ -181,11 +168,8 @@ class TestWriters:
         now_ns = time.monotonic_ns()
         sink = SharedMemorySink(name, CONTRACT, clock_ns=lambda: now_ns)
         memory = attach(name)
-        for act in (
-            sink.wait,
-            lambda: sink.tell(Event(0, "lost", None, "gone"), {}),
-            lambda: sink.write(make_result(), {}),
-        ):
+        gone = Event(0, "lost", None, "gone")
+        for act in (sink.wait, lambda: sink.tell(gone, {}), lambda: sink.write(make_result(), {})):
             now_ns -= 1_000_000
             act()
             assert heartbeat_ns(memory) == now_ns
@@ -213,9 +197,7 @@ class TestWriters:
 
     def test_two_cannot_write_one(self, name, start_writer):
         writer = start_writer()
-        with pytest.raises(
-            SinkError, match=rf"{name} is written by process {writer.pid}: end it, or choose another name"
-        ):
+        with pytest.raises(SinkError, match=rf"{name} is written by process {writer.pid}: end it"):
             SharedMemorySink(name, CONTRACT)
         assert writing(attach(name), within_s=5)
         assert not list(Path("/dev/shm").glob(f".{name}*"))

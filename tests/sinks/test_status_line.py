@@ -10,9 +10,7 @@ import pytest
 from edge_samples import BASELINE, FakeModel, make_scan
 from sink_samples import RUN, Terminal, make_results
 
-from edge.perception.event import Event, Note
-from edge.perception.result import NextTap
-from edge.perception.runtime import Runtime
+from edge.api import Event, NextTap, Note, Runtime
 from edge.sinks.status_line import MessageSink, StatusSink
 
 
@@ -26,12 +24,13 @@ def test_events_are_lines_and_what_others_wrote_does_nothing_to_the_terminal(str
     assert stream.getvalue() == "".join(f"{start}edge-sr: {line}\n" for line in lines)
 
 
-def test_a_terminal_that_knows_no_escape_sequences_gets_none(monkeypatch):
-    monkeypatch.setenv("TERM", "dumb")
-    stream = Terminal()
+@pytest.mark.parametrize(("stream", "term"), [(Terminal(), "dumb"), (io.StringIO(), "xterm")])
+def test_what_knows_no_escape_sequences_gets_none(monkeypatch, stream, term):
+    monkeypatch.setenv("TERM", term)
     status, messages = StatusSink(stream), MessageSink(stream)
     status.write(make_results(1)[0], RUN)
     messages.tell(Event(0, "trouble", None, "the cable is out"), {})
+    status.wait()
     status.close()
     assert stream.getvalue() == "edge-sr: the cable is out\n"
 
@@ -184,11 +183,3 @@ class TestStatus:
         sink.close()
         with contextlib.suppress(OSError):  # it still has what nobody took
             stream.close()
-
-    def test_nothing_where_there_is_no_terminal(self):
-        stream = io.StringIO()
-        sink = StatusSink(stream)
-        sink.write(make_results(1)[0], {})
-        sink.wait()
-        sink.close()
-        assert stream.getvalue() == ""

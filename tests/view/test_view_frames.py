@@ -12,7 +12,7 @@ from view_samples import CONTRACT, Press
 from edge.perception.event import Event, Note
 from edge.sinks.binary_message import unpack
 from edge.sinks.json_encoding import event_record, record
-from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.frames import Frames, Run, hello, state
 from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
 from edge.view.viewers import Viewer
 from firmware_bridge.links.replay_player import PlayerState
@@ -63,38 +63,8 @@ def test_a_result_frame_is_the_record_and_its_maps(heard, clock):
     np.testing.assert_array_equal(maps["deviation"], result.deviation)
     np.testing.assert_array_equal(maps["zeroed"], result.zeroed)
     np.testing.assert_array_equal(maps["taps"], result.window[: result.taps_used, 2])
-    assert header["trace"] == [
-        [0.0, round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4), None]
-    ]
-
-
-def test_hello_says_what_does_not_change():
-    header, maps = unpack(hello(Run("demo", "emulated", "mtsr4", CONTRACT, "c0ffee"), None))
-    model = {"model": "mtsr4", "taps": 4, "pattern_unit": "mm", "full_scale": 2.0, "wrench": False, "checks": False}
-    grid = {
-        "rows": 4,
-        "cols": 4,
-        "taxel_pitch_mm": 4.7,
-        "height": 40,
-        "width": 40,
-        "pixel_pitch_mm": pytest.approx(0.47),
-    }
-    run = {"kind": "hello", "version": 1, "run": "c0ffee", "name": "demo", "source": "emulated", "recording": None}
-    contact = {"contact_level": CONTRACT.contact_level, "max_fps": MAX_FPS, "maps": []}
-    assert maps == {} and header == run | model | grid | contact
-
-
-def test_a_viewer_gets_only_what_is_new_and_every_scan_once_in_the_trace(heard, clock):
-    press, viewer, traced = Press(), Viewer(), []
-    for scans in (1, 4, 0, 7, 200):
-        for result in press.take(scans):
-            heard.write(result, {})
-        got = look(viewer, heard, clock)
-        assert len(got) == (scans > 0)
-        for header, _ in got:
-            assert header["scan"] == press.number - 1
-            traced += numbers(header)
-    assert traced == list(range(212)) and header["rate_hz"] == 100.0
+    drawn = [round(result.force_counts, 1), round(result.area_mm2, 2), round(result.force_n, 4)]
+    assert header["trace"] == [[0.0, *drawn, None]]
 
 
 def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
@@ -105,6 +75,7 @@ def test_what_is_heard_while_a_frame_is_made_is_left_to_the_next(heard, clock):
     [(first, _)] = unpacked(viewer.due(frames))
     [(second, _)] = look(viewer, heard, clock)
     assert (first["scan"], numbers(first)) == (0, [0]) and (second["scan"], numbers(second)) == (1, [1])
+    assert look(viewer, heard, clock) == [], "nothing is sent twice"
 
 
 @pytest.mark.parametrize("rate_hz", [8, 100, 1000])
@@ -144,9 +115,8 @@ AGAIN = Event(0, "zeroed", "4", "again")
 def test_memory_does_not_grow_with_the_run(heard):
     idle = Press().next(0)
     for number in range(20_000):
-        heard.write(
-            replace(idle, scan=replace(idle.scan, number=number, time_ns=number * PERIOD_NS), events=(AGAIN,)), {}
-        )
+        scan = replace(idle.scan, number=number, time_ns=number * PERIOD_NS)
+        heard.write(replace(idle, scan=scan, events=(AGAIN,)), {})
     assert len(heard.points("4", 0)) <= TRACE_POINTS and len(heard.events(0)) == EVENTS
 
 
@@ -157,11 +127,9 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
     clock.now_ns += 2 * 10**9
     got = look(viewer, heard, clock)
     assert [header["note"] for header, _ in got] == [f"gone {number}" for number in range(5, EVENTS + 5)]
-    last, said = (
-        got[-1][0],
-        event_record(Event(EVENTS + 4, "lost", None, f"gone {EVENTS + 4}"), {"outages": EVENTS + 4}, "emulated"),
-    )
-    assert last == said | {"kind": "event", "number": EVENTS + 5, "age_s": 2.0, "maps": []}
+    last = Event(EVENTS + 4, "lost", None, f"gone {EVENTS + 4}")
+    said = event_record(last, {"outages": EVENTS + 4}, "emulated")
+    assert got[-1][0] == said | {"kind": "event", "number": EVENTS + 5, "age_s": 2.0, "maps": []}
     assert look(viewer, heard, clock) == []
     heard.tell(Event(1, "back", None, "again"), {})
     assert [header["note"] for header, _ in look(viewer, heard, clock)] == ["again"]
@@ -173,40 +141,15 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     heard.write(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
     heard.write(press.next(), {})
     event, result = look(viewer, heard, clock)
-    assert (event[0]["event"], event[0]["sensor"], event[0]["note"]) == (
-        *("zeroed", "4", "sensor 4 zeroed on demand: baseline b"),
-    )
+    said = [event[0][key] for key in ("event", "sensor", "note")]
+    assert said == ["zeroed", "4", "sensor 4 zeroed on demand: baseline b"]
     assert result[0]["scan"] == 2
 
 
-def test_a_paused_viewer_gets_events_alone_and_then_the_newest_with_all_of_the_trace(heard, clock):
-    press, viewer = Press(), Viewer()
-    heard.write(press.next(), {})
-    look(viewer, heard, clock)
-    viewer.paused = True
-    for result in press.take(9):
-        heard.write(result, {})
-    heard.tell(Event(1, "lost", None, "gone"), {})
-    assert [header["kind"] for header, _ in look(viewer, heard, clock)] == ["event"]
-    viewer.paused = False
-    [(header, _)] = look(viewer, heard, clock)
-    assert header["scan"] == 9 and numbers(header) == list(range(1, 10))
-
-
-def test_state_tells_the_silence_of_a_sensor(heard, clock):
-    heard.write(Press("4").next(), {})
-    clock.now_ns += 700_000_000
-    heard.write(Press("6").next(), {})
-    assert Frames(heard, clock(), "emulated").silent() == {"4": 0.7}
-    clock.now_ns += 500_000_000
-    assert Frames(heard, clock(), "emulated").silent() == {"4": 1.2}
-    header, _ = unpack(state(Path("edge.mcap"), 3, {"4": 1.2}))
-    facts = {"kind": "state", "recording": "edge.mcap", "viewers": 3, "silent": {"4": 1.2}, "maps": []}
-    assert header == facts | {"replay": None, "recorded_s": None, "recorded_bytes": None}
-    recorded = unpack(state(Path("edge.mcap"), 1, {}, None, (2.5, 70_000)))[0]
-    assert (recorded["recorded_s"], recorded["recorded_bytes"]) == (2.5, 70_000)
+def test_state_tells_of_what_is_recorded_and_played():
     played = PlayerState(1.5, 6.7, 0.5, paused=True, waiting=False, rounds=2)
-    assert unpack(state(None, 1, {}, played))[0]["replay"] == played._asdict()
+    header = unpack(state(Path("edge.mcap"), 3, {}, played, (2.5, 70_000)))[0]
+    assert (header["recorded_s"], header["recorded_bytes"], header["replay"]) == (2.5, 70_000, played._asdict())
 
 
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
@@ -216,33 +159,6 @@ def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     assert unpack(state(path, 1, {}))[0]["recording"] == r"\xff.mcap"
     heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
     assert look(Viewer(), heard, clock)[0][0]["note"] == r"recording into \xff.mcap stopped"
-
-
-def test_what_is_refused_is_an_event():
-    header, _ = unpack(refused(7, "no command", "emulated"))
-    assert (header["kind"], header["event"], header["note"], header["time_ns"]) == ("event", "refused", "no command", 7)
-    assert "number" not in header and header["sensor"] is None
-
-
-def test_what_a_runtime_refuses_has_a_kind_that_tells_whether_it_may_be_forced(heard, clock):
-    four, viewer = Press("4"), Viewer()
-
-    def told(press_counts=3000):
-        heard.write(four.next(press_counts), {})
-        return [(header["event"], header["sensor"]) for header, _ in look(viewer, heard, clock)[:-1]]
-
-    four.runtime.zero()
-    assert told() == [("refused", None)]  # no sensor has sent yet
-    four.runtime.zero("4")
-    assert told() == [("in_contact", "4")]
-    four.runtime.zero("6")
-    assert told() == [("refused", None)]
-    four.runtime.zero("4", force=True)
-    assert told() == []
-    four.runtime.lose_touch()
-    assert told() == [("given_up", "4")]
-    four.runtime.reset()
-    assert told() == [("reset", None)]  # of all sensors, though this one's result carries it
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The live page of the demo and of a recording, and the pictures that are taken of it."""
+"""The live page of the demo, of a recording and of a hand, and the pictures that are taken of it."""
 
 import contextlib
 import csv
@@ -18,10 +18,14 @@ from browser_samples import (
     SIZES,
     TOKEN,
     browser,
+    colours_of,
     demo,
     edge_sr,
+    emulated,
     fits,
+    folder,
     likeness,
+    live,
     logged,
     moves,
     noise,
@@ -31,7 +35,9 @@ from browser_samples import (
     part,
     playwright,
     pressed,
+    resize,
     shares,
+    then_held,
     word,
 )
 from edge_samples import ROOT, wait_for
@@ -40,7 +46,7 @@ from websockets.sync.client import connect
 from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
 
-__all__ = ["browser", "demo", "open_page"]
+__all__ = ["browser", "demo", "folder", "open_page"]
 
 # The force, and the pattern where it is deep, as they are painted at one time.
 LOOK = f"""() => {{
@@ -274,3 +280,55 @@ def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, monkeyp
     taken = (tmp_path / "live-phone.png").read_bytes()
     assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
     assert capsys.readouterr().out.startswith(f"{tmp_path}/live-phone.png: ")
+
+
+HAND = ("4", "6", "8", "10")
+INSIDE = """() => [...document.querySelectorAll(".pad")].map(one => one.getBoundingClientRect())
+  .every(({left, top, right, bottom, width}) =>
+    width >= 72 && left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight)"""
+
+
+def test_four_pads_of_a_hand_are_opened_one_at_a_time(demo, folder, open_page):
+    rest = demo["counts"][:1] + noise(200, seed=2)
+    quiet = np.concatenate([rest[:150], np.full_like(rest[:1], -1).repeat(400, axis=0)])
+    broken = rest.copy()
+    broken[:, :, 1, 2] = 65_535
+    with emulated(folder, then_held(demo, pressed(demo)[0]), broken, rest, quiet) as run:
+        page = open_page(run.url)
+
+        def pad(sensor):
+            return page.locator(f'[data-pad="{sensor}"]')
+
+        def opened():
+            return page.eval_on_selector_all(".sensor:not([hidden])", "all => all.map(one => one.dataset.sensor)")
+
+        def reads(sensor, yes):
+            playwright.expect(pad(sensor).locator(".link")).to_have_attribute("data-up", yes)
+
+        playwright.expect(pad("4")).to_have_attribute("data-state", "contact")
+        playwright.expect(page.locator("#hand .pad")).to_have_count(4)
+        assert page.eval_on_selector_all("#hand .pad", "all => all.map(one => one.dataset.pad)") == list(HAND)
+        assert opened() == []
+        for width, height in (PHONE, *SIZES):
+            resize(page, width, height)
+            page.wait_for_function(INSIDE)
+        colours = colours_of(pad("4").locator("canvas").evaluate(RGBA)).reshape(-1, 4)
+        assert len(np.unique(colours, axis=0)) > 20, "a pattern"
+        pad("4").click()
+        live(page)
+        playwright.expect(part(page, "dead", "4")).to_be_hidden()
+        assert opened() == ["4"]
+        page.keyboard.press("]")
+        assert opened() == ["6"] and pad("6").get_attribute("aria-pressed") == "true"
+        playwright.expect(part(page, "dead", "6").filter(has_text="taxel 6 saturated")).to_be_visible()
+        page.keyboard.press("[")
+        page.keyboard.press("[")
+        assert opened() == ["10"]
+        playwright.expect(pad("10")).to_have_attribute("data-state", "silent")
+        reads("10", "no")
+        reads("8", "yes")
+        page.keyboard.press("Escape")
+        assert opened() == []
+        run.emulator.hang_up()
+        for sensor in HAND:
+            reads(sensor, "no")

@@ -7,31 +7,16 @@ import threading
 from dataclasses import replace
 from io import BytesIO
 
+import browser_samples
 import numpy as np
 import pytest
-from browser_samples import (
-    RGBA,
-    TOKEN,
-    browser,
-    colours_of,
-    live,
-    logged,
-    number,
-    open_page,
-    painted,
-    part,
-    playwright,
-    resize,
-    word,
-)
+from browser_samples import RGBA, browser, colours_of, live, logged, number, open_page, painted, part, playwright, word
 from edge_samples import make_pad_contract, wait_for
 from map_samples import letter
 from matplotlib.image import imread
 from view_samples import CONTRACT, Mapped, Press, live_page, tell
 
-from edge.perception.event import Note
-from edge.perception.result import NextTap
-from edge.perception.wrench import Wrench
+from edge.api import NextTap, Note, Wrench
 
 __all__ = ["browser", "open_page"]
 
@@ -143,13 +128,11 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page, tmp_pat
 
         shows[0] = unbelieved
         word(page, "contact, not believed")
-        verdict.to_have_text(
-            "not to be believed: readings like no contact (a magnet or steel near? the id map? the axes?)"
-        )
+        verdict.to_contain_text("not to be believed: readings like no contact (a magnet or steel near? the id map?")
         playwright.expect(page.locator("#live")).to_have_text("sensor 4: contact, not believed")
         trusted.to_have_text("no: unfamiliar")
         for size in ((844, 390), (1280, 800)):
-            resize(page, *size)
+            browser_samples.resize(page, *size)
             verdict.to_be_in_viewport()
             wait_for(lambda: red_share(page) > 0.25)
         page.keyboard.press("Space")
@@ -228,7 +211,7 @@ def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page, tmp_
             tell(shown, "tap_dropped", "4", detail)
             logged(page, detail)
         painted(page)
-        resize(page, 844, 800)
+        browser_samples.resize(page, 844, 800)
         assert outline(page) == around, "a canvas of another size is painted, though paused"
         assert np.array_equal(shown_on(page), before), "what is looked at stays"
         page.keyboard.press("Space")
@@ -289,7 +272,7 @@ def proxy(port, *, below="/edge/", host=None, sockets=True, status="404 Not Foun
         ("/edge/", None, None),
         ("/", "127.0.0.1:{port}", None),
         ("/a/b/", "localhost", None),
-        ("/edge/", "edge_up", TOKEN),
+        ("/edge/", "edge_up", browser_samples.TOKEN),
     ],
 )
 def test_through_a_proxy_the_page_finds_its_socket(tmp_path, open_page, below, host, token):
@@ -307,7 +290,7 @@ def test_through_a_proxy_the_page_finds_its_socket(tmp_path, open_page, below, h
 @pytest.mark.parametrize(
     ("settings", "token", "words"),
     [
-        ({}, TOKEN, "the token is missing or wrong"),
+        ({}, browser_samples.TOKEN, "the token is missing or wrong"),
         ({"sockets": False}, None, "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
         ({"sockets": None}, None, "answers 404 for /edge/ws, and not edge-sr"),
         ({"sockets": None, "status": "502 Bad Gateway"}, None, "answers 502 for /edge/ws, and not edge-sr"),

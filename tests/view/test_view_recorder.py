@@ -1,22 +1,21 @@
-"""Recordings that a viewer of the live page asks for."""
+"""Recordings that a viewer of the live page asks for, and what `edge-sr --view` does with a port and a recording."""
 
 import json
 import re
+import socket
 import threading
 import time
 
 import numpy as np
 import pytest
+from bridge_samples import make_counts, write_recording
 from edge_samples import wait_for
 from view_samples import CONTRACT, TIMEOUT_S, Press
 
-from edge.errors import SinkError
-from edge.perception.event import Event
-from edge.pipeline.commands import Command, Commands, obey
-from edge.pipeline.sink import Sink
+from edge.api import Event, Sink, SinkError
+from edge.cli.main import main
 from edge.sinks.registry import open_sink
 from edge.view.recorder import Recorder
-from edge.view.viewers import Viewer, execute
 from firmware_bridge.recording.formats import load_recording
 
 AT = time.struct_time((2026, 11, 22, 5, 6, 7, 6, 326, 0))
@@ -74,10 +73,8 @@ def test_what_comes_while_it_is_on_is_recorded(tmp_path):
     recorder.write(press.next(), {})
     recorder.close()
     assert recorder.path is None
-    assert [(event.kind, event.text) for event in told] == [
-        ("note", f"recording into {path}"),
-        ("note", f"recorded into {path}"),
-    ]
+    assert {event.kind for event in told} == {"note"}
+    assert [event.text for event in told] == [f"recording into {path}", f"recorded into {path}"]
     [track] = load_recording(path).tracks
     np.testing.assert_array_equal(track.counts, [result.scan.counts for result in results])
 
@@ -177,21 +174,20 @@ def test_one_that_cannot_be_finished_is_told(tmp_path):
     assert told[-1].kind == "sink" and told[-1].text.endswith("could not be finished: no room for the end")
 
 
-def test_commands_to_record_are_done_and_the_others_handed_on(tmp_path):
-    class Untouched:
-        def reset(self):
-            raise AssertionError
+def test_a_port_in_use_is_one_line_and_5(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["--source", "slcan:/dev/no-such-port", "--view", str(port)]) == 5
+    assert capsys.readouterr().err == (
+        f"edge-sr: no live page: cannot listen on 127.0.0.1:{port}: address in use; "
+        "name another port with --view, or 0 for any free one\n"
+    )
 
-        zero = reset
 
-    recorder, _ = make_recorder(tmp_path, lambda text: Disk())
-    commands = Commands()
-    commands.record = recorder.record
-    for message in ({"cmd": "zero"}, {"cmd": "record", "on": True}, {"cmd": "reset"}, {"cmd": "jump"}):
-        execute(json.dumps(message), Viewer(), commands)
-    assert recorder.path is None  # not before the loop asks
-    assert list(commands.poll()) == [Command("zero"), Command("reset")] and commands.refused == 1
-    wait_for(lambda: recorder.wait() or recorder.path is not None)
-    execute('{"cmd": "record", "on": false}', Viewer(), commands)
-    obey(commands, Untouched())
-    assert recorder.path is None
+def test_a_recording_is_played_as_if_live_where_somebody_is_to_look(tmp_path):
+    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=1000)
+    for number, (options, live) in enumerate((([], False), (["--paced"], True), (["--view", "0"], True))):
+        records, begun_ns = tmp_path / f"{number}.jsonl", time.monotonic_ns()
+        assert main(["replay", str(path), "--sink", f"jsonl:{records}", *options]) == 0
+        first = json.loads(records.read_text().splitlines()[0])
+        assert (first["time_ns"] >= begun_ns) == live, options

@@ -109,7 +109,7 @@ class TestFrames:
             assert len(ours) == 2 and all(one.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) for one in ours)
         scans = [header["scan"] for header, _ in seen]
         assert sum(len(header["trace"]) for header, _ in seen) == scans[-1] + 1
-        assert scans == sorted(set(scans))
+        assert scans == sorted(set(scans)) and seen[-1][0]["rate_hz"] == 100.0
         assert len(scans) <= took_s * 25 + 2
         shown = {header["scan"]: maps for header, maps in seen if "pattern" in maps}
         again = [result for result in Press().take(scans[-1] + 1) if result.scan.number in shown]
