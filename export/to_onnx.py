@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 
 from edge.errors import EdgeError
@@ -27,7 +26,7 @@ from edge.terminal.progress_bar import tracked
 from export.errors import ExportError
 from export.graphs.graph import known_width, outputs, to_model
 from export.graphs.intervals import IntervalData
-from export.graphs.parity import check_parity, extreme_windows
+from export.graphs.parity import check_parity
 from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
 from firmware_bridge.pad_geometry import pad_of
@@ -144,8 +143,7 @@ def export(
             check_parity(net, model, frozen, contract)
         return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
 
-    beyond = np.concatenate([*extreme_windows(contract).values()]) if net.takes_poses else None
-    quantise = partial(quantised, seen=calibration_batch(calibration, contract), beyond=beyond)
+    quantise = partial(quantised, seen=calibration_batch(calibration, contract))
     integers = quantise(single)
     if intervals is not None:
         found = intervals.conformed(net, integers)

@@ -51,10 +51,10 @@ from train.networks.graph_weights import network_of, origin_of
 
 _TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
-BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 0.75)}
+BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.1)}
 """Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch.
 
-Measured in int8: .10 on the test set, .17 on recordings; beyond any touch .57, a bound against nonsense alone.
+Beyond any touch int8 saturates: it may be off by as much as the float pattern, but not by more.
 """
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "one tap", "recordings")

@@ -44,14 +44,6 @@ def integer_nodes(model: onnx.ModelProto) -> list[str]:
     return [node.name for node in model.graph.node if node.name in chosen]
 
 
-def newest_values(model: onnx.ModelProto) -> set[str]:
-    """Return the names of the values that convolutions and ReLUs give for the newest taps, one a window."""
-    shapes = _shapes(model)
-    windows = _runs(shapes, next(node for node in model.graph.node if node.op_type == "Conv"))
-    layers = [node for node in model.graph.node if node.op_type in ("Conv", "Relu")]
-    return {name for node in layers if _runs(shapes, node) == windows for name in node.output}
-
-
 def _first_convolutions(model: onnx.ModelProto) -> set[str]:
     """Return the convolutions that see the inputs without another convolution in between."""
     found: set[str] = set()

@@ -10,8 +10,8 @@ from onnx import numpy_helper
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
-from export.quantisation.int8 import calibration_batch, convolutions, quantised, rounded_ranges
-from export.quantisation.integer_nodes import integer_nodes, newest_values
+from export.quantisation.int8 import calibration_batch, convolutions, quantised
+from export.quantisation.integer_nodes import integer_nodes
 from train.data.press_batches import Batch
 
 
@@ -71,17 +71,6 @@ def test_the_same_windows_give_the_same_bytes_and_the_given_graph_is_left_as_it_
     again = quantised(model, seen)
     assert again.SerializeToString(deterministic=True) == integers.SerializeToString(deterministic=True)
     assert model.SerializeToString(deterministic=True) == before
-
-
-def test_windows_beyond_any_touch_widen_the_ranges(model, windows, seen):
-    one = Batch(seen.window[:1].repeat(32, 1, 1, 1), seen.pattern[:32], pad=seen.pad[:32])
-    narrow, wide = (rounded_ranges(quantised(model, one, beyond=beyond)) for beyond in (None, windows))
-    assert narrow.keys() == wide.keys()
-    assert all(wide[name][0] <= low and wide[name][1] >= high for name, (low, high) in narrow.items())
-    factors = {name: wide[name][1] / high for name, (_, high) in narrow.items() if high}
-    own = newest_values(model) & factors.keys()
-    assert max(factors[name] for name in own) == pytest.approx(1.3, rel=0.02), "of its own layers none further"
-    assert max(factors[name] for name in factors.keys() - own) > 1.35
 
 
 def test_a_graph_without_convolutions_is_refused(seen):

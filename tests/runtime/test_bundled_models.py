@@ -90,7 +90,7 @@ def test_intervals_hold_and_no_figure_is_left_behind(name):
 @pytest.mark.parametrize("test_set", [frozen, wide])
 @pytest.mark.parametrize("taps", [1, 2, 4, 7])
 def test_several_taps_are_not_worse_than_the_default(test_set, taps):
-    """Of the paper's schedule, by the 95 % interval of the difference, frames of one tap drawn together."""
+    """Difference by its 95 % interval, frames of one tap drawn together; taps turned as the paper has them."""
     if taps <= all_taps(POSED_MODEL, test_set):
         gained_db = errors(POSED_MODEL, taps, test_set)["psnr_db"] - errors(DEFAULT_MODEL, 1, test_set)["psnr_db"]
         assert bootstrap_interval(gained_db, test_set().tap)[1] >= 0

@@ -206,7 +206,9 @@ class _Carrier:
         cells = sent.reshape(*self._taps, _CARRIED + _HEADS, self._cells).transpose(1, 2)
         weight = F.softplus(cells[:, _CARRIED:]) * self._there
         weighted = cells[:, :_CARRIED].unflatten(1, (_HEADS, -1)) * weight[:, :, None]
-        total = torch.cat([weighted.flatten(1, 2), weight], dim=1).flatten(2) @ self._weights[0].transpose(1, 2)
+        # A cell of zeros more: onnxruntime 1.31 leaves a product over no cells at all, of one tap alone, unwritten.
+        shared = F.pad(torch.cat([weighted.flatten(1, 2), weight], dim=1).flatten(2), (0, 1))
+        total = shared @ F.pad(self._weights[0], (0, 1)).transpose(1, 2)
         amount = total[:, _CARRIED:] + _LEAST_WEIGHT
         mean = (total[:, :_CARRIED].unflatten(1, (_HEADS, -1)) / amount[:, :, None]).flatten(1, 2)
         return torch.cat([mean, torch.log(amount)], dim=1).unflatten(2, [_CELLS * length for length in self._grid])
