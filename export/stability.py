@@ -44,9 +44,10 @@ FAR_MM: Final = 1e3
 RESIDUAL: Final = 1e-3
 WIDE: Final = 24
 """Factor of a grid whose copies are farther away than any thickness requires."""
-INT8_PRESS, INT8_BEYOND = 0.25, 0.75
+INT8_PRESS, INT8_BEYOND = 0.25, 2.5
 """Largest difference of int8 from float32 in any pixel, as a share of the largest value: on presses, as `export.verify`
-has it, and on windows beyond any touch, where the bound is against nonsense."""
+has it, and on windows beyond any touch, where int8
+saturates: there the runtime believes no pattern."""
 SAME: Final = 1e-5
 """Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
 steps."""

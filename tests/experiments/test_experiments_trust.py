@@ -9,6 +9,7 @@ from edge_samples import FakeModel, make_pad_contract, write_model
 from experiment_samples import quick_bench, save_recordings
 from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
+from edge.inference.contract import ANY_BATCH
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
 from train.experiments.sensor import shipped, trust_checks
@@ -95,7 +96,8 @@ def test_patterns_that_are_off_are_counted_by_how_far(wide):
 
 class TestTaps:
     def test_right_windows_are_kept_and_foreign_ones_dropped(self):
-        model = FakeModel(make_trusted_contract(output_full_scale=0.5))
+        posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+        model = FakeModel(make_trusted_contract(output_full_scale=0.5, **posed))
         elsewhere = np.roll(press(), 2, axis=-1)
         right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))
         truth = np.zeros((1, 40, 40), dtype=np.float32)

@@ -253,10 +253,9 @@ def test_the_command_writes_integers_and_says_what_they_cost(folder, frozen, tmp
         main([str(tmp_path / "none.pt"), "--out", str(tmp_path)])
 
 
-@pytest.mark.parametrize("option", [["--trust", "x"], ["--intervals", "x"]])
-def test_options_that_do_not_fit_are_a_usage_error(option):
+def test_options_that_do_not_fit_are_a_usage_error():
     with pytest.raises(SystemExit) as end:
-        main(["one.pt", *option])
+        main(["one.pt", "--intervals", "x"])
     assert end.value.code == 2
 
 

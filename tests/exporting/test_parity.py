@@ -240,13 +240,13 @@ def test_a_difference_is_a_share_of_full_scale_or_of_what_is_larger():
 def test_windows_are_of_every_force_and_stiff_ones_beside():
     _, contract = graph_of("mtsr")
     step = read_windows(frozen(), contract)
-    assert step.shape[1:] == (12, 4, 4) and 50 < len(step) < 250 < len(read_windows(frozen(), contract, None))
+    assert step.shape[1:] == (21, 4, 4) and 50 < len(step) < 250 < len(read_windows(frozen(), contract, None))
     stiff = extreme_windows(contract)
-    assert all(window.shape == (1, 12, 4, 4) and window.dtype == np.float32 for window in stiff.values())
+    assert all(window.shape == (1, 21, 4, 4) and window.dtype == np.float32 for window in stiff.values())
     bits = stiff["denormals"].view(np.uint32)  # a comparison would take them for zeros
     assert not stiff["zeros"].any() and bits.min() > 0 and bits.max() < 0x00800000
     assert stiff["1000 x full range"].max() == pytest.approx(1000 * 32768 / 500)
-    assert not stiff["2 of 4 taps"][:, 6:].any() and stiff["2 of 4 taps"][:, 3:6].any()
+    assert not stiff["4 of 7 taps"][:, 12:].any() and stiff["4 of 7 taps"][:, 3:12].any()
     assert not stiff["rest to full load in one scan"][:, 3:].any()
 
 

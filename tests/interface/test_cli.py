@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording as write_counts
 from cli_samples import assert_refused, base_options, files, records, run, start, write_recording
 from edge_samples import BASELINE, ROOT, make_contract, write_model
-from golden_world import write_csv
 
 from edge import __version__
 from edge.cli import main as cli
@@ -25,7 +25,7 @@ __all__ = ["files"]
 
 
 def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_poses(tmp_path):
-    recording = write_csv(tmp_path / "rest.csv", np.full((3, 3, 4, 4), 30_000))
+    recording = write_counts(tmp_path / "rest.csv", np.full((3, 3, 4, 4), 30_000))
     for name, model in ((f"replay:{recording}", "stsr-int8"), ("demo", "mtsr-int8")):
         done = run("--source", name, "--rate-hz", "100", "--duration-s", "0.5", "--sink", "jsonl:-")
         assert {record["model"] for record in records(done.stdout)} == {model}

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording as write_counts
 from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
-from golden_world import write_csv
 
 from edge.api import Pad, RecordingError, Scan, Source, Stream, UsageError, open_recording, open_runtime, open_source
 from edge.doctor.write_sensor_file import keep
@@ -105,7 +105,7 @@ def test_named_sources_are_put_in_place_each_by_its_own(tmp_path):
     """Sensor 4 of left and sensor 4 of right may sit in other ways."""
     for folder in ("left", "right"):
         (tmp_path / folder).mkdir()
-        write_csv(tmp_path / folder / "4.csv", make_scan().counts[None])
+        write_counts(tmp_path / folder / "4.csv", make_scan().counts[None])
     texts = [f"{name}=replay:{tmp_path}/{name}/4.csv" for name in ("left", "right")]
     found = {}
     with Source(*open_sources(texts, 100.0, mountings={"left/4": TURNED, "4": Mounting(AS_MAPPED[::-1])})) as source:

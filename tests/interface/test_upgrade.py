@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bridge_samples import write_recording
 from cli_samples import records, run
 from edge_samples import REST, write_model
-from golden_world import write_csv
 
 from edge.api import load_baselines, open_recording, take_baselines
 from edge.cli import main as cli
@@ -87,7 +87,9 @@ DRIFT[0] = -110
 def write_parts(path, *parts, seed=0):
     """Write a recording of (scans, counts over rest) parts, as the vendor's logger does, without times."""
     felt = np.array([felt + np.zeros((3, 4, 4)) for scans, felt in parts for _ in range(scans)])
-    return write_csv(path, np.rint(REST + felt + np.random.default_rng(seed).normal(0, 2, felt.shape)).astype(int))
+    return write_recording(
+        path, np.rint(REST + felt + np.random.default_rng(seed).normal(0, 2, felt.shape)).astype(int)
+    )
 
 
 def moving(scans):
