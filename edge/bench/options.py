@@ -13,7 +13,7 @@ program should run meanwhile.
 examples:
   edge-sr bench --out today
   edge-sr bench --threads 1 \\
-          --only stsr mtsr4
+          --only stsr mtsr
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """
