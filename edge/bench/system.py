@@ -156,7 +156,8 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
         times_ns[sensor].append(int(time_ns))
     first, last = (_newest_counters(some) for some in (settled, [*settled, *records]))
     lost = sum(last.get(name, 0) - first.get(name, 0) for name in LOST)
-    if not records or any(last.get(name, 0) for name in UNMATCHED):
+    beyond = any(record["scan"] >= len(times_ns[record["sensor"]]) for _, record in records)
+    if not records or beyond or any(last.get(name, 0) for name in UNMATCHED):
         return Cost(cpu_percent, None, None, lost, resident_mb)
     took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
     p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
