@@ -33,13 +33,13 @@ wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and m
 	$(BIN)/python release/wheels.py
 
 PRESSES := data/gripped.npz data/taps4.npz data/taps7.npz
+TURNED := data/turned7.npz
 FIGURES := data/named4.npz data/named7.npz data/nominal4.npz data/nominal7.npz
 
-models: $(VENV)/.dev $(PRESSES) $(FIGURES) data/validation.npz  ## train the bundled models on, and export them again
+models: $(VENV)/.dev $(PRESSES) $(TURNED) $(FIGURES) data/validation.npz  ## train the bundled models on, and export them again
 	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m train.fit checkpoints --data $(PRESSES) $(FIGURES) --validation data/validation.npz
-	OMP_NUM_THREADS=2 $(BIN)/python -m train.trust checkpoints/trust.json --data $(PRESSES)
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) --trust checkpoints/trust.json
-	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) --trust checkpoints/trust.json --int8 $(PRESSES)
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) $(TURNED) --trust edge/models/stsr-int8.onnx
+	$(BIN)/python -m export.to_onnx $(NETWORKS) --out edge/models --batch any --validation data/validation.npz --intervals $(PRESSES) $(TURNED) --trust edge/models/stsr-int8.onnx --int8 $(PRESSES)
 	$(BIN)/python -m train.freeze edge/models --data $(PRESSES)
 	$(BIN)/python -m export.verify edge/models/*.onnx
 
@@ -64,6 +64,9 @@ data/taps4.npz: $(VENV)/.dev  ## four taps each, from poses of every kind
 
 data/taps7.npz: $(VENV)/.dev  ## the same, seven taps each
 	$(BIN)/python -m train.data.make_presses $@ --count 2500 --taps 7 --seed 65
+
+data/turned7.npz: $(VENV)/.dev  ## seven taps turned by 5 degrees each, by which intervals hold for these, too
+	$(BIN)/python -m train.data.make_presses $@ --count 1200 --taps 7 --schedule turns --seed 69
 
 data/named4.npz: $(VENV)/.dev  ## the paper's figures, four taps each
 	$(BIN)/python -m train.data.make_presses $@ --families paper --count 5000 --taps 4 --seed 63

@@ -24,6 +24,7 @@ from edge.errors import EdgeError, UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, INT8_SUFFIX, POSED_MODEL, bundled_models, find_model
 from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
+from edge.perception.pattern_check import PatternCheck
 from edge.terminal.progress_bar import tracked
 from export.graphs.parity import FULL_RANGE_COUNTS, extreme_windows
 from firmware_bridge.pad_geometry import USPA44
@@ -47,7 +48,7 @@ WIDE: Final = 24
 INT8_PRESS, INT8_BEYOND = 0.25, 2.5
 """Largest difference of int8 from float32 in any pixel, as a share of the largest value: on presses, as `export.verify`
 has it, and on windows beyond any touch, where int8
-saturates: there the runtime believes no pattern."""
+saturates and the runtime believes no pattern, as the rows "believed" show."""
 SAME: Final = 1e-5
 """Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
 steps."""
@@ -218,12 +219,20 @@ def _graph(
 ) -> Iterator[Case]:
     pattern = one.run(window).copy()
     size, full_scale = float(np.abs(pattern).max()), one.contract.output_full_scale
+    touch = name in TOUCHES or name.endswith("taps")
+    if (
+        (trust := one.contract.read_trust())
+        and name in extreme_windows(one.contract)
+        and name not in NO_TOUCH
+        and not touch
+    ):
+        verdict = PatternCheck(trust, one.contract).judge(0, window[0], pattern, one.deviation, one.traction, 0)
+        yield Case(name, "believed", float(verdict.trusted is True), 0.0, model=one.name)
     strength = max(1.0, float(np.abs(window).max()))  # patterns grow with the readings: no bound beyond them
     yield Case(name, "largest over the largest reading, mm", largest(one, window) / strength, MOST_MM, model=one.name)
     spread = float(np.abs(several.run(window) - pattern).max())
     together = one.run_together([window] * TOGETHER)
     spread = max(spread, float(np.abs(together - pattern).max()))
-    touch = name in TOUCHES or name.endswith("taps")
     most = SAME if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
     what = f"{THREADS} threads and {TOGETHER} windows, to one"
     yield Case(name, what, spread / max(size, full_scale), most, model=one.name)

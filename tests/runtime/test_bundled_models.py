@@ -77,8 +77,7 @@ def test_intervals_hold_and_no_figure_is_left_behind(name):
     """Intervals are calibrated on presses of the wide world; figures are easier, and more of their pixels held."""
     for test_set, most, hard in ((wide, 0.92, set()), (frozen, 1, HARD_FIGURES)):
         made = errors(name, all_taps(name, test_set), test_set)
-        # Four turned taps of mtsr-int8 are 87.3 % covered: its intervals were fitted to poses of every kind.
-        assert 0.87 <= made["coverage_90"].mean() <= most
+        assert 0.88 <= made["coverage_90"].mean() <= most
         linear, surface = classical_psnr_db(test_set)["linear map"], test_set().surface[test_set().tap]
         gain_db = made["psnr_db"] - linear
         behind = {str(name) for name in np.unique(surface) if gain_db[surface == name].mean() < 0}

@@ -140,7 +140,9 @@ class Chaos:
             reader.start()
             self._follow(lines, process, seconds)
             self._end_s = 0.0  # the sensors are switched off, so that the accounts close
-            self._judge(lines, QUIET_S)
+            records = -1
+            while records != (records := self.run.judge.records.total()):  # a busy program is behind
+                self._judge(lines, QUIET_S)
             process.send_signal(signal.SIGTERM)  # beside other commands of a script SIGINT is ignored
             with suppress(subprocess.TimeoutExpired):
                 self.run.exit_code = process.wait(END_TIMEOUT_S)

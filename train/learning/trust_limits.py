@@ -21,7 +21,7 @@ from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.contact_check import contact_check
 from train.learning.tap_checks import tap_check
-from train.physics.pad_draws import INPUTS
+from train.physics.pad_draws import INPUTS, input_scale
 from train.physics.sensor_noise import Nuisances
 
 UNFAMILIAR: Final = 0.005
@@ -31,7 +31,7 @@ FOREIGN: Final = 0.01
 
 
 def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
-    """Return the forward model and checks of a file of train.trust, or of a model, which has the limits of the checks.
+    """Return the forward model and checks of a file of train.trust, or those of a model with their limits.
 
     Args:
         path: of the file, or NAME.onnx.
@@ -43,9 +43,12 @@ def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
     try:
         if path.suffix == ".onnx":
             model = onnx.load(path, load_external_data=False)
-            trust = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props}).read_trust()
+            contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+            trust = contract.read_trust()
             if trust is None:
                 raise ValueError("this model has no checks")
+            if (contract.pad_inputs, contract.counts_per_unit) != (tuple(input_scale()), COUNTS_PER_UNIT):
+                raise ValueError("this model has other inputs than a network of this release")
             return trust
         fitted = json.loads(path.read_text())
         forward = forward_model(fitted["forward"], len(INPUTS))
