@@ -84,8 +84,8 @@ RESULTS: Final = (
                "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
         Option("--idle-reset-s T", positive, "forget earlier taps after T seconds without contact (default "
                "%(default)g)", default=DEFAULTS.idle_reset_s),
-        Option("--taps K", whole(1), "combine at most K taps to a pattern (default: as many as the model takes; 1 if "
-               "it takes poses of the pad and there are none)"),
+        Option("--taps K", whole(1), "combine at most K taps to a pattern (default: as many as the model takes; if "
+               "it takes poses of the pad and there are none 1, or as many as its name states, such as mtsr4)"),
         about="A tap is one press, from touch to release. Counts are the units of raw readings.",
     ),
     Group("checks of patterns and sensor",

@@ -53,9 +53,9 @@ def run(bench: Workbench, folder: Path) -> Path:
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"`{model.name}` (training {model.contract.training_sha256[:12]}) through the runtime's session. Figures that "
-        "nothing was trained on, on pads of their own, presses to .03 to .5 mm, seven taps each: "
+        "nothing was trained on, on pads of their own, presses of 0.03 to 0.5 mm, seven taps each: "
         + "; ".join(f"{name} {len(one)} (sha256 {one.presses.sha256()[:12]})" for name, one in sets.items())
-        + f". All nuisances, gains N(1, .075); stated and true errors of the poses {PLACE_ERROR_MM} mm and "
+        + f". All nuisances, gains N(1, 0.075); stated and true errors of the poses {PLACE_ERROR_MM} mm and "
         f"{TURN_ERROR_DEG:g} degree. PSNR in dB, full scale {MAX_INDENTATION_MM} mm; gains are over the same model "
         "with the newest tap alone, paired, 95 % intervals by figure. Run time of the model: median of a scan, one "
         "thread."
