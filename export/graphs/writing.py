@@ -59,7 +59,9 @@ class Writer:
         fitting = [one for one in self.validation if one.scale == contract.scale]
         if fitting and session.deviation is not None:
             contract.confidence.update(fit_confidence(session, fitting))
-        if self.trust is not None and contract.pad_inputs and contract.traction_scale:
+        # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
+        checkable = contract.taps == 1 or contract.takes_poses
+        if self.trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
             contract.trust.update(self.trust.to_json())
         content = _content(model, contract, origin(self.report))
         Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime

@@ -54,15 +54,13 @@ def test_several_taps_of_a_face_anywhere_on_it_stay_one_sheet(played):
     model, rng = ModelSession(find_model(POSED_MODEL)), np.random.default_rng(0)
     shifted = np.array([[0, 0, 0, 0, 0], [2.35, 0, 0, 0.2, 1], [0, -2.35, 0, 0.2, 1], [2.35, 2.35, 0, 0.2, 1]])
     near = np.array([[0, 0, 0, 0, 0], [1, -2, 30, 0.2, 1], [-2, 1, -20, 0.2, 1], [2, 2, 45, 0.2, 1]])
-    holes: list[bool] = []
     for name, one in played.items():
         strong = np.argsort(one.zeroed[:, 2].sum(axis=(1, 2)))[-len(one.zeroed) // 3 :]
-        for poses in (shifted, near) * 10:
-            scans = one.zeroed[rng.choice(strong, 4, replace=False)].astype(np.float32)
+        scans = one.zeroed[[strong[-1], *rng.choice(strong, 3, replace=False)]].astype(np.float32)
+        for poses in (shifted, near):
             pattern = model.run(model.contract.scale_window(scans), poses=poses.astype(np.float32))[None]
             assert share_touched(pattern)[0] >= LEAST_SHARE and unevenness(pattern)[0] <= MOST_UNEVEN, name
-            holes += [] if name.startswith(DENTED) else [bool(has_hole(pattern)[0])]
-    assert np.mean(holes) <= 0.02  # 0.4 % of 480 in int8, none in float32
+            assert name.startswith(DENTED) or not has_hole(pattern)[0], name
 
 
 def test_patterns_of_real_grips_are_believed(played):

@@ -4,14 +4,16 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from export_samples import POSED_PRESSES, TAPS, made_once, posed_models, some_frames
+from export_samples import OPTIONS, POSED_PRESSES, TAPS, made_once, posed_models, save_checkpoint, some_frames
 
-from edge.inference.bundled import INT8_SUFFIX
+from edge.inference.bundled import INT8_SUFFIX, find_model
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.to_onnx import export
 from export.verify import verify
+from train.learning.trust_limits import load_trust
 from train.networks.graph_weights import network_of
+from train.networks.registry import build
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import REACH_MM
 
@@ -98,3 +100,14 @@ def test_a_single_tap_reads_no_memory_that_nobody_wrote(folder):
             for _ in range(50):
                 np.full(2**size, np.nan, dtype=np.float32)  # memory that is free again
             assert np.allclose(session.run_together([window] * count), expected, atol=1e-6)
+
+
+def test_checks_go_to_models_whose_taps_can_be_checked(folder, tmp_path):
+    """Without poses earlier taps have no check, and a pattern of another surface's taps would be believed."""
+    trust = load_trust(find_model("stsr-int8"))
+    net = build("compact-mtsr4", 10, **OPTIONS)
+    by_channels = save_checkpoint(tmp_path / "rows.pt", net, "compact-mtsr4", **OPTIONS)
+    for path, checked in ((folder / "fused.pt", True), (by_channels, False)):
+        export(path, tmp_path, some_frames(), batch=ANY_BATCH, trust=trust)
+        found = ModelSession(tmp_path / f"{path.stem}.onnx").contract.read_trust()
+        assert (found is not None) is checked
