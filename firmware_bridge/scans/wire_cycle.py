@@ -5,8 +5,9 @@ which is the same each time, wraps round. By default the order is that of the id
 fragments; then its cycles are cut by pauses alone, until two in a row came in the same order, which is then the
 sensor's.
 
-A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on. While the
-order is to be learnt, the readings alone show the pauses, and an eighth of a period is one.
+A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on, of the shorter
+ones, as a lost cycle makes them longer. Until there are enough, the readings alone show the pauses; while the order is
+to be learnt, an eighth of a period is one. Limit: where nearly all cycles of the first eight are lost, two may mix.
 
 Arrivals show no pause within what was read in one piece. There a lost cycle shows by the count: cycles end a period
 apart, and a read only delays them. So one that ends late by most of a period may hold readings of two cycles, unless
@@ -28,7 +29,7 @@ SHORTEST_PAUSE_NS: Final = 1_500_000
 MOST_INTERVALS: Final = 128
 """Intervals between cycles that give the period."""
 LEAST_INTERVALS: Final = 8
-"""Intervals from which it shows lost cycles; pauses are judged by the first one."""
+"""Intervals from which it shows lost cycles, and pauses are judged by the shorter ones."""
 RENEWED_EVERY: Final = 32
 """Cycles after which the period is computed again, once there are so many intervals."""
 LATER: Final = 64
@@ -104,7 +105,8 @@ class WireCycle:
         """Derive the limit of pauses from the gaps between readings, until cycles show the period."""
         if self.gaps_ns is not None and 0 <= gap_ns <= LONGEST_PAUSE_NS:
             self.gaps_ns.append(gap_ns)
-            cycle_ns = sum(self.gaps_ns) * self._length // len(self.gaps_ns)
+            shorter = sorted(self.gaps_ns)[: (len(self.gaps_ns) + 1) // 2]  # lost cycles make some of them longer
+            cycle_ns = sum(shorter) * self._length // len(shorter)
             self.pause_ns = min(max(cycle_ns // (2 if self.order else 8), SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
 
     def doubt(self) -> None:
@@ -169,18 +171,22 @@ class WireCycle:
 
     def _measure(self) -> None:
         usual, count = sorted(self._intervals), len(self._intervals)
+        shorter_ns = usual[count // 8]
         low_ns, high_ns = usual[count // 4], usual[count - 1 - count // 4]
-        self.in_pieces = 4 * low_ns < high_ns > 2 * SHORTEST_PAUSE_NS
+        self.in_pieces = low_ns < SHORTEST_PAUSE_NS < high_ns // 2  # sooner than a bus carries a cycle
         # Lost cycles make some of them longer, so the middle half counts; but all do where many are read in one piece.
         if not self.in_pieces:
             usual = usual[count // 4 : count - count // 4]
         period_ns = sum(usual) // len(usual)
         if period_ns > 0:  # if all was read in one piece, the period is not visible
+            self.period_ns = period_ns
             # A lost cycle makes the next ones late by a period, which is less exact where many are read in one piece.
             self._later_ns = max(period_ns // 2 if self.in_pieces else period_ns * 3 // 4, SHORTEST_PAUSE_NS)
-            pause_ns = max(period_ns // 2, SHORTEST_PAUSE_NS)
-            self.pause_ns = LONGEST_PAUSE_NS if self.in_pieces else min(pause_ns, LONGEST_PAUSE_NS)
-            self.period_ns, self.gaps_ns = period_ns, None
+            # Fewer may all hold lost cycles, and none would show as a pause; but arrivals have no other measure then.
+            if self.has_pace or (self.gaps_ns is not None and not self.gaps_ns):
+                pause_ns = max(shorter_ns // 2, SHORTEST_PAUSE_NS)
+                self.pause_ns = LONGEST_PAUSE_NS if self.in_pieces else min(pause_ns, LONGEST_PAUSE_NS)
+                self.gaps_ns = None
             self._until_renewed = RENEWED_EVERY if count == MOST_INTERVALS else 1
 
     def _learn(self, order: tuple[int, ...]) -> None:

@@ -96,14 +96,20 @@ def handed_on(frames, reader):
         yield (tick + 1) * reader.latency_s, b"".join(lines)
 
 
-def read(frames, reader):
-    """Return the cycles of whole scans by sensor, how many were mixed, how long each had to wait, and counters."""
+def read(frames, reader, broken_s=0.0):
+    """Return the cycles of whole scans by sensor, how many were mixed, how long each had to wait, and counters.
+
+    The link breaks before `broken_s` [s], and is opened again.
+    """
     scans = GsUsbScans() if reader.usb else SlcanScans()
     if reader.usb:
         scans.start(stamped=True, channels=1)
     found = SimpleNamespace(numbers={}, whole=0, mixed=0, waits_ns=[])
     for time_s, data in handed_on(frames, reader):
         now_ns = 5_000_000_000 + round(time_s * 1e9)
+        if 0 < broken_s < time_s:
+            scans.begin_anew()
+            broken_s = 0.0
         for scan in filter(lambda scan: scan.whole, scans.feed(data, now_ns)):
             cycles = set(scan.counts[2].ravel().tolist())
             found.numbers.setdefault(scan.sensor, []).append(max(cycles))
@@ -151,6 +157,18 @@ def test_no_scan_is_of_two_cycles_on_a_faulty_bus(reader, fault, share, rates_hz
     assert found.mixed == 0 and len(found.numbers) == len(rates_hz)
     assert found.whole > (in_bursts if reader is PLAIN_BURSTS else fewest)
     assert max(found.waits_ns) < LONGEST_WAIT_NS or reader is PLAIN_BURSTS
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["opened", "opened again"])
+@pytest.mark.parametrize("reader", [STAMPED, STAMPED_BURSTS, USB], ids=str)
+@pytest.mark.parametrize("lost", [0, 1, 3, 5])
+def test_a_link_whose_first_cycles_are_lost_mixes_none_later(lost, reader, again):
+    before, frames = 16 * 20 * again, bus(40)
+    del frames[before + 16 * 2 : before + 16 * (2 + lost)]
+    del frames[before + 16 * 3 + 8 : before + 16 * 4 + 8]  # as many as make the halves of two cycles fit
+    found = read(frames, reader, broken_s=0.199 * again)
+    assert found.mixed == 0 and found.counters["torn_wire"] == 2
+    assert found.whole >= 40 - lost - 2 - 2 * again
 
 
 @pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=str)

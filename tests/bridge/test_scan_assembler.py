@@ -11,7 +11,7 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, Reading
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
-from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, MOST_DOUBTS, SHORTEST_PAUSE_NS
+from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS, SHORTEST_PAUSE_NS
 
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
 
@@ -258,7 +258,8 @@ def test_the_period_is_measured_by_stamps_if_there_are_any(first, stamped, pause
     feed_at(assembler, cycle(0)[3:])  # of an unknown beginning: counts for nothing
     first(assembler, cycle(1) if first is feed_at else 1, 10 * MS, stamped=stamped)
     assert assembler.longest_cycle_ns(WHOLE) == SHORTEST_PAUSE_NS
-    feed_cycle(assembler, 2, 110 * MS, stamped=stamped)
+    for number in range(2, LEAST_INTERVALS + 2):
+        feed_cycle(assembler, number, 100 * (number - 1) * MS + 10 * MS, stamped=stamped)
     assert assembler.longest_cycle_ns(WHOLE) == pause_ns
 
 
