@@ -101,8 +101,9 @@ class Loop:
             BridgeError: the source is lost; what was taken before has its results.
             EdgeError: a sink or the model fails.
         """
+        over = self._over()
         try:
-            taken = self._take(0.0 if self._runtime.waiting else wait_s)
+            taken = self._take(0.0 if over or self._runtime.waiting else wait_s, over=over)
         except BridgeError:
             self._make_patterns()
             raise
@@ -127,9 +128,12 @@ class Loop:
         # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
         self.left = min(self.left or self._runtime.waiting, self._runtime.waiting)
         self.left -= self._infer()
-        if self._source.patient:
+        if over or self._source.patient:
             self._make_patterns()
         elif self.left > 0:
+            return
+        if over:
+            self.finish()
             return
         self.left = 0
         for event in self._cadences.look():
@@ -199,20 +203,21 @@ class Loop:
         for event in intake.look(self._now_ns):
             self._tell(event)
 
-    def _take(self, wait_s: float) -> list[Scan | Notice | TimedPose] | None:
-        """Return what waits; None once the source has ended, `stop` is set, or the time is over.
-
-        A patient source's time is that of its scans.
-        """
-        patient, now_s = self._source.patient, self._clock_s()
+    def _over(self) -> bool:
+        """Return True once `stop` is set, or the time is over; a patient source's time is that of its scans."""
+        now_s = self._clock_s()
         if self._begun_s is None:
             self._begun_s, now_s = now_s, self._clock_s()
-        if self._stop.is_set() or (not patient and now_s - self._begun_s >= self._length_s):
+        return self._stop.is_set() or (not self._source.patient and now_s - self._begun_s >= self._length_s)
+
+    def _take(self, wait_s: float, *, over: bool) -> list[Scan | Notice | TimedPose] | None:
+        """Return what waits; None once the source has ended, or a patient one's time is over."""
+        if over and self._source.patient:
             return None
         taken = self._source.take(wait_s)
         self.statistics.overruns = self._source.overruns
         self._received = None
-        for one in taken if patient and taken is not None else ():  # one scan at most
+        for one in taken if self._source.patient and taken is not None else ():  # one scan at most
             if isinstance(one, Scan):
                 self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
                 if one.time_ns - self._first_ns >= self._length_s * 1e9:

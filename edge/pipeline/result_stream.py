@@ -61,7 +61,7 @@ class Stream:
             sinks: open; they get every result and event, and the poses, before anything else does. Their counters are
                 the stream's.
             on_event: called with each event, in its place between results.
-            stop: ends the stream after the scans in hand.
+            stop: ends the stream after the scans that wait.
             duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
                 results are made, measured in the time of the recording.
             commands: polled between scans.

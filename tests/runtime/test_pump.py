@@ -115,6 +115,21 @@ class TestEnds:
         assert next(ticks) == 6  # 0 was the start, 1 to 4 were within, 5 was over
         assert sink.waits > 0 and sink.results == []
 
+    def test_scans_that_wait_at_the_end_have_their_results(self):
+        stop, busy, arrived = threading.Event(), threading.Event(), threading.Event()
+        link = FakeLink([presses([0]), busy, presses([1, 2])], endless=True)
+        inner = link.read
+
+        def read(timeout_s):
+            if link.reads == 3:  # so all others were handed on
+                arrived.set()
+            return inner(timeout_s)
+
+        link.read = read
+        sink = ListSink(on_write=lambda result: (busy.set(), arrived.wait(10), stop.set()))
+        pumped(link, sink, stop=stop)
+        assert numbers(sink) == [0, 1, 2]
+
     def test_a_closed_sink_ends_it(self):
         def refuse(result):
             raise SinkClosedError("gone")
