@@ -46,7 +46,7 @@ from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import RunFacts, Sink
 from edge.pipeline.source_setup import links_to, settled, with_recorded
 from edge.sinks import registry as forms
-from edge.sinks.fan_out import Fan
+from edge.sinks.registry import Fan
 from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,
@@ -61,8 +61,7 @@ from firmware_bridge.errors import (
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP
 from firmware_bridge.pad_geometry import USPA44, USPA46, SensorGeometry
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap, layout_c
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan

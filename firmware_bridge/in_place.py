@@ -1,4 +1,7 @@
-"""Writing of a file in place: a draft first, moved there once it is complete, with the former file kept."""
+"""Users' files: written by a draft that is moved in place once it is complete, and read up to a limit.
+
+The former file is kept. The limit is there since a path can also lead to an endless device.
+"""
 
 import errno
 import os
@@ -52,3 +55,21 @@ def check_writable(path: Path) -> None:
             pass
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+PIECE_BYTES: Final = 1 << 20
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Read a whole file.
+
+    Raises:
+        OSError: it cannot be read, or is larger; no more than a piece beyond the limit is read.
+    """
+    content = bytearray()
+    with path.open("rb") as file:
+        while piece := file.read(PIECE_BYTES):  # one large read would allocate memory for the whole limit
+            content += piece
+            if len(content) > most_bytes:
+                raise OSError(errno.EFBIG, f"larger than the {most_bytes:,} bytes that are read")
+    return bytes(content)

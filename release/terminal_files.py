@@ -11,7 +11,7 @@ from argparse_manpage.manpage import Manpage
 from edge import __version__
 from edge.bench.options import bench_parser
 from edge.cli.main import COMMANDS
-from edge.cli.run_options import parser
+from edge.cli.run_help import parser
 from edge.inference.bundled import bundled_models
 
 SHELLS: Final = {

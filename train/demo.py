@@ -15,7 +15,7 @@ from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from train.data.generation_config import SEED
 from train.data.paper_taps import between_frames, tap

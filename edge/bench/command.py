@@ -15,12 +15,10 @@ from typing import Any, Final, TextIO
 import numpy as np
 
 from edge.bench import contenders
-from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
-from edge.bench.contenders import Subject
-from edge.bench.errors import BenchError
-from edge.bench.live_report import Page, line
+from edge.bench.contenders import FORCE_RANGE_N, ErrorRow, Subject, error_rows, force_floor_percent
+from edge.bench.options import BenchError
 from edge.bench.provenance import provenance, this_machine, with_head
-from edge.bench.system import show_system
+from edge.bench.system import Page, line, show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 

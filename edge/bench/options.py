@@ -1,10 +1,16 @@
-"""Options of `edge-sr bench`, and its help."""
+"""Options of `edge-sr bench`, its help, and its errors."""
 
 import argparse
 from pathlib import Path
 from typing import Final
 
+from edge.errors import EdgeError
 from edge.terminal.argument_types import Parser, positive, whole
+
+
+class BenchError(EdgeError, RuntimeError):
+    """Error of a measurement that could not be made, or of an earlier bench that cannot be used."""
+
 
 BENCH_HELP: Final = """\
 Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \

@@ -13,7 +13,7 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.errors import harmless
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import boundary_distance_mm, psnr_db, rmse_percent
 from edge.inference.bundled import demo_recording
+from edge.inference.contract import scheduled_rows
 from edge.inference.model_interface import Model
-from edge.inference.pose_input import scheduled_rows
-from edge.mapping.live_map import MapState
 from edge.mapping.object_map import ObjectMap
-from edge.mapping.sink import MapSink
+from edge.mapping.sink import MapSink, MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import RESET, Commands
@@ -26,11 +25,11 @@ from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.terminal.heatmap import Palette, Panel, choose_palette, draw
 from edge.terminal.text_wrap import columns, drawn
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 from firmware_bridge.zeroing.baseline import deformation
 
 if TYPE_CHECKING:
-    from edge.view.live_view import LiveView
+    from edge.view.server import LiveView
 
 FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2
 """Scenes as train/demo.py numbers them; FREE is outside of any."""

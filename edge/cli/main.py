@@ -27,7 +27,7 @@ from edge.api import (
     save_baselines,
     unfinished_load,
 )
-from edge.cli.run_options import understood
+from edge.cli.run_help import understood
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 from firmware_bridge.in_place import BACKUP_SUFFIX
@@ -113,14 +113,14 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _map(options: argparse.Namespace) -> None:
-    from edge.cli.run_files import new_map
+    from edge.cli.run_command import new_map
 
     with new_map(options) as mapping:
         _follow(options, mapping=mapping)
 
 
 def _record(options: argparse.Namespace) -> None:
-    from edge.cli.run_files import new_recording
+    from edge.cli.run_command import new_recording
 
     with new_recording(options) as statistics:
         _follow(options, statistics)

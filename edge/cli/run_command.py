@@ -9,8 +9,10 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -34,9 +36,11 @@ from edge.api import (
     open_sink,
     pump,
 )
-from edge.cli.run_options import runtime_options
+from edge.cli.run_help import runtime_options
 from edge.cli.user_commands import user_commands
+from edge.errors import SinkError
 from edge.pipeline.silence_hint import silence_hint
+from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
@@ -45,7 +49,62 @@ if TYPE_CHECKING:
     from edge.api import MapSink
     from edge.cli.demo import Demo
     from edge.pipeline.replay_setup import Player
-    from edge.view.live_view import LiveView
+    from edge.view.server import LiveView
+
+_NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
+"""Suffixes of other formats, which a recording must not be named after."""
+
+
+@contextmanager
+def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
+    """Add a recording to the options of a run, and report it at the end, however the run ends."""
+    path = Path(options.file)
+    if path.is_dir():
+        raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
+    if path.suffix.lower() in _NOT_WRITTEN:
+        made = path.with_suffix(".mcap")
+        then = "for records in JSON use edge-sr --sink jsonl:FILE"
+        if path.suffix.lower() in (".csv", ".npz"):
+            then = f"afterwards edge-sr convert {made} {path}"
+        raise UsageError(f"{path.suffix} cannot be recorded: edge-sr record {made}; {then}")
+    if path.suffix != ".mcap":
+        path = path.with_name(path.name + ".mcap")
+    if path.exists():  # checked before anything is begun
+        raise SinkError(f"{path} exists: give another name, or delete it first")
+    options.sink = [*options.sink, f"mcap:{path}"]
+    check_apart(options.sink)
+    statistics = Statistics()
+    try:
+        yield statistics
+    finally:
+        if path.exists():
+            size_mb = path.stat().st_size / 1e6
+            emulated = ", EMULATED" if statistics.source == "emulated" else ""
+            sure = sys.exception() is None and not statistics.unwritten  # else a sink has reported what it lacks
+            held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
+            with suppress(OSError):  # the terminal may have gone
+                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
+
+
+@contextmanager
+def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
+    """Yield the sink of a map, and report what is on it at the end, however the run ends."""
+    from edge.api import MapSink, ObjectMap
+
+    for path, ending in ((options.out, ".npz"), (options.png, ".png")):
+        if path is not None and path.suffix != ending:
+            raise UsageError(f"{path} is no name of a map's file: expected one that ends in {ending}")
+    if not all(map(isfinite, options.centre_mm)):
+        raise UsageError(f"--centre-mm {options.centre_mm[0]} {options.centre_mm[1]}: expected two finite numbers")
+    whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
+    sink = MapSink(whole, npz=options.out, png=options.png)
+    try:
+        yield sink
+    finally:
+        if sink.fused or sys.exception() is None:
+            with suppress(OSError):  # the terminal may have gone
+                sys.stderr.write(f"{sink.summary()}\n")
+
 
 DAY_S: Final = 86_400
 DEMO_HZ: Final = 100.0
@@ -163,7 +222,7 @@ def _open_view(
                 option = f"--{name.replace('_', '-')}"
                 raise UsageError(f"{option} requires --view")
         return contextlib.nullcontext()
-    from edge.view.live_view import LOOPBACK, LiveView
+    from edge.view.server import LOOPBACK, LiveView
 
     directory = options.view_record_dir or Path()
     if options.view_record_dir is not None and not os.access(f"{directory}/", os.W_OK | os.X_OK):

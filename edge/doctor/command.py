@@ -26,9 +26,8 @@ from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
 from firmware_bridge.links.base import Link
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
-from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import deformation
 
 EXIT_WRONG: Final = 1

@@ -23,9 +23,8 @@ from firmware_bridge.links.base import Link
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
-from firmware_bridge.silence import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing import baseline as zeroing
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, BaselineEstimator, deformation
 

@@ -15,7 +15,7 @@ from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
-from firmware_bridge.silence import LATEST_SCAN_S
+from firmware_bridge.schedule import LATEST_SCAN_S
 
 _SHOWN = 8
 

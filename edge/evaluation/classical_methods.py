@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edge.errors import EdgeError
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 
 _MOST_BYTES: Final = 1 << 31
 _AXES: Final[Mapping[str, tuple[str, str]]] = {

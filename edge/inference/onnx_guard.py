@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from edge.errors import ModelError
-from firmware_bridge.bounded_read import read_bounded
+from firmware_bridge.in_place import read_bounded
 
 MOST_BYTES: Final = 1 << 28
 """Largest file: a hundred times the largest bundled model."""

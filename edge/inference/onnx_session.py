@@ -15,9 +15,8 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 
 from edge.errors import ModelError, WindowError
 from edge.inference.bound_run import BoundRun, Outputs
-from edge.inference.contract import ANY_BATCH, Contract
+from edge.inference.contract import ANY_BATCH, POSE_KEYS, POSE_WIDTH, Contract, scheduled_rows
 from edge.inference.onnx_guard import read_model
-from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import within_limit
 from firmware_bridge.errors import harmless
 
@@ -122,7 +121,7 @@ class ModelSession:
             window: (taps, 3, rows, cols) float32, newest first, in network input units; 1 to K taps of a model that
                 takes poses, else K.
             pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
-            poses: (taps, 5) float32 as edge.inference.pose_input makes them, for a model that takes poses; by default
+            poses: (taps, 5) float32 as edge.inference.contract makes them, for a model that takes poses; by default
                 those of the paper's schedule, and zeros for taps of zeros.
 
         Returns:

@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import UsageError
-from edge.mapping.evidence import CONTACT_LEVEL, weigh
-from edge.mapping.footprint import MOST_PX, PX_PER_MM, SIZE_MM, Grid, footprint
+from edge.mapping.evidence import CONTACT_LEVEL, MOST_PX, PX_PER_MM, SIZE_MM, Grid, footprint, weigh
 from edge.perception.pattern_check import LEAST_COUNTS
 from edge.perception.result import Result
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 
 STEP_MM: Final = 0.5
 """Movement within which patterns are one piece of evidence, about one pixel of a pattern."""

@@ -9,10 +9,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from math import hypot
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from edge.errors import SinkError
-from edge.mapping.live_map import MapState
+from edge.mapping.evidence import Grid
 from edge.mapping.map_files import check_npz, save_npz, save_png
 from edge.mapping.object_map import ObjectMap
 from edge.perception.result import Result
@@ -20,9 +23,38 @@ from edge.pipeline.sink import Sink, check_new
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.pose_track import GAP_NS
-from firmware_bridge.silence import SENSOR_SILENT_NS
+from firmware_bridge.poses import GAP_NS, PadPose
+from firmware_bridge.schedule import SENSOR_SILENT_NS
+
+
+class Box(NamedTuple):
+    """Rows and columns of a map, from the first to below the last."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+
+class MapState(NamedTuple):
+    """State of a map, numbered from 1: layers (H, W), poses of the pads by sensor, and patterns by their fate."""
+
+    number: int
+    grid: Grid
+    contact: NDArray[np.float32]
+    doubted: NDArray[np.float32]
+    pads: Mapping[str, PadPose]
+    counts: Mapping[str, int]
+
+    def since(self, before: "MapState | None") -> Box | None:
+        """Return the part that has changed since another state, or since an empty map; None for nothing."""
+        if before is None:
+            changed = ~np.isnan(self.contact) | (self.doubted != 0)
+        else:  # bits are compared, since a NaN is not equal to itself
+            changed = (self.contact.view(np.int32) != before.contact.view(np.int32)) | (self.doubted != before.doubted)
+        rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+        return Box(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1) if len(rows) else None
+
 
 APART_MM: Final = USPA44.rows * USPA44.pitch_mm / 2
 """Half a pad, in [mm]: the centres of two pads are never that near to each other."""

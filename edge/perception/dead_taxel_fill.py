@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge.errors import EdgeError
 from edge.perception.result import Filled
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 
 RIDGE: Final = 2e-3
 """Share of a kind's mean variance that is added to every channel, for the gains and noise of the individual sensor."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from firmware_bridge.pad_geometry import AXES, USPA44
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
 
 TAXELS: Final = USPA44.taxel_count

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.expected_error import doubt
+from edge.inference.intervals import doubt
 from edge.inference.trust import Trust, contact_features, pose_tap_features
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 

@@ -1,4 +1,4 @@
-"""Stages of a pattern: which taps it is made from, whether it is believed, and what follows from it."""
+"""Stages of a pattern: which taps it is made from, whether it is believed, and what follows, such as its patch."""
 
 import sys
 
@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.expected_error import expect
+from edge.inference.intervals import expect
 from edge.inference.trust import Trust
-from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
 from edge.perception.gain_following import SensorPad
@@ -18,6 +17,30 @@ from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from edge.perception.wrench import Balance, wrench_of
 from firmware_bridge.pad_geometry import SensorGeometry
+
+
+def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
+    """Return the pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none if that is not positive."""
+    peak = pattern.max(axis=(-2, -1), keepdims=True)
+    return (pattern >= level * peak) & (peak > 0)
+
+
+def touched_patch(
+    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
+) -> tuple[float, tuple[float, float] | None]:
+    """Return area in [mm2] and pattern-weighted centroid of the touched pixels of a pattern (H, W), above zero there.
+
+    The centroid is x, y in [mm] from the pattern's centre, x to the right and y down; None if no pixel is touched.
+    """
+    rows, cols = np.nonzero(touching)
+    if rows.size == 0:
+        return 0.0, None
+    weights = pattern[rows, cols].astype(np.float64)
+    weights /= weights.sum()
+    height, width = pattern.shape
+    x_mm = (float(weights @ cols) - (width - 1) / 2) * pixel_pitch_mm
+    y_mm = (float(weights @ rows) - (height - 1) / 2) * pixel_pitch_mm
+    return rows.size * pixel_pitch_mm**2, (x_mm, y_mm)
 
 
 class Check:

@@ -12,7 +12,7 @@ from edge.perception.event import Event, Note, joined
 from edge.perception.pattern_check import REASON_TEXTS, Reason
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 from firmware_bridge.zeroing.drift_tracker import Drift

@@ -16,8 +16,7 @@ from edge.perception.step import Origin, Step
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.pose_track import PoseTrack
+from firmware_bridge.poses import PadPose, PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan

@@ -12,7 +12,7 @@ from edge.perception.pattern_check import Reason
 from edge.perception.result import Filled, NextTap, Result, State, WrenchOrigin
 from edge.perception.wrench import Wrench
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 from firmware_bridge.zeroing.drift_tracker import Drift

@@ -10,7 +10,7 @@ from edge.perception.event import Note
 from edge.perception.step import Step
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.silence import TAXEL_SILENT_SCANS
+from firmware_bridge.schedule import TAXEL_SILENT_SCANS
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 HOLD_SCANS: Final = 5

@@ -12,7 +12,7 @@ from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.silence import GIVEN_UP_S, POLL_S
+from firmware_bridge.schedule import GIVEN_UP_S, POLL_S
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 

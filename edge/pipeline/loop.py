@@ -9,20 +9,18 @@ from typing import Final
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.cadence import Cadences
+from edge.pipeline.cadence import Cadences, PaceSetter
 from edge.pipeline.commands import Commands, obey
 from edge.pipeline.gain_keeper import GainKeeper
-from edge.pipeline.pace import PaceSetter
-from edge.pipeline.pose_intake import PoseIntake
-from edge.pipeline.pose_queue import PoseQueue
+from edge.pipeline.pose_queue import PoseIntake, PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.silence import POLL_S
+from firmware_bridge.schedule import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
 ALL_HEARD_SCANS: Final = 10

@@ -18,8 +18,8 @@ from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
-from firmware_bridge.silence import POLL_S
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
+from firmware_bridge.schedule import POLL_S
 
 
 class Stream:

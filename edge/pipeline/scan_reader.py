@@ -12,15 +12,14 @@ from queue import Empty, SimpleQueue
 from typing import Final, Protocol, Self
 
 from edge.errors import SourceTakenError, UsageError
-from edge.pipeline.pace import Pace
+from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.schedule import POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
-from firmware_bridge.silence import POLL_S
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""

@@ -13,9 +13,9 @@ from edge.pipeline.commands import Commands
 from firmware_bridge.in_place import check_writable
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame
 
 
 class Sink(Protocol):

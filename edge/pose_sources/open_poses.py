@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseQueue
 from edge.sinks.registry import needs_cyclone_dds
-from edge.sinks.ros2.topic_names import base_topic
+from edge.sinks.ros2.cdr_messages import base_topic
 from edge.sinks.zenoh import close_session, open_session, opening, understood
 
 if TYPE_CHECKING:

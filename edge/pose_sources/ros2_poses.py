@@ -11,10 +11,10 @@ from cyclonedds.util import duration
 
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.pose_sources.stamped_poses import StampClock, pad_pose, placed
+from edge.sinks.ros2.cdr_messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED
 from edge.sinks.ros2.dds_domain import join, reader, taken
-from edge.sinks.ros2.ros_types import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED
 from firmware_bridge.errors import CdrError
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
 
 _KEPT: Final = 128

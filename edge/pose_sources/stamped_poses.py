@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.pipeline.pose_queue import PoseError
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.scans.device_clock import DeviceClock
 
 MOST_TILT_DEG: Final = 10.0

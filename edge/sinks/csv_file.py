@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import AXES
-from firmware_bridge.poses.pose_track import PoseTrack
-from firmware_bridge.poses.timed_pose import TimedPose
-from firmware_bridge.recording.csv_columns import CSV_POSES, EMULATED
-from firmware_bridge.recording.csv_reader import csv_header
+from firmware_bridge.poses import PoseTrack, TimedPose
+from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT

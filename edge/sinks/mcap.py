@@ -16,13 +16,23 @@ from edge.perception.result_fields import maps_of
 from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, record
 from edge.sinks.mcap_writer import McapFile
-from edge.sinks.ros2.cdr_messages import RESULT, frame_of, log_message, result_message, transforms, wrench
+from edge.sinks.ros2.cdr_messages import (
+    IMAGE,
+    LOG,
+    RESULT,
+    TF_MESSAGE,
+    WRENCH_STAMPED,
+    frame_of,
+    log_message,
+    result_message,
+    sensor_path,
+    transforms,
+    wrench,
+)
 from edge.sinks.ros2.map_messages import UNITS, image, in_si
-from edge.sinks.ros2.ros_types import IMAGE, LOG, TF_MESSAGE, WRENCH_STAMPED
-from edge.sinks.ros2.topic_names import sensor_path
 from edge.terminal.stop_signals import finishing
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.scan_messages import (
     POSE,

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS, MAPS
-from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.ros2.cdr_messages import IMAGE, RESULT
 from edge.sinks.ros2.map_messages import UNITS
-from edge.sinks.ros2.ros_types import IMAGE
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.mcap_reader import mcap_files
 from firmware_bridge.recording.mcap_records import MESSAGE, DamageError, records

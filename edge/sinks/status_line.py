@@ -13,7 +13,7 @@ from edge.pipeline.cadence import Rate
 from edge.pipeline.sink import Sink
 from edge.terminal.text_wrap import drawn, rewritable
 from firmware_bridge.errors import harmless
-from firmware_bridge.silence import SHOWN_AT_REST_S, SHOWN_SILENT_S
+from firmware_bridge.schedule import SHOWN_AT_REST_S, SHOWN_SILENT_S
 
 REFRESH_S: Final = 0.1
 CLEAR_TO_END: Final = "\x1b[K"

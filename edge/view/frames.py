@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from edge.inference.contract import Contract
-from edge.mapping.live_map import MapState
+from edge.mapping.sink import MapState
 from edge.perception.event import Event
 from edge.sinks.binary_message import pack
 from edge.sinks.json_encoding import event_record, record
@@ -15,7 +15,7 @@ from edge.view.run_snapshot import MAX_FPS, Newest, NumberedEvent, Point, RunSna
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import PlayerState
-from firmware_bridge.silence import SENSOR_SILENT_NS
+from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 VERSION: Final = 1
 

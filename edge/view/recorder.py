@@ -11,7 +11,7 @@ from edge.errors import SinkError
 from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from edge.pipeline.sink import Sink
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 
 FORM: Final = "mcap"
 """Form of the sink that is recorded into, and the ending of its files."""

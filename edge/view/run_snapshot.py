@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-from edge.mapping.live_map import MapState
+from edge.mapping.sink import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.cadence import Rate

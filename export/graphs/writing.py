@@ -9,7 +9,7 @@ from typing import Any
 
 import onnx
 
-from edge.evaluation.evaluate import judge_model, mean_error
+from edge.evaluation.metrics import judge_model, mean_error
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import ANY_BATCH, Contract
 from edge.inference.onnx_session import ModelSession, load_session

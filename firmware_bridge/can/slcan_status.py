@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable
 from typing import Final
 
-from firmware_bridge.silence import ADAPTER_ASKED_NS
+from firmware_bridge.schedule import ADAPTER_ASKED_NS
 
 STATUS_FLAGS: Final = b"F\r"
 

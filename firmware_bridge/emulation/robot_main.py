@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError
-from firmware_bridge.poses.pad_pose import POSE_FIELDS
+from firmware_bridge.poses import POSE_FIELDS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 

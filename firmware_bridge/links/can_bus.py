@@ -14,9 +14,8 @@ from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, Unread
 from firmware_bridge.links.discovery import can_networks, is_pretended
-from firmware_bridge.links.unread import Unread
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import Scan

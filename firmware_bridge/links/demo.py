@@ -13,8 +13,7 @@ from typing import Final, Self
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
 
 START_TIMEOUT_S: Final = 20.0

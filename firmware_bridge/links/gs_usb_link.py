@@ -16,9 +16,8 @@ from usb.backend import IBackend
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, Unread
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
-from firmware_bridge.links.unread import Unread
 from firmware_bridge.links.usb_devices import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.gs_usb_scans import GsUsbScans

@@ -15,11 +15,10 @@ from typing import Final, TypeVar
 
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Notice, NoticeKind, SerialLine
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.silence import LINK_SILENT_S
+from firmware_bridge.schedule import LINK_SILENT_S
 
 FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError, harmless
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.poses.pose_track import GAP_NS
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import GAP_NS, TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting

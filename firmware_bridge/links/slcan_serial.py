@@ -19,10 +19,9 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SerialLine, SourceKind
+from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread
 from firmware_bridge.links.fd_reader import BurstReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
-from firmware_bridge.links.unread import Unread
 from firmware_bridge.links.usb_devices import in_use
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan

@@ -24,8 +24,7 @@ from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 from firmware_bridge.scans.xela_server_scans import ServerScans
-from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.silence import SERVER_QUIET_S
+from firmware_bridge.schedule import NS_PER_S, SERVER_QUIET_S
 
 DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0

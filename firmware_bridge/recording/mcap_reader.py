@@ -17,10 +17,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import CdrError, RecordingError
+from firmware_bridge.in_place import read_bounded
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
 from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
 from firmware_bridge.recording.scan_messages import (

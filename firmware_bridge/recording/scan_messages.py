@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.errors import CdrError
 from firmware_bridge.pad_geometry import AXES, USPA44, SensorGeometry
-from firmware_bridge.poses.pad_pose import POSE_FIELDS, PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import POSE_FIELDS, PadPose, TimedPose
 from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
 from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.mounting import Mounting

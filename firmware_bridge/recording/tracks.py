@@ -13,7 +13,7 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.schedule import NS_PER_S
 
 if TYPE_CHECKING:
-    from firmware_bridge.poses.timed_pose import TimedPose
+    from firmware_bridge.poses import TimedPose
     from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 

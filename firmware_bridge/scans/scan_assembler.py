@@ -21,7 +21,7 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Readi
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, SHORTEST_PAUSE_NS, WireCycle
-from firmware_bridge.silence import SCAN_GIVEN_UP_NS
+from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",

@@ -18,7 +18,7 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Readi
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
-from firmware_bridge.silence import SCAN_GIVEN_UP_NS
+from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000

@@ -25,8 +25,7 @@ from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
-from firmware_bridge.schedule import NS_PER_S
-from firmware_bridge.silence import SERVER_READING_OLD_NS
+from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
 USUAL_UPS_HZ: Final = 83.0
 """Rate of a taxel by the vendor's data sheet, for a server that does not report it."""

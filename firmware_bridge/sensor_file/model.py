@@ -10,14 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import SensorFileError
+from firmware_bridge.in_place import read_bounded
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAIN_RANGE, PAD_RANGES, Pad
 from firmware_bridge.scans.scan import LONGEST_SENSOR_NAME, is_sensor_name
-from firmware_bridge.sensor_file.pad_frame import LARGEST_MM, PadFrame
 from firmware_bridge.strict_table import (
     LEAST_POSITIVE,
     Table,
@@ -43,6 +42,37 @@ took 27 s."""
 _REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
 PARTS: Final = ("mounting", "force", "baseline", "gains")
 """Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
+
+
+LARGEST_MM: Final = 1e5
+_OFF: Final = 1e-3
+"""Most by which a quaternion's norm may differ from 1."""
+
+
+@dataclass(frozen=True)
+class PadFrame:
+    """Place of a pad in a frame of the robot: the middle of its face, x to the right, y down, z into the pad.
+
+    Attributes:
+        parent: name of the robot's frame, such as "tool0".
+        place_mm: x, y, z of the middle of the face in the parent, in [mm].
+        quaternion: x, y, z, w of the turn from the parent's axes to the pad's.
+
+    Raises:
+        ValueError: one of these is invalid.
+    """
+
+    parent: str
+    place_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not self.parent or self.parent.startswith("/") or not self.parent.isprintable() or " " in self.parent:
+            raise ValueError(f"parent is {self.parent[:40]!r}, expected the name of a frame such as tool0")
+        if len(self.place_mm) != 3 or not all(abs(one) <= LARGEST_MM for one in self.place_mm):
+            raise ValueError(f"place_mm is {self.place_mm}, expected three numbers up to {LARGEST_MM:g}")
+        if len(self.quaternion) != 4 or not abs(math.hypot(*self.quaternion) - 1) <= _OFF:
+            raise ValueError(f"quaternion is {self.quaternion}, expected x, y, z, w of norm 1")
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from firmware_bridge.sensor_file.model import (
     FILE_FORMAT,
     FILE_VERSION,
     PARTS,
+    PadFrame,
     SensorEntry,
     SensorFile,
     load_sensor_file,
 )
-from firmware_bridge.sensor_file.pad_frame import PadFrame
 from firmware_bridge.zeroing.baseline import Baseline
 
 LOCKED_S: Final = 5.0

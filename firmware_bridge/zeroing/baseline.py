@@ -14,9 +14,8 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
-from firmware_bridge.in_place import write_in_place
+from firmware_bridge.in_place import read_bounded, write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name

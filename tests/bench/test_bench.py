@@ -15,9 +15,8 @@ from edge_samples import ROOT, make_contract, write_model
 
 from edge.bench import command, system
 from edge.bench import provenance as reports
-from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
-from edge.bench.contenders import Subject, subjects
-from edge.bench.errors import BenchError
+from edge.bench.contenders import FORCE_RANGE_N, Subject, error_rows, force_error_percent, force_floor_percent, subjects
+from edge.bench.options import BenchError
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
 from edge.bench.system import measured
 from edge.cli.main import main
@@ -175,7 +174,7 @@ def test_a_commit_that_is_not_here_is_named(tmp_path):
         system.tree_of("no-such-commit", tmp_path)
 
 
-SOURCE = "edge/bench/errors.py"
+SOURCE = "edge/bench/options.py"
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from bridge_samples import frames_of, make_counts, read_scans
 from link_rigs import DemoRig, GsUsbRig, PythonCanRig, ReplayRig, ServerRig, SlcanRig
 
 from edge.errors import UsageError
-from edge.pipeline.pace import Pace
+from edge.pipeline.cadence import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError

@@ -41,8 +41,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 

@@ -15,8 +15,7 @@ from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import POSE, decode_pose, encode_pose
 

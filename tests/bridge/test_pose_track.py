@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.pose_track import AHEAD_NS, GAP_NS, MOST_POSES, PoseTrack
+from firmware_bridge.poses import AHEAD_NS, GAP_NS, MOST_POSES, PadPose, PoseTrack
 
 MS = 1_000_000
 

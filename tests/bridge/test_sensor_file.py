@@ -13,8 +13,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import ID_MAPS
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
-from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline
 

@@ -18,7 +18,7 @@ from edge_samples import FakeLink
 
 from edge.api import USPA44, load_sensor_file
 from edge.cli import main as cli
-from edge.cli.run_options import parser
+from edge.cli.run_help import parser
 from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.guided_press import CORNERS, orders

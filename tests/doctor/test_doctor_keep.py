@@ -11,7 +11,7 @@ from test_doctor_command import doctor, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli import main as cli
-from edge.cli.run_options import parser
+from edge.cli.run_help import parser
 from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
@@ -20,8 +20,7 @@ from edge.pipeline.gain_keeper import keep_learned
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 
 GAINS = tuple(np.linspace(0.9, 1.1, 48).tolist())

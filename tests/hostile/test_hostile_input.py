@@ -15,13 +15,13 @@ from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import read_model
-from firmware_bridge.bounded_read import read_bounded
 from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.in_place import read_bounded
 from firmware_bridge.recording import csv_reader
 from firmware_bridge.recording import npz_recording as recording
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.zeroing.baseline import load_baselines
 from train.data.presses import load_presses
 from train.errors import CheckpointError, DatasetError

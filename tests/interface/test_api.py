@@ -21,7 +21,7 @@ from edge import api
 from edge.api import Stream, UsageError, load_model, open_recording, open_runtime, open_sink, open_source
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 
 NAN = float("nan")
 OF_THE_MOMENT = ("counters", "time_ns", "run_time_us", "latency_us", "baseline_age_s", "device_time_ns")

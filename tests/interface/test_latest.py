@@ -15,8 +15,7 @@ from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink
-from firmware_bridge.poses.pad_pose import PadPose
-from firmware_bridge.poses.timed_pose import TimedPose
+from firmware_bridge.poses import PadPose, TimedPose
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
 

@@ -16,10 +16,17 @@ from pose_samples import make_posed_contract
 from edge.api import MapSink, ObjectMap, PadPose, Runtime, Source, Stream, TimedPose, open_recording, open_runtime, pump
 from edge.mapping.map_files import check_npz
 from edge.pipeline.commands import RESET, CommandLines, Commands
-from edge.pipeline.pose_intake import REPEATED_NS, PoseIntake
-from edge.pipeline.pose_queue import FURTHEST_AHEAD_NS, WAITING_POSES, PoseError, PoseQueue, pose_of_fields
+from edge.pipeline.pose_queue import (
+    FURTHEST_AHEAD_NS,
+    REPEATED_NS,
+    WAITING_POSES,
+    PoseError,
+    PoseIntake,
+    PoseQueue,
+    pose_of_fields,
+)
 from edge.pipeline.run_statistics import Statistics
-from firmware_bridge.silence import POSES_SILENT_NS
+from firmware_bridge.schedule import POSES_SILENT_NS
 
 __all__ = ["files"]
 WHOLE = (

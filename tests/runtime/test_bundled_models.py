@@ -11,7 +11,7 @@ import pytest
 
 from edge.errors import WindowError
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.evaluate import judge, judge_model, mean_error
+from edge.evaluation.metrics import judge, judge_model, mean_error
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, POSED_MODEL, bundled_models, find_model
 from edge.inference.onnx_session import ModelSession

@@ -13,10 +13,10 @@ from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
-from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.contact_patch import touched, touched_patch
+from edge.perception.pattern_stages import touched, touched_patch
 from edge.perception.result import mask_bits
+from edge.perception.sensor import CHANGED_COUNTS, NOISE_COUNTS, LastReading
 from firmware_bridge.scans.mounting import Mounting
 
 SURE = make_contract(interval_factor=1.6)

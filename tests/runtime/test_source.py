@@ -14,7 +14,7 @@ from edge_samples import REST, FakeLink, ListSink, make_scan
 from runtime_samples import presses, pumped
 
 from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
-from edge.pipeline.pace import Pace, PaceSetter
+from edge.pipeline.cadence import Pace, PaceSetter
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink

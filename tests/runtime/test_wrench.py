@@ -13,10 +13,9 @@ from edge.api import USPA44, find_model, load_model
 from edge.inference.forward_model import features
 from edge.perception.wrench import LEAST_FORCE_N, Balance, wrench_of
 from edge.sinks.mcap import McapSink
-from edge.sinks.ros2.cdr_messages import force_and_torque
+from edge.sinks.ros2.cdr_messages import WRENCH_STAMPED, force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
 from edge.sinks.ros2.map_messages import image_map
-from edge.sinks.ros2.ros_types import WRENCH_STAMPED
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS

@@ -15,12 +15,11 @@ from cli_samples import base_options, files, records, start
 from edge_samples import BASELINE, ROOT, FakeModel, make_scan
 
 from edge.api import Runtime, UsageError
-from edge.pipeline.pose_intake import PoseIntake
-from edge.pipeline.pose_queue import PoseError, PoseQueue
+from edge.pipeline.pose_queue import PoseError, PoseIntake, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses
 from edge.pose_sources.stamped_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
 __all__ = ["files"]
 PATIENCE_S = 20

@@ -23,7 +23,7 @@ from edge.sinks.ros2.diagnostics import Level, diagnose
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame
 
 __all__ = ["sink"]
 IMAGE, WRENCH = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped"

@@ -26,19 +26,19 @@ from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
 from edge.api import Event, Note, Result, SinkError, UsageError
-from edge.cli.run_options import parser
+from edge.cli.run_help import parser
 from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import check_sink, open_sink
-from edge.sinks.ros2 import cdr_messages, map_messages, ros_types
+from edge.sinks.ros2 import cdr_messages, map_messages
+from edge.sinks.ros2.cdr_messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
 from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
-from edge.sinks.ros2.topic_names import LONGEST_TOPIC, base_topic, sensor_topic
 from firmware_bridge.errors import CdrError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.recording.cdr import MessageType
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.sensor_file.model import PadFrame
 
 __all__ = ["sink"]
 
@@ -224,7 +224,7 @@ def test_rviz_shows_topics_that_are_published(sink):
     assert (qos["durability"], qos["reliability"]) == ("transient_local", "reliable")
 
 
-KINDS = [one for one in ros_types.TYPES.values() if one.name in TYPE_HASHES]
+KINDS = [one for one in cdr_messages.TYPES.values() if one.name in TYPE_HASHES]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
@@ -238,7 +238,7 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
 def test_every_type_is_ros_own():
     """Also those of recordings, which are not published."""
     assert TYPE_HASHES.keys() == {one.name for one in KINDS}
-    for kind in ros_types.TYPES.values():
+    for kind in cdr_messages.TYPES.values():
         assert [(field.name, field.kind) for field in kind.fields] == [
             (name, ros_kind.replace("/msg/", "/")) for name, ros_kind, _ in ros2_messages.fields(kind.name)
         ]
@@ -274,9 +274,9 @@ UNIX_NS = 1_700_000_000_123_456_789
 
 
 def test_another_image_is_not_taken_for_a_map():
-    said = ros_types.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    said = cdr_messages.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
-        map_messages.image_map(ros_types.IMAGE.encode({**said, "encoding": "mono8"}))
+        map_messages.image_map(cdr_messages.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():

@@ -6,7 +6,7 @@ from edge_samples import make_scan
 from edge.perception.result import Result
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 
 PIXEL_MM = USPA44.pixel_pitch_mm(10)
 SAMPLES = 4

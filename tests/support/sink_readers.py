@@ -16,9 +16,8 @@ from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.pipeline.sink import RunFacts, Sink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.ros2.cdr_messages import LOG, RESULT
 from edge.sinks.ros2.map_messages import image_map
-from edge.sinks.ros2.ros_types import LOG
 
 CONTRACT = make_contract(interval_factor=1.6)
 PERIOD_NS = 10_000_000

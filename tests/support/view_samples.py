@@ -21,8 +21,8 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.sinks.binary_message import unpack
 from edge.sinks.registry import open_sink
-from edge.view.live_view import LiveView
-from firmware_bridge.poses.pad_pose import PadPose
+from edge.view.server import LiveView
+from firmware_bridge.poses import PadPose
 
 CONTRACT = make_contract(interval_factor=1.6)
 TIMEOUT_S = 60.0

@@ -23,7 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from edge.bench.errors import BenchError
+from edge.bench.options import BenchError
 from edge.bench.system import Ratio, ratio_of, tree_of
 
 ROOT: Final = Path(__file__).parents[2]

@@ -6,7 +6,7 @@ from edge_samples import make_contract
 
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
-from edge.inference.expected_error import Expected, doubt, expect, is_confidence
+from edge.inference.intervals import Expected, doubt, expect, is_confidence
 from edge.inference.onnx_session import ModelSession
 from train.data.frozen_presses import load_frozen_presses
 from train.learning.expected_error_table import BINS, doubts_and_errors, fit_confidence

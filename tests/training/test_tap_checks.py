@@ -7,7 +7,7 @@ import pytest
 from press_samples import make_press_set
 
 from firmware_bridge.pad_geometry import USPA44
-from firmware_bridge.poses.pad_pose import PadPose
+from firmware_bridge.poses import PadPose
 from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.learning import tap_checks

@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 from edge.pipeline.pump import uncollected
 from edge.view import server
 from edge.view import viewers as attended
-from edge.view.connection_limits import MOST_CONNECTIONS, MOST_VIEWERS
+from edge.view.viewers import MOST_CONNECTIONS, MOST_VIEWERS
 
 __all__ = ["page"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
-from firmware_bridge.recording.npz_reader import read_npz
+from firmware_bridge.recording.npz_recording import read_npz
 from train.errors import DatasetError
 from train.physics.resample import resample, resample_touching
 

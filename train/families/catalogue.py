@@ -62,7 +62,7 @@ class Tapped:
     Attributes:
         heights_mm: (K, m, m) at the pad's places, newest tap first.
         cover: compliant cover of the shape or the pad.
-        poses: (K, 3) of the pad in the newest tap's axes, see `firmware_bridge.poses.pad_pose`.
+        poses: (K, 3) of the pad in the newest tap's axes, see `firmware_bridge.poses`.
         angle_deg: (K,), turn of the pad seen from above, for the earth's field.
     """
 

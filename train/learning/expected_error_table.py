@@ -1,4 +1,4 @@
-"""Table from a network's deviations to its error (edge.inference.expected_error), fitted on taps not trained on."""
+"""Table from a network's deviations to its error (edge.inference.intervals), fitted on taps not trained on."""
 
 from collections.abc import Collection
 from typing import Final
@@ -6,9 +6,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.evaluate import windows_of
+from edge.evaluation.metrics import windows_of
 from edge.evaluation.test_set import FrozenSet
-from edge.inference.expected_error import doubt
+from edge.inference.intervals import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.data.generation_config import SEED
@@ -27,7 +27,7 @@ def confidence_sets(validation: PaperTaps, scale: int) -> list[FrozenSet]:
 
 
 def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
-    """Fit the table of edge.inference.expected_error for a model with deviations.
+    """Fit the table of edge.inference.intervals for a model with deviations.
 
     Frames are sorted by their uncertainty into bins of equally many; a bin's gain is that of its frames together.
     """

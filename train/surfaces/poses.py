@@ -5,7 +5,7 @@ whose pattern is reconstructed; the taps before it are made at the same place, e
 step. Targets are split by position: one for the test and one for validation, 72 targets each, the same for every K.
 
 A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
-in [deg], as in `firmware_bridge.poses.pad_pose`.
+in [deg], as in `firmware_bridge.poses`.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -4,6 +4,7 @@ Lengths are in metres, as ROS has them. A value that is not available is NaN, or
 """
 
 import math
+import re
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, Final
@@ -12,14 +13,78 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, EventKind
 from edge.perception.field import Columns, Out
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
-from edge.sinks.ros2.ros_types import LOG, TF_MESSAGE, WRENCH_STAMPED, header
 from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.recording.cdr import STD_HEADER, MessageType, stamp
-from firmware_bridge.sensor_file.pad_frame import PadFrame
+from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
+from firmware_bridge.sensor_file.model import PadFrame
+
+_TYPE_FIELDS: Final = {
+    "sensor_msgs/Image": "std_msgs/Header header, uint32 height, uint32 width, string encoding, uint8 is_bigendian, "
+    "uint32 step, uint8[] data",
+    "geometry_msgs/Vector3": "float64 x, float64 y, float64 z",
+    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force, geometry_msgs/Vector3 torque",
+    "geometry_msgs/WrenchStamped": "std_msgs/Header header, geometry_msgs/Wrench wrench",
+    "rcl_interfaces/Log": "builtin_interfaces/Time stamp, uint8 level, string name, string msg, string file, "
+    "string function, uint32 line",
+    "std_msgs/String": "string data",
+    "std_msgs/Float64": "float64 data",
+    "std_msgs/Int8": "int8 data",
+    "sensor_msgs/PointField": "string name, uint32 offset, uint8 datatype, uint32 count",
+    "sensor_msgs/PointCloud2": "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, "
+    "bool is_bigendian, uint32 point_step, uint32 row_step, uint8[] data, bool is_dense",
+    "diagnostic_msgs/KeyValue": "string key, string value",
+    "diagnostic_msgs/DiagnosticStatus": "byte level, string name, string message, string hardware_id, "
+    "diagnostic_msgs/KeyValue[] values",
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header, diagnostic_msgs/DiagnosticStatus[] status",
+    "geometry_msgs/Point": "float64 x, float64 y, float64 z",
+    "geometry_msgs/PointStamped": "std_msgs/Header header, geometry_msgs/Point point",
+    "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
+    "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
+    "geometry_msgs/PoseStamped": "std_msgs/Header header, geometry_msgs/Pose pose",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose, float64[36] covariance",
+    "geometry_msgs/PoseWithCovarianceStamped": "std_msgs/Header header, geometry_msgs/PoseWithCovariance pose",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation, geometry_msgs/Quaternion rotation",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, "
+    "geometry_msgs/Transform transform",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+}
+"""Fields of each type, each after the types in it."""
+
+
+def _types() -> dict[str, MessageType]:
+    types = {"builtin_interfaces/Time": TIME, "std_msgs/Header": STD_HEADER}
+    for name, fields in _TYPE_FIELDS.items():
+        lines = fields.split(", ")
+        kinds = [line.partition(" ")[0].removesuffix("[]") for line in lines]
+        parts = [types[kind] for kind in kinds if kind in types]
+        types[name] = MessageType(name.replace("/", "/msg/"), "\n".join(lines), *parts)
+    return types
+
+
+TYPES: Final = _types()
+IMAGE: Final = TYPES["sensor_msgs/Image"]
+WRENCH_STAMPED: Final = TYPES["geometry_msgs/WrenchStamped"]
+LOG: Final = TYPES["rcl_interfaces/Log"]
+STRING: Final = TYPES["std_msgs/String"]
+FLOAT64: Final = TYPES["std_msgs/Float64"]
+INT8: Final = TYPES["std_msgs/Int8"]
+POINT_CLOUD: Final = TYPES["sensor_msgs/PointCloud2"]
+DIAGNOSTIC_ARRAY: Final = TYPES["diagnostic_msgs/DiagnosticArray"]
+POINT_STAMPED: Final = TYPES["geometry_msgs/PointStamped"]
+POSE_STAMPED: Final = TYPES["geometry_msgs/PoseStamped"]
+POSE_WITH_COVARIANCE_STAMPED: Final = TYPES["geometry_msgs/PoseWithCovarianceStamped"]
+TRANSFORM_STAMPED: Final = TYPES["geometry_msgs/TransformStamped"]
+TF_MESSAGE: Final = TYPES["tf2_msgs/TFMessage"]
+
+
+def header(frame: str, unix_ns: int) -> dict[str, Any]:
+    """Return the fields of a std_msgs/Header."""
+    return {"stamp": stamp(unix_ns), "frame_id": frame}
+
 
 _FIELDS: Final = tuple(field for field in FIELDS if Out.ROS in field.out)
 _NAMES: Final = tuple(name for field in _FIELDS for name in field.names)
@@ -123,3 +188,52 @@ def log_message(event: Event, unix_ns: int) -> bytes:
 def _taxel_places_m(geometry: SensorGeometry) -> NDArray[np.float64]:
     """Return the centres of the taxels (taxels, 3) on the face, in [m]."""
     return np.pad(geometry.taxel_centres_mm() / 1e3, ((0, 0), (0, 1)))
+
+
+LONGEST_TOPIC: Final = 247
+"""Limit of ROS; DDS takes 255, some of which are for prefixes."""
+_ALLOWED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_PLAIN: Final = re.compile(r"(?!s[0-9])(?!x_)[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
+_FROM_DIGIT: Final = re.compile(r"[0-9][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
+
+
+def base_topic(text: str) -> str:
+    """Return a topic as a user writes it, without a leading slash.
+
+    Raises:
+        UsageError: it is no valid topic of ROS.
+    """
+    topic = text.removeprefix("/")
+    if not all(_ALLOWED.fullmatch(token) for token in topic.split("/")):
+        raise UsageError(
+            f"topic {text!r} is not a ROS topic: expected letters, digits and _ between single slashes, no digit "
+            "first, such as ros2:skin or ros2:/gripper/skin"
+        )
+    return topic
+
+
+def sensor_path(sensor: str) -> str:
+    """Return the part of a topic that stands for a sensor; no two sensors share one.
+
+    "4" becomes s4, "left/4" left/s4; a name that is not valid in ROS, or could be taken for another, becomes x_ and its
+    UTF-8 in hexadecimal digits.
+    """
+    return "/".join(map(_token, sensor.split("/")))
+
+
+def sensor_topic(base: str, sensor: str, what: str) -> str:
+    """Return the topic of one thing that is published of a sensor; a SinkError where it is too long for ROS."""
+    topic = "/".join((base, sensor_path(sensor), what))
+    if len(topic) >= LONGEST_TOPIC:
+        raise SinkError(
+            f"topic {topic} has {len(topic)} characters, ROS holds {LONGEST_TOPIC - 1}: name sensor {sensor!r} shorter"
+        )
+    return topic
+
+
+def _token(part: str) -> str:
+    if _PLAIN.fullmatch(part):
+        return part
+    if _FROM_DIGIT.fullmatch(part):
+        return f"s{part}"
+    return f"x_{part.encode().hex() or '0'}"

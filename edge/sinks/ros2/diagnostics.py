@@ -6,8 +6,8 @@ from typing import Any, Final, NamedTuple
 
 from edge.perception.result import Result
 from edge.sinks.json_encoding import record
-from edge.sinks.ros2.ros_types import DIAGNOSTIC_ARRAY, header
-from firmware_bridge.silence import SHOWN_SILENT_S
+from edge.sinks.ros2.cdr_messages import DIAGNOSTIC_ARRAY, header
+from firmware_bridge.schedule import SHOWN_SILENT_S
 
 _LOSSES: Final = ("dropped", "overruns", "missed", "missing_taxels", "unwritten")
 

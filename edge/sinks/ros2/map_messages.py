@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.result import Result
-from edge.sinks.ros2.ros_types import IMAGE, POINT_CLOUD, header
+from edge.sinks.ros2.cdr_messages import IMAGE, POINT_CLOUD, header
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.scan import ABSENT, Scan
 

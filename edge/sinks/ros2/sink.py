@@ -19,11 +19,7 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import event_record
-from edge.sinks.ros2.cdr_messages import frame_of, transforms, wrench, wrench_message
-from edge.sinks.ros2.dds_domain import join, reader, taken, writer
-from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose, diagnostics_message
-from edge.sinks.ros2.map_messages import image, in_si, points, taxels
-from edge.sinks.ros2.ros_types import (
+from edge.sinks.ros2.cdr_messages import (
     DIAGNOSTIC_ARRAY,
     FLOAT64,
     IMAGE,
@@ -33,9 +29,17 @@ from edge.sinks.ros2.ros_types import (
     STRING,
     TF_MESSAGE,
     WRENCH_STAMPED,
+    base_topic,
+    frame_of,
     header,
+    sensor_topic,
+    transforms,
+    wrench,
+    wrench_message,
 )
-from edge.sinks.ros2.topic_names import base_topic, sensor_topic
+from edge.sinks.ros2.dds_domain import join, reader, taken, writer
+from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose, diagnostics_message
+from edge.sinks.ros2.map_messages import image, in_si, points, taxels
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.evaluate import judge
+from edge.evaluation.metrics import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.terminal.progress_bar import tracked
 from train.data.presses import PressSet, join_presses

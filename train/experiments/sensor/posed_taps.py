@@ -15,7 +15,7 @@ from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import NOT_OF_IT, PatternCheck
 from edge.terminal.progress_bar import tracked
-from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.generation_config import SEED
 from train.data.press_batches import stated_poses

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from edge.inference.onnx_session import ModelSession
-from edge.perception.change_gate import NOISE_COUNTS
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
+from edge.perception.sensor import NOISE_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ScanSeries

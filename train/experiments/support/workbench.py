@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edge.evaluation.evaluate import judge
+from edge.evaluation.metrics import judge
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
@@ -42,7 +42,7 @@ _QUICK_ONE_IN: Final = 12
 _QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 
 Figures = dict[str, NDArray[np.float64]]
-"""Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
+"""Every metric of every frame, (n,) each, as returned by edge.evaluation.metrics."""
 
 
 @dataclass(frozen=True)
