@@ -54,10 +54,8 @@ class SensorGeometry:
 USPA44: Final = SensorGeometry("uSPa44", rows=4, cols=4, pitch_mm=4.7, width_mm=20.0, height_mm=20.0)
 USPA46: Final = SensorGeometry("uSPa46", rows=4, cols=6, pitch_mm=7.25, width_mm=43.5, height_mm=29.0)
 """Pad uSPa46, with an assumed outline of half a pitch beyond the outer taxels."""
-PADS: Final = (USPA44, USPA46)
-"""Pads with a name of their own."""
-MOST_TAXELS: Final = 64
-"""Most taxels of a sensor: the bits of the masks in records and files."""
+PADS: Final = (USPA44, USPA46)  # pads with a name of their own
+MOST_TAXELS: Final = 64  # most taxels of a sensor: the bits of the masks in records and files
 
 
 def pad_of(rows: int, cols: int) -> SensorGeometry:

@@ -12,8 +12,7 @@ from math import cos, hypot, radians, sin
 from typing import Final
 
 PLACE_ERROR_MM: Final = 0.2
-TURN_ERROR_DEG: Final = 1.0
-"""Standard deviations of a pose on a gripper mounted by hand, where nothing else is stated."""
+TURN_ERROR_DEG: Final = 1.0  # standard deviations of a pose on a gripper mounted by hand, where nothing else is stated
 MOST: Final = 1e6
 """Largest coordinate in [mm] and turn in [deg], so that every difference of two is a number with a meaning."""
 
@@ -61,10 +60,8 @@ class PadPose:
 POSE_FIELDS: Final = tuple(one.name for one in fields(PadPose))
 
 
-MOST_POSES: Final = 4096
-"""Poses that are remembered: 40 s at 100 poses/s, longer than any tap lasts."""
-GAP_NS: Final = 200_000_000
-"""Longest time between two poses that is interpolated, in [ns]."""
+MOST_POSES: Final = 4096  # poses that are remembered: 40 s at 100 poses/s, longer than any tap lasts
+GAP_NS: Final = 200_000_000  # longest time between two poses that is interpolated, in [ns]
 AHEAD_NS: Final = 50_000_000
 """Longest time for which the course goes on after the last pose, in [ns]: a scan may arrive first."""
 

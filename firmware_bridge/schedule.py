@@ -9,16 +9,13 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-LAST_TIME_NS: Final = 1 << 60
-"""Latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63."""
+LAST_TIME_NS: Final = 1 << 60  # latest time in a recording, in [ns] (36 years): sums of two times stay below 2^63
 NS_PER_S: Final = 1_000_000_000
 POSITIVE: Final = (1e-9, 1e9)
 """Range of a positive number that a user gives: times and rates beyond it have no use, and no room in nanoseconds."""
 
-Clock = Callable[[], int]
-"""Clock of monotonic time, in [ns]."""
-Sleep = Callable[[float], object]
-"""Function that sleeps for a time in [s]; may return early or late."""
+Clock = Callable[[], int]  # clock of monotonic time, in [ns]
+Sleep = Callable[[float], object]  # function that sleeps for a time in [s]; may return early or late
 
 
 def sleep_until(deadline_ns: int, clock: Clock = time.monotonic_ns, sleep: Sleep = time.sleep) -> int:
@@ -64,8 +61,7 @@ class Ticker:
         return self._start_ns + round(tick * NS_PER_S / self._rate_hz)
 
 
-SLOWEST_PERIOD_NS: Final = 250_000_000
-"""Time between two scans of the slowest sensor on record, in [ns]."""
+SLOWEST_PERIOD_NS: Final = 250_000_000  # time between two scans of the slowest sensor on record, in [ns]
 
 # ---- A sensor ----
 
@@ -77,13 +73,11 @@ SCAN_GIVEN_UP_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Time after its first reading at which an incomplete scan is given up: later readings are another scan's."""
 SERVER_READING_OLD_NS: Final = 4 * SLOWEST_PERIOD_NS
 """Age at which a reading from the vendor's server belongs to a silent sensor."""
-TAXEL_SILENT_SCANS: Final = 50
-"""Scans without a taxel after which its loss is reported, and zeroing goes on without it."""
+TAXEL_SILENT_SCANS: Final = 50  # scans without a taxel after which its loss is reported, and zeroing goes on without it
 POSES_SILENT_NS: Final = SENSOR_SILENT_NS
 """Time without a pose, after one that does not hold, after which its source is reported silent: some scans were without
 one by then."""
-LATEST_SCAN_S: Final = 2.0
-"""Age of the last scan at the end of its watch above which the doctor reports a sensor."""
+LATEST_SCAN_S: Final = 2.0  # age of the last scan at the end of its watch above which the doctor reports a sensor
 
 # ---- A link ----
 
@@ -91,8 +85,7 @@ LINK_SILENT_S: Final = 0.7
 """Time without a scan after which a link is opened again: a little more than a sensor's silence, which must not."""
 ADAPTER_ASKED_NS: Final = 500_000_000
 """Time without a scan after which an adapter's status, which can explain the silence, is requested."""
-SERVER_QUIET_S: Final = 0.75
-"""Time without a message after which the vendor's server is pinged."""
+SERVER_QUIET_S: Final = 0.75  # time without a message after which the vendor's server is pinged
 
 # ---- A person, or a program that waits ----
 

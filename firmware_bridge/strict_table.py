@@ -5,8 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-LARGEST: Final = 1e12
-"""Largest magnitude of a number in the file; a whole number can have more digits than any float."""
+LARGEST: Final = 1e12  # largest magnitude of a number in the file; a whole number can have more digits than any float
 LEAST_POSITIVE: Final = 1e-300
 """Least number above 0: much smaller ones count as 0 where a library has made the processor faster."""
 

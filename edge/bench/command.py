@@ -22,12 +22,10 @@ from edge.bench.system import Page, line, show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
-STARTS: Final = 5
-"""Number of starts whose median is the start-up."""
+STARTS: Final = 5  # number of starts whose median is the start-up
 INTERRUPTED: Final = 130
 """Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
-FULL_TICKS: Final = 3000
-"""Fewest ticks for which p99.9 rests on more than the longest few."""
+FULL_TICKS: Final = 3000  # fewest ticks for which p99.9 rests on more than the longest few
 _BLAS: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
 _ERROR_COLUMNS: Final = (
     *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),

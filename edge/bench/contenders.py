@@ -82,8 +82,7 @@ def opened(subject: Subject, threads: int) -> Infer:
     return lambda window: model.run(scale_window(window[:taps]))
 
 
-FORCE_RANGE_N: Final = 5.0
-"""Force at which every tap of a frozen set ends, unless the sensor's depth limit comes first."""
+FORCE_RANGE_N: Final = 5.0  # force at which every tap of a frozen set ends, unless the sensor's depth limit comes first
 
 
 class ErrorRow(NamedTuple):

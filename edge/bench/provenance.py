@@ -25,8 +25,7 @@ from typing import Any, Final
 import numpy as np
 import onnxruntime
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-"""Folder of the packages: the checkout's, where there is one."""
+ROOT: Final = Path(__file__).resolve().parents[2]  # folder of the packages: the checkout's, where there is one
 UNKNOWN: Final = "unknown"
 _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MULTILINE)
 

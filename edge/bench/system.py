@@ -30,11 +30,9 @@ ROOT: Final = Path(__file__).parents[2]
 ROUNDS: Final = 5
 SETTLE_S: Final = 2.0
 RATE_HZ: Final = 100.0
-CONTROLLERS: Final = ("4", "6", "8", "10")
-"""Names of the sensors on a bus: at 1 Mbit/s it carries no more."""
+CONTROLLERS: Final = ("4", "6", "8", "10")  # names of the sensors on a bus: at 1 Mbit/s it carries no more
 FRAME_US: Final = 130
-PRESSED_SHARE: Final = 3
-"""In contact, one sensor in so many is pressed, rounded up."""
+PRESSED_SHARE: Final = 3  # in contact, one sensor in so many is pressed, rounded up
 PARTS: Final = ("at rest", "in contact")
 COLUMNS: Final = ("what", "CPU %", "last byte to record p50 us", "p99 us", "lost", "MB")
 LOST: Final = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")

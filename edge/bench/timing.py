@@ -17,8 +17,7 @@ from edge.bench.contenders import FROZEN_FILE, Subject, opened
 from edge.errors import EdgeError
 from firmware_bridge.schedule import Clock, Sleep, Ticker
 
-Run = Callable[[int], object]
-"""One inference; its argument is a number that selects the input."""
+Run = Callable[[int], object]  # one inference; its argument is a number that selects the input
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,7 @@ from firmware_bridge.zeroing.baseline import deformation
 if TYPE_CHECKING:
     from edge.view.server import LiveView
 
-FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2
-"""Scenes as train/demo.py numbers them; FREE is outside of any."""
+FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2  # scenes as train/demo.py numbers them; FREE is outside of any
 _BEGINS: Final = {
     FOREIGN: "demo: now another surface is tapped, and then the first one again: no pattern may be made from both",
     MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",

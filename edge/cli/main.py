@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 EXIT_DEVICE: Final = 3
 EXIT_MODEL: Final = 4
 EXIT_SINK: Final = 5
-EXIT_INTERRUPTED: Final = 130
-"""Exit code of a shell after Ctrl-C, used until a run has begun that ends well."""
+EXIT_INTERRUPTED: Final = 130  # exit code of a shell after Ctrl-C, used until a run has begun that ends well
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -22,8 +22,7 @@ WINDOWS: Final = 16
 SEED: Final = 1
 _SHOWN: Final = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
 """Metrics that are shown, and how wide."""
-UNEVEN: Final = 3.0
-"""Ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine."""
+UNEVEN: Final = 3.0  # ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:

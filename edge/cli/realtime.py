@@ -11,8 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Final
 
-PRIORITY: Final = 20
-"""Modest priority: above every ordinary process, below the kernel's interrupt threads (50)."""
+PRIORITY: Final = 20  # modest priority: above every ordinary process, below the kernel's interrupt threads (50)
 MCL_CURRENT: Final = 1
 MCL_FUTURE: Final = 2
 MCL_ONFAULT: Final = 4

@@ -17,8 +17,7 @@ from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 
-AS_MAPPED: Final = "as in the id map"
-"""Name of the orientation in which nothing is to be corrected."""
+AS_MAPPED: Final = "as in the id map"  # name of the orientation in which nothing is to be corrected
 CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
 TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 """Signs of x and y of a push from each corner to the middle."""
@@ -27,8 +26,7 @@ AGREEING: Final = 0.8
 """Least share of the pushes that must point along one axis: 1 where every corner agrees, 0.5 or 0 where one of four
 or three contradicts, 0 for the other axis.
 """
-_OFF_THE_MIDDLE: Final = 0.4
-"""Distance from a midline, in pitches, below which a press is on no corner."""
+_OFF_THE_MIDDLE: Final = 0.4  # distance from a midline, in pitches, below which a press is on no corner
 
 
 @dataclass(frozen=True)

@@ -61,12 +61,9 @@ LATENCY_LIMIT_MS: Final = 2
 HELD_BACK_LIMIT_MS: Final = 5.0
 """Longest delay of a quarter of the scans, half of a period; a timer at 16 ms makes it 10 to 12."""
 LINE_BYTES: Final = 22
-STAMPED_LINE_BYTES: Final = 26
-"""Length of an slcan line of a taxel with a time stamp; LINE_BYTES is without one."""
-BITS_PER_BYTE: Final = 10
-"""Bits of a byte on a serial line: eight, a start bit and a stop bit."""
-ANSWERS_BYTES: Final = 64
-"""Fewer bytes are an adapter's answers to commands; noise of another line speed is more."""
+STAMPED_LINE_BYTES: Final = 26  # length of an slcan line of a taxel with a time stamp; LINE_BYTES is without one
+BITS_PER_BYTE: Final = 10  # bits of a byte on a serial line: eight, a start bit and a stop bit
+ANSWERS_BYTES: Final = 64  # fewer bytes are an adapter's answers to commands; noise of another line speed is more
 USUAL_RATE_HZ: Final = 100.0
 FULL_SHARE: Final = 0.9
 OVERFULL_SHARE: Final = 1.05

@@ -17,12 +17,10 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNT
 
 PERIODS_TOGETHER: Final = 100
 """Number of periods that are averaged: an adapter that delivers scans in bunches makes single periods meaningless."""
-AROUND: Final = 16
-"""Scans before and after a scan that show whether it alone was late."""
+AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
 FEWEST_SCANS: Final = 50
 _TRIMMED: Final = 0.02
-_TRIMMED_RMS: Final = 0.9346
-"""RMS of a normal variable of deviation 1 without the 2 % that lie farthest out."""
+_TRIMMED_RMS: Final = 0.9346  # RMS of a normal variable of deviation 1 without the 2 % that lie farthest out
 _ENDS: Final = 0.1
 
 
@@ -131,8 +129,7 @@ NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
 """Limits of "look" and "wrong" for x, y, z. On record are 1.1 to 2.8 and 2 to 4.7; four taps need under eight."""
 STRAY_COUNTS: Final = 12_000.0
 """Largest distance of a taxel's rest from the others' on one axis: z of one model spans 9700 from end to end."""
-LONE_DRIFT_COUNTS: Final = 94.0
-"""Largest drift of a single taxel, in counts; as much in every taxel is a contact."""
+LONE_DRIFT_COUNTS: Final = 94.0  # largest drift of a single taxel, in counts; as much in every taxel is a contact
 _OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and replace the sensor if it persists"
 
 

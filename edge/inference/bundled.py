@@ -7,15 +7,12 @@ from typing import Final
 from edge.errors import ModelError, UsageError
 
 BUNDLE_DIR: Final = Path(__file__).resolve().parents[1] / "models"
-TAXELS: Final = BUNDLE_DIR / "taxels.npz"
-"""File of the estimator of dead taxels."""
+TAXELS: Final = BUNDLE_DIR / "taxels.npz"  # file of the estimator of dead taxels
 CONTACTS: Final = BUNDLE_DIR / "contacts.npz"
 """File of the distribution of contacts by which a running sensor learns its gains."""
-DEFAULT_MODEL: Final = "stsr-int8"
-"""Model that assumes nothing of earlier taps."""
+DEFAULT_MODEL: Final = "stsr-int8"  # model that assumes nothing of earlier taps
 INT8_SUFFIX: Final = "-int8"
-POSED_MODEL: Final = "mtsr-int8"
-"""Default where poses of the pad come: it combines up to 7 taps."""
+POSED_MODEL: Final = "mtsr-int8"  # default where poses of the pad come: it combines up to 7 taps
 _OF_TAPS: Final = re.compile(r"(?<=^mtsr)[2-7](?=-int8$|$)")
 """Number of taps in the paper's names: mtsr4 is mtsr, given four taps at most."""
 

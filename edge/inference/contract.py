@@ -39,8 +39,7 @@ OUTSIDE: Final = 1.5
 """Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
 DETERMINED: Final = 0.4
 """Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
-LEAST_UNIT: Final = 1e-6
-"""Least divisor in counts, newtons or millimetres, so that float32 holds the quotient."""
+LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
 
 Shape = tuple[Any, ...]
 """Shape of an input or output, the batch first: a number for each dimension, or a name where it is free."""

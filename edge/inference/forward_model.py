@@ -17,8 +17,7 @@ from firmware_bridge.pad_geometry import AXES
 GRID: Final = 8
 """Cells of the pattern along a side: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
 _CELLS: Final = GRID**2
-KPA: Final = 30.0
-"""Tangential traction that counts as 1, in [kPa]."""
+KPA: Final = 30.0  # tangential traction that counts as 1, in [kPa]
 _DRAG_GRID: Final = 4
 """Cells of the drag along a side in the contract; the traction has twice as many, and four of them share a weight."""
 FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2

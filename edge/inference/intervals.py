@@ -85,8 +85,7 @@ def _grown(masks: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 LARGEST: Final = float(np.finfo(np.float32).max)
 """Largest number in a contract: patterns are float32. A whole number can have more digits than any float."""
-WORTH_A_TAP: Final = 0.02
-"""Share of the error that another tap must be expected to take away to be worth it: .2 dB."""
+WORTH_A_TAP: Final = 0.02  # share of the error that another tap must be expected to take away to be worth it: 0.2 dB
 
 Table = Mapping[str, Mapping[str, list[float]]]
 """Number of taps -> doubt, error and gain, lists of one length: at that doubt, the RMS error as a share of the

@@ -13,12 +13,9 @@ from typing import Final, NamedTuple
 from edge.errors import ModelError
 from firmware_bridge.in_place import read_bounded
 
-MOST_BYTES: Final = 1 << 28
-"""Largest file: a hundred times the largest bundled model."""
-MOST_FIELDS: Final = 1 << 20
-"""Most fields, some seconds of walking."""
-MOST_NODES: Final = 5000
-"""Most operators; onnxruntime goes over all of them repeatedly."""
+MOST_BYTES: Final = 1 << 28  # largest file: a hundred times the largest bundled model
+MOST_FIELDS: Final = 1 << 20  # most fields, some seconds of walking
+MOST_NODES: Final = 5000  # most operators; onnxruntime goes over all of them repeatedly
 MOST_DIMS: Final = 64
 _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
@@ -45,8 +42,7 @@ _NESTED: Final = "has graphs within its graph, expected one plain graph"
 _BROKEN: Final = "not a model that onnxruntime can load: damaged, or not an ONNX file"
 _SPARSE: Final = "has sparse weights, expected plain ones"
 
-_Message = Mapping[int, "_Message | str"]
-"""Number of a field -> the message that it holds, or the reason to refuse it."""
+_Message = Mapping[int, "_Message | str"]  # number of a field -> the message that it holds, or the reason to refuse it
 _DIMS: Final = 1
 _LOCATION: Final = 14
 _OPERATOR: Final = 4

@@ -21,8 +21,7 @@ from edge.inference.timed_loading import within_limit
 from firmware_bridge.errors import harmless
 
 WARM_UP_RUNS: Final = 10
-MOST_RUNS: Final = 32
-"""Numbers of windows and of taps for which arrays are kept: four sensors with seven taps have 28."""
+MOST_RUNS: Final = 32  # numbers of windows and of taps for which arrays are kept: four sensors with seven taps have 28
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
 NOT_WHILE_LOADING: Final = ["ConstantFolding"]

@@ -13,8 +13,7 @@ from typing import Final, TypeVar
 
 from edge.errors import ModelError
 
-LOAD_LIMIT_S: Final = 60.0
-"""Longest load: a thousand times that of the bundled models."""
+LOAD_LIMIT_S: Final = 60.0  # longest load: a thousand times that of the bundled models
 STOP_S: Final = 0.5
 """Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
 _POLL_S: Final = 0.1

@@ -16,14 +16,11 @@ from edge.inference.small_network import SmallNetwork, small_network
 
 QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a scan's own before the division by it: noise stays small."""
-_MOST: Final = 12.0
-"""Largest reading over the amplitude; a contact on one taxel alone has 4."""
-PLACE_MM: Final = 5.0
-"""Unit of a tap's place among features: about a taxel pitch."""
+_MOST: Final = 12.0  # largest reading over the amplitude; a contact on one taxel alone has 4
+PLACE_MM: Final = 5.0  # unit of a tap's place among features: about a taxel pitch
 ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)
 """Units of the errors of a pose among features, in [mm] and [deg]: five usual errors."""
-MOST_ERROR: Final = 5.0
-"""Largest error of a pose among features, in its unit: beyond it a pose states nothing."""
+MOST_ERROR: Final = 5.0  # largest error of a pose among features, in its unit: beyond it a pose states nothing
 _POSE_FEATURES: Final = 6
 _KEYS: Final = ("forward", "contact", "tap")
 

@@ -10,8 +10,7 @@ from firmware_bridge.poses import PadPose
 
 SIZE_MM: Final = 60.0
 PX_PER_MM: Final = 4.0
-MOST_PX: Final = 2000
-"""Most pixels along a map's side: its layers take 100 MB."""
+MOST_PX: Final = 2000  # most pixels along a map's side: its layers take 100 MB
 
 
 class Grid(NamedTuple):
@@ -92,10 +91,8 @@ def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArra
 
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's top from which a pixel counts as touched: where a blurred edge of a flat part truly lies."""
-FLOOR_MM: Final = 0.02
-"""Standard deviation of a pixel below which no model is taken at its word, in [mm]."""
-UNKNOWN_MM: Final = 0.05
-"""Standard deviation of a pixel where the model gives none, in [mm]."""
+FLOOR_MM: Final = 0.02  # standard deviation of a pixel below which no model is taken at its word, in [mm]
+UNKNOWN_MM: Final = 0.05  # standard deviation of a pixel where the model gives none, in [mm]
 BLUR: Final = 0.15
 """Standard deviation of a pattern's share of its top by which an edge is blurred, even in a sure pattern."""
 MOST_ODDS: Final = 4.0
@@ -103,8 +100,7 @@ MOST_ODDS: Final = 4.0
 LEAST_TOP_MM: Final = 0.05
 """Top below which a pattern may be all drift: a free pad that has warmed by a few kelvin makes .02 mm, in [mm]."""
 _TOP_PIXELS: Final = 8
-_LOGISTIC: Final = 1.702
-"""Log odds of a normal distribution per standard deviation, within .01 in probability."""
+_LOGISTIC: Final = 1.702  # log odds of a normal distribution per standard deviation, within 0.01 in probability
 
 
 class Evidence(NamedTuple):

@@ -14,8 +14,7 @@ from edge.mapping.object_map import MapLayers, ObjectMap
 
 FORMAT: Final = "tactile-object-map"
 VERSION: Final = 1
-_LEAST_PX: Final = 480
-"""Side of the picture of one layer, at least: a pixel of the map is repeated."""
+_LEAST_PX: Final = 480  # side of the picture of one layer, at least: a pixel of the map is repeated
 _NOTHING: Final = (255, 255, 255)
 _DOUBTED: Final = (200, 40, 30)
 _GAP_PX: Final = 8

@@ -19,23 +19,19 @@ from edge.perception.result import Result
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 
-STEP_MM: Final = 0.5
-"""Movement within which patterns are one piece of evidence, about one pixel of a pattern."""
+STEP_MM: Final = 0.5  # movement within which patterns are one piece of evidence, about one pixel of a pattern
 INDEPENDENT_MM: Final = USPA44.pitch_mm
 """Movement after which a pattern is evidence of its own, since other taxels then see each part."""
 LEAST_SHARE: Final = 0.05
 """Worth of a pattern at a place that counted before: its noise and the error of its pose are new."""
-MOST_ODDS: Final = 12.0
-"""Largest log odds on the map, so that an object that has moved can be seen again."""
-PLACES: Final = 256
-"""Places that are remembered as counted: 128 mm of a slide."""
+MOST_ODDS: Final = 12.0  # largest log odds on the map, so that an object that has moved can be seen again
+PLACES: Final = 256  # places that are remembered as counted: 128 mm of a slide
 _FAR_MM: Final = 1e9
 _OVERLAP_MM2: Final = 5.0
 """Area that must lie on the map already for a press to be aligned with it, about a quarter of a taxel's."""
 _RADIUS_MM: Final = USPA44.rows * USPA44.pitch_mm / 6**0.5
 """Distance from the pad's centre at which a turn moves its points, at the root of their mean square."""
-_HIGHEST: Final = 0.98
-"""Share of the touched pixels that lie below the map's top, which no single pixel is to define."""
+_HIGHEST: Final = 0.98  # share of the touched pixels that lie below the map's top, which no single pixel is to define
 
 
 @dataclass(frozen=True, slots=True)

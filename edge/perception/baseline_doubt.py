@@ -25,19 +25,13 @@ explain."""
 NEAR_COUNTS: Final = 50.0
 """Largest reading of a taxel at rest, on any axis: more than a pad turned over in the earth's field (36) and the first
 recovery after a grip (45), and less than the change of any public recording's rest level in four hours (64 to 715)."""
-SEEN_SHARE: Final = 0.75
-"""Share of the taxels at rest by which the pad is seen at rest."""
-LOCAL_SHARE: Final = 0.5
-"""Share of the taxels at rest beside which the others are touched."""
-DRIFT_PER_S: Final = 40.0
-"""Rate up to which drift explains a rise, in [counts/s] a taxel: twice the fastest on record."""
-LEFT_COUNTS: Final = 150.0
-"""Largest mean that a release leaves on the taxels: warming by 3 K gives 120 counts."""
-LEFT_SHARE: Final = 0.5
-"""The same as a share of the contact's peak."""
+SEEN_SHARE: Final = 0.75  # share of the taxels at rest by which the pad is seen at rest
+LOCAL_SHARE: Final = 0.5  # share of the taxels at rest beside which the others are touched
+DRIFT_PER_S: Final = 40.0  # rate up to which drift explains a rise, in [counts/s] a taxel: twice the fastest on record
+LEFT_COUNTS: Final = 150.0  # largest mean that a release leaves on the taxels: warming by 3 K gives 120 counts
+LEFT_SHARE: Final = 0.5  # the same as a share of the contact's peak
 STILL_COUNTS: Final = 100.0
-STILL_NS: Final = 100_000_000
-"""Time for which the summed z stays within STILL_COUNTS after a release."""
+STILL_NS: Final = 100_000_000  # time for which the summed z stays within STILL_COUNTS after a release
 ALIKE_SHARE: Final = 0.3
 """Largest difference of a taxel from the median, as a share of it, in a field: in real flat grips it is .55 and more,
 in simulated presses above 1."""

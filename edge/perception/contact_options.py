@@ -7,8 +7,7 @@ from typing import Final
 from edge.errors import UsageError
 from edge.validation import as_float, check_whole
 
-ON_COUNTS: Final = 1500.0
-"""Summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel."""
+ON_COUNTS: Final = 1500.0  # summed z at which a tap begins: about 1.3 N, twelve times the thermal drift of one taxel
 OFF_COUNTS: Final = 750.0
 IDLE_RESET_S: Final = 5.0
 

@@ -56,16 +56,13 @@ class SensorPad:
 
 
 HELD_SCANS: Final = 200
-SURER: Final = 0.05
-"""Least rise of certainty that is worth a change of the gains in use."""
-SHIFTED: Final = 0.01
-"""Least RMS change of the gains in use."""
+SURER: Final = 0.05  # least rise of certainty that is worth a change of the gains in use
+SHIFTED: Final = 0.01  # least RMS change of the gains in use
 _LEAST_CERTAINTY: Final = 0.1
 CONTRADICTED: Final = 6.0
 """Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
 gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
-CONTRADICTED_CONTACTS: Final = 25
-"""Fewest distinct contacts by which that is decided."""
+CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
 
 
 class GainFollower:

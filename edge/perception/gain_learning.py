@@ -24,42 +24,35 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PA
 TAXELS: Final = USPA44.taxel_count
 LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)
 """Largest readings of x, y and z of a contact that is used; chips are clipped a little above."""
-LEAST_COUNTS: Final = 200.0
-"""Largest z of the weakest contact that is used: in weaker ones drift is over a fifth of it."""
+LEAST_COUNTS: Final = 200.0  # largest z of the weakest contact that is used: in weaker ones drift is over a fifth of it
 APART: Final = 0.1
 """Least RMS difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
 REMEMBERED: Final = 64
 """Newest distinct contacts, of which a further one must differ: always the same contact teaches once."""
 SOLVE_EVERY: Final = 7
 """Distinct contacts between two steps towards the best gains, each of which takes half a millisecond."""
-MOST_CONTACTS: Final = 400.0
-"""Contacts in whose memory older ones fade."""
+MOST_CONTACTS: Final = 400.0  # contacts in whose memory older ones fade
 INDEPENDENT: Final = 150.0
 """Information of endless contacts of one pad, in contacts: they share what the model leaves out."""
-BOUND: Final = 0.25
-"""Largest deviation of a gain from 1."""
+BOUND: Final = 0.25  # largest deviation of a gain from 1
 PLACE_SPREAD: Final = 0.06
 """Standard deviation of a place's log-gain from the seat and moment of its magnet, common to its three axes."""
 LEFT_BY_CONTACTS: Final = 0.04
 """Deviation of a gain that contacts cannot reduce, what they share not averaging out. Contacts make measured gains
 no surer where these are surer than that."""
-_FREEDOM: Final = 5.0
-"""Degrees of freedom of Student's t, which weighs down contacts that no component explains well."""
+_FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
 _UNEXPLAINED: Final = 40.0
 """Squared distance from every component, over its mean on an even sensor, beyond which a contact teaches nothing."""
 _EVEN: Final = 1e-3
 """Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
-_OPEN: Final = 1 / np.sqrt(3)
-"""Prior deviation of a constant over half of its range: uniform within it."""
-_DETERMINED: Final = 0.7
-"""Largest deviation of a constant that counts as determined, over that of its prior."""
+_OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
+_DETERMINED: Final = 0.7  # largest deviation of a constant that counts as determined, over that of its prior
 _LEAST_DEVIATION: Final = 1e-3
 _LEAN: Final = 0.025
 _UNEVEN_COUNTS: Final = 30.0
 _DRIFT_COUNTS: Final = ((2.0, 2.0, 12.0), (18.0, 18.0, 45.0))
 """Standard deviations of offsets of x, y and z, of a taxel's own and of those common to all."""
-_BIASED: Final = 30.0
-"""Contacts after which half of the mean error is there."""
+_BIASED: Final = 30.0  # contacts after which half of the mean error is there
 _STEPS: Final = 4
 _LONGEST_STEP: Final = 0.1
 _MOST_BYTES: Final = 1 << 23
@@ -71,8 +64,7 @@ _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
 _ROWS: Final = np.concatenate([np.arange(GAINS), np.arange(2 * TAXELS), np.arange(2 * TAXELS, GAINS), np.arange(GAINS)])
 """Channel that each parameter acts on: inverse gains, leans, unevenness, offsets."""
 _LINEAR: Final = len(_ROWS)
-_PAIRS: Final = GAINS * _ROWS[:, None] + _ROWS
-"""Places of all pairs of them in a flat matrix of channels."""
+_PAIRS: Final = GAINS * _ROWS[:, None] + _ROWS  # places of all pairs of them in a flat matrix of channels
 
 
 @dataclass(frozen=True, slots=True)

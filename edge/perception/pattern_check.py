@@ -38,8 +38,7 @@ REASON_TEXTS: Final[dict[Reason, str]] = {
 }
 """Reasons in a user's words, each with what to look for."""
 
-LEAST_COUNTS: Final = 100.0
-"""Largest z of the weakest contact that is checked: below it, drift is half of the reading."""
+LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
 MOST_MISMATCH: Final = 0.8
 """Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
 one in 300 right ones."""
@@ -53,8 +52,7 @@ _DOUBT_POWER: Final = 0.1
 _MOST_CHECKERBOARD: Final = 0.9
 """Share of z's variation over the pad that alternates from taxel to taxel, beyond which no layer transmits it: crossed
 bars of two pitches reach 0.84 in simulation."""
-_DEEPEST: Final = 1.1
-"""Largest depth of a pattern over the declared full scale, which is the deepest press in training."""
+_DEEPEST: Final = 1.1  # largest depth of a pattern over the declared full scale, which is the deepest press in training
 MOST_Z: Final = 6_500.0
 MOST_SUM: Final = 58_000.0
 """Largest z of a taxel, and of all, in counts: but for one press in a thousand, those of the training, up to 40 N."""
@@ -63,8 +61,7 @@ REPEATS: Final = 5
 longer than 3."""
 SAME_STRENGTH: Final = 0.85
 """Strength of a press, over that of an earlier tap, from which the two are compared for good."""
-NOT_OF_IT: Final = 0.5
-"""Share from which an earlier tap does not belong to the contact."""
+NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 _SUSPICION: Final = 1.5
 _STEP: Final = 4.5
 _LIMIT: Final = 12.0

@@ -22,8 +22,7 @@ from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
-MOST_TOGETHER: Final = 4
-"""Sensors whose patterns are made in one call: scans that come meanwhile wait for its end."""
+MOST_TOGETHER: Final = 4  # sensors whose patterns are made in one call: scans that come meanwhile wait for its end
 
 
 class Runtime:

@@ -30,12 +30,10 @@ from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.schedule import TAPS_FORGOTTEN_NS
 from firmware_bridge.zeroing.baseline import Baseline
 
-NOISE_COUNTS: Final = 2.0
-"""Standard deviation of a reading at rest: 1.7 to 2.6 in recordings."""
+NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
 CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
 """RMS change of all readings that noise, present in both scans, does not reach: four of its deviations away."""
-CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS
-"""Change of one reading that noise does not reach."""
+CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS  # change of one reading that noise does not reach
 MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 """Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 

@@ -171,8 +171,7 @@ def _reached(newest: PadPose, dx_mm: float, dy_mm: float) -> PadPose:
     )
 
 
-NO_TAP = -1
-"""Number of a window that is no tap: readings in doubt, to be looked at."""
+NO_TAP = -1  # number of a window that is no tap: readings in doubt, to be looked at
 
 
 class Taps:

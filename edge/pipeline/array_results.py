@@ -23,8 +23,7 @@ from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import Baseline
 
-SENSOR: Final = "array"
-"""Name of the sensor of an array, unless the baseline names another."""
+SENSOR: Final = "array"  # name of the sensor of an array, unless the baseline names another
 
 
 def infer(

@@ -19,8 +19,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S, SENSOR_SILENT_NS
 
 REMEMBERED_INTERVALS: Final = 31
-FEWEST_INTERVALS: Final = 5
-"""Fewest intervals that give a period."""
+FEWEST_INTERVALS: Final = 5  # fewest intervals that give a period
 BURST_SHARE: Final = 8
 """Divisor of the period: scans nearer to each other than an eighth of it were held up. Bursts of all sixteen frames,
 16 ms apart, are further apart."""
@@ -272,18 +271,12 @@ class Rate:
         self._last_ns = time_ns
 
 
-TOGETHER_SENSORS: Final = 4
-"""Fewest sensors whose scans are read together."""
-READS_A_PERIOD: Final = 4
-"""Reads of many sensors in a period."""
-SHORTEST_REST_S: Final = 0.005
-"""Shortest period, in [s], of sensors that rest: faster ones give their scans at once."""
-LONGEST_PERIOD_S: Final = 0.05
-"""Period from which scans come too seldom to be read together, in [s]."""
-SAME_SHARE: Final = 0.1
-"""Share by which a measured period may change before links are read at another pace."""
-RESTLESS_NS: Final = 1_000_000_000
-"""Time after a contact, in [ns], during which every scan is still read at once."""
+TOGETHER_SENSORS: Final = 4  # fewest sensors whose scans are read together
+READS_A_PERIOD: Final = 4  # reads of many sensors in a period
+SHORTEST_REST_S: Final = 0.005  # shortest period, in [s], of sensors that rest: faster ones give their scans at once
+LONGEST_PERIOD_S: Final = 0.05  # period from which scans come too seldom to be read together, in [s]
+SAME_SHARE: Final = 0.1  # share by which a measured period may change before links are read at another pace
+RESTLESS_NS: Final = 1_000_000_000  # time after a contact, in [ns], during which every scan is still read at once
 
 
 class Pace(NamedTuple):

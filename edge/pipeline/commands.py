@@ -20,10 +20,8 @@ from firmware_bridge.scans.scan import is_sensor_name
 if TYPE_CHECKING:
     from edge.perception.runtime import Runtime
 
-READ_BYTES: Final = 1 << 16
-"""Bytes of one read: all that a pipe holds, some 500 poses."""
-WAITING: Final = 64
-"""Commands that may wait until the loop takes them."""
+READ_BYTES: Final = 1 << 16  # bytes of one read: all that a pipe holds, some 500 poses
+WAITING: Final = 64  # commands that may wait until the loop takes them
 
 
 @dataclass(frozen=True, slots=True)

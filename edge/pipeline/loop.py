@@ -23,10 +23,8 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
-ALL_HEARD_SCANS: Final = 10
-"""Scans of one sensor of a link after which all sensors of that link have sent some."""
-REFUSED_AGAIN_S: Final = 10.0
-"""Time until another refused command is told, in [s]: a stream of them must not flood."""
+ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
+REFUSED_AGAIN_S: Final = 10.0  # time until another refused command is told, in [s]: a stream of them must not flood
 
 
 class Loop:

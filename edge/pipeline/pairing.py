@@ -11,8 +11,7 @@ from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import CAPACITY_SCANS
 from edge.validation import check_positive
 
-APART_S: Final = 0.02
-"""Longest time between the results of a pair, in [s]: two periods of a sensor at 100 Hz."""
+APART_S: Final = 0.02  # longest time between the results of a pair, in [s]: two periods of a sensor at 100 Hz
 
 
 def paired(

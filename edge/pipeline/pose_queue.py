@@ -20,8 +20,7 @@ FURTHEST_AHEAD_NS: Final = 1_000_000_000
 _FIELDS: Final = ("cmd", "x_mm", "y_mm", "turn_deg", "error_mm", "error_deg", "sensor", "time_ns", "holds")
 
 
-LONGEST_BYTES: Final = 4096
-"""Bytes of one message: ten times those of a pose."""
+LONGEST_BYTES: Final = 4096  # bytes of one message: ten times those of a pose
 
 
 def json_object(message: str | bytes) -> dict[str, Any] | None:

@@ -11,8 +11,7 @@ from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
-BUCKETS_PER_OCTAVE: Final = 32
-"""Resolution of the run-time histogram: a quantile is at most 2.2 % too high."""
+BUCKETS_PER_OCTAVE: Final = 32  # resolution of the run-time histogram: a quantile is at most 2.2 % too high
 SHORTEST_NS: Final = 1_000_000_000
 """Shortest run whose rate is reported: the first scans have waited for the model and come at once, and over less time
 100 Hz looks like 135."""

@@ -6,8 +6,7 @@ from typing import Final
 
 FEWEST_BAD_LINES: Final = 4
 """Lines without a CAN frame from which a port is none of an slcan adapter: an adapter that was reset may send one."""
-FEWEST_SKIPPED_BYTES: Final = 120
-"""The same of bytes that belong to no line at all: four of the longest lines."""
+FEWEST_SKIPPED_BYTES: Final = 120  # the same of bytes that belong to no line at all: four of the longest lines
 _MESSAGES: Final = {
     "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
     "foreign_sensor": "their sensors are of another pad: --id-map",

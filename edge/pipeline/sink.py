@@ -97,5 +97,4 @@ def check_new(path: Path) -> None:
         raise SinkError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-NOW: Final = RunFacts()
-"""Facts of a run of scans of now."""
+NOW: Final = RunFacts()  # facts of a run of scans of now

@@ -17,8 +17,7 @@ from firmware_bridge.errors import CdrError
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
 
-_KEPT: Final = 128
-"""Messages of a topic that wait until they are read."""
+_KEPT: Final = 128  # messages of a topic that wait until they are read
 
 
 class Ros2Poses:

@@ -15,8 +15,7 @@ PROGRESS: Final = frozenset(
     ("received_bytes", "transfers", "frames", "readings", "messages", "scans", "replies", "status_answers", "poses")
 )
 """Counters that grow while all is well; every other one counts something that was lost, odd, or refused."""
-COUNTED_NS: Final = 1_000_000_000
-"""Time from which on a sensor's record has the counters again, in [ns]."""
+COUNTED_NS: Final = 1_000_000_000  # time from which on a sensor's record has the counters again, in [ns]
 _HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
 _ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
 
@@ -80,8 +79,7 @@ def chosen_fields(text: str) -> frozenset[str]:
     return names
 
 
-record: Final = RecordForm().of
-"""Function from a result and counters to a record without maps."""
+record: Final = RecordForm().of  # function from a result and counters to a record without maps
 
 
 def event_record(event: Event, counters: Mapping[str, int], source: str | None) -> dict[str, Any]:

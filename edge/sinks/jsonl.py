@@ -22,8 +22,7 @@ from edge.perception.result import Result
 from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
 
-PIPE_BYTES: Final = 1 << 20
-"""Most that Linux gives to any user."""
+PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
 _PAGE_BYTES: Final = 4096
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _ALL: Final = RecordForm(maps=True)

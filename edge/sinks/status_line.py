@@ -19,8 +19,7 @@ REFRESH_S: Final = 0.1
 CLEAR_TO_END: Final = "\x1b[K"
 FIRST_HINT_S: Final = 5.0
 """Time without a scan before the first hint, in [s]; the next hints come after twice, four times, ... as long."""
-ALL_DETAILS: Final = 4
-"""Levels of detail of the line: 4 has all of it, 0 only what a person must act on."""
+ALL_DETAILS: Final = 4  # levels of detail of the line: 4 has all of it, 0 only what a person must act on
 _COUNTED: Final = ("dropped", "overruns", "torn_wire", "unwritten", "poses", "poses_refused", "poses_dropped")
 """Counters on the line. Of scans torn at the source, noise makes one in forty of a healthy sensor: not an alarm."""
 _SHORTER: Final = {"overruns": "overrun", "torn_wire": "torn"}

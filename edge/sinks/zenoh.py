@@ -27,8 +27,7 @@ from firmware_bridge.extras import how_to_install
 if TYPE_CHECKING:
     import zenoh
 
-PLACE: Final = "tcp/127.0.0.1:7447"
-"""Endpoint of a router on this machine, at zenoh's usual port."""
+PLACE: Final = "tcp/127.0.0.1:7447"  # endpoint of a router on this machine, at zenoh's usual port
 CLOSED: Final = {
     "mode": "peer",
     "listen/endpoints": [],

@@ -7,8 +7,7 @@ other threads' free memory is of no use. Other C libraries have neither, and sta
 import ctypes
 from typing import Final
 
-_M_ARENA_MAX: Final = -8
-"""Number of the setting in glibc's malloc.h."""
+_M_ARENA_MAX: Final = -8  # number of the setting in glibc's malloc.h
 
 
 def share_one_heap() -> None:

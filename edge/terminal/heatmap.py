@@ -28,8 +28,7 @@ RESET: Final = "\x1b[0m"
 GAP: Final = 2
 WIDEST: Final = 40
 NARROWEST: Final = 20
-SHARP: Final = 8
-"""Divisor of a map's width: with half as many lines, a map of 4 x 4 then has sharp borders."""
+SHARP: Final = 8  # divisor of a map's width: with half as many lines, a map of 4 x 4 then has sharp borders
 
 
 @dataclass(frozen=True, slots=True)

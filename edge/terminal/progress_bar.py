@@ -12,8 +12,7 @@ from firmware_bridge.errors import harmless
 DELAY_S: Final = 2.0
 _COUNTED: Final = "{desc} {percentage:3.0f}%|{bar}| {rate_fmt} {remaining} left{postfix}"
 _TIMED: Final = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
-SECONDS: Final = "s"
-"""Unit of work that lasts for a set time, whose rate means nothing."""
+SECONDS: Final = "s"  # unit of work that lasts for a set time, whose rate means nothing
 _Thing = TypeVar("_Thing")
 
 

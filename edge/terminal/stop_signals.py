@@ -16,10 +16,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-END_S: Final = 1.5
-"""Time from the signal to the end by force, within the two seconds that are promised."""
-STALLED_S: Final = 10.0
-"""Longest pause in the growth of a recording that is being finished, since its disk may be busy."""
+END_S: Final = 1.5  # time from the signal to the end by force, within the two seconds that are promised
+STALLED_S: Final = 10.0  # longest pause in the growth of a recording that is being finished, since its disk may be busy
 EXIT_FORCED: Final = 6
 _LOOK_S: Final = 0.1
 _STDERR: Final = 2

@@ -13,8 +13,7 @@ from edge.perception.result import Result
 from edge.pipeline.sink import Sink
 from firmware_bridge.poses import TimedPose
 
-FORM: Final = "mcap"
-"""Form of the sink that is recorded into, and the ending of its files."""
+FORM: Final = "mcap"  # form of the sink that is recorded into, and the ending of its files
 
 
 class Recorder(Sink):

@@ -20,8 +20,7 @@ TRACE_POINTS: Final = 1200
 """Most points of the last TRACE_S: one in 50 ms, which on a page some hundred pixels wide looks like all of them."""
 RECENT_SCANS: Final = 256
 EVENTS: Final = 20
-MAX_FPS: Final = 25
-"""Most result frames a second of one sensor: more is not visible to the eye."""
+MAX_FPS: Final = 25  # most result frames a second of one sensor: more is not visible to the eye
 _PERIOD_NS: Final = round(1e9 / MAX_FPS)
 _POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
 

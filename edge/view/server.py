@@ -44,12 +44,10 @@ from firmware_bridge.links.replay_player import Player
 
 STATE_S: Final = 1.0
 TIDY_S: Final = 10.0
-TIDY_CONNECTIONS: Final = 64
-"""Number of lost connections that are tidied up at once, without waiting for TIDY_S."""
+TIDY_CONNECTIONS: Final = 64  # number of lost connections that are tidied up at once, without waiting for TIDY_S
 OPEN_S: Final = 5.0
 CLOSE_S: Final = 1.0
-END_S: Final = 0.5
-"""Longest wait for viewers to read that the run has ended, in [s]."""
+END_S: Final = 0.5  # longest wait for viewers to read that the run has ended, in [s]
 COMMAND_PAUSE_S: Final = 0.02
 """Pause between two commands of a viewer, in [s], so that a viewer that never stops asking does not delay the loop."""
 

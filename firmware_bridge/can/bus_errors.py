@@ -8,15 +8,13 @@ from typing import Final
 
 BUS_OFF: Final = 0x40
 RESTARTED: Final = 0x100
-CONTROLLER: Final = 0x04
-"""Error class whose details are in data byte 1."""
+CONTROLLER: Final = 0x04  # error class whose details are in data byte 1
 RX_OVERFLOW: Final = 0x01
 TX_OVERFLOW: Final = 0x02
 WARNING: Final = 0x04 | 0x08
 PASSIVE: Final = 0x10 | 0x20
 
-LOST_RECENTLY_NS: Final = 5_000_000_000
-"""Time for which a loss of frames is reported, in [ns]."""
+LOST_RECENTLY_NS: Final = 5_000_000_000  # time for which a loss of frames is reported, in [ns]
 
 _COUNTED: Final[tuple[str, ...]] = (
     "bus_off",

@@ -31,12 +31,10 @@ LIMITS_BYTES: Final = 40
 CONFIG_BYTES: Final = 12
 
 HARDWARE_STAMPS: Final = 1 << 4
-LPC546XX_QUIRK: Final = 1 << 9
-"""Feature flag of a chip that needs one more byte after every frame sent to it."""
+LPC546XX_QUIRK: Final = 1 << 9  # feature flag of a chip that needs one more byte after every frame sent to it
 
 RECEIVED: Final = 0xFFFFFFFF
-ECHO_IDS: Final = 10
-"""Most frames under way to the bus at once, as in Linux; their echo ids are 0..9."""
+ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; their echo ids are 0..9
 
 OVERFLOW_FLAG: Final = 1 << 0
 FD_FLAG: Final = 1 << 1

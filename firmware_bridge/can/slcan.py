@@ -32,17 +32,14 @@ OPEN: Final = b"O\r"
 STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
 
-LONGEST_LINE: Final = 30
-"""Most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp."""
+LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp
 LAST_TIMESTAMP_MS: Final = 59_999
 
 LINES_TO_LEARN: Final = 4
 """Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
 
-PACKED_BYTES: Final = 10
-"""Bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data."""
-STAMPED_BYTES: Final = 12
-"""Bytes of a usual frame packed with two bytes of time stamp, in [ms]."""
+PACKED_BYTES: Final = 10  # bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data
+STAMPED_BYTES: Final = 12  # bytes of a usual frame packed with two bytes of time stamp, in [ms]
 
 _STAMP = rb"(?:[0-9A-Da-d][0-9A-Fa-f]{3}|[Ee](?:[0-9][0-9A-Fa-f]{2}|[Aa][0-5][0-9A-Fa-f]))"
 _USUAL = rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}%s\r)+"

@@ -39,8 +39,7 @@ LOSSES: Final = frozenset({"rx_full", "overrun"})
 NOISE: Final = frozenset({"error_passive", "bus_error"})
 INTERVAL_NS: Final = 5_000_000_000
 MOST_UNANSWERED: Final = 3
-FRAMES_TO_FORGET: Final = 1600
-"""Frames after which a loss that an error line reported is over: a second of one sensor."""
+FRAMES_TO_FORGET: Final = 1600  # frames after which a loss that an error line reported is over: a second of one sensor
 
 BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
 BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"

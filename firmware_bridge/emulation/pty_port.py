@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Final
 
 LINE_SPEED_BAUD: Final = 3_000_000
-COUNTED_LATE_NS: Final = 10_000_000
-"""Longest delay, in [ns], until a busy kernel counts sent bytes as unread."""
+COUNTED_LATE_NS: Final = 10_000_000  # longest delay, in [ns], until a busy kernel counts sent bytes as unread
 _COUNTS: Final = 4
 _SPEEDS_BAUD: Final = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()

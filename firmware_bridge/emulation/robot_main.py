@@ -31,10 +31,8 @@ from firmware_bridge.recording.tracks import Recording, Track
 
 FOLLOW: Final = "follow"
 INTERRUPTED: Final = 130
-MOVE_SCANS: Final = 10
-"""Scans of the free pad while the robot moves to a tap that was asked for."""
-LONGEST_WAIT_SCANS: Final = 500
-"""Scans after which a robot that is not asked any more taps by the recording."""
+MOVE_SCANS: Final = 10  # scans of the free pad while the robot moves to a tap that was asked for
+LONGEST_WAIT_SCANS: Final = 500  # scans after which a robot that is not asked any more taps by the recording
 _STOP_POLL_S: Final = 0.05
 _OPTIONS: Final = ("tap", "option_counts", "option_pose")
 

@@ -17,8 +17,7 @@ from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import ABSENT
 
-FRAME_S: Final = 0.000_13
-"""Duration of a frame of eight bytes on a 1 Mbit/s bus, with stuffed bits, in [s]."""
+FRAME_S: Final = 0.000_13  # duration of a frame of eight bytes on a 1 Mbit/s bus, with stuffed bits, in [s]
 
 CR: Final = b"\r"
 BEL: Final = b"\a"

@@ -126,8 +126,7 @@ def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
 
 LONG_UNREAD_NS: Final = 50_000_000
 """Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
-WAITED_NS: Final = 1_000_000
-"""Duration of a read, in [ns], above which no data was waiting when it began."""
+WAITED_NS: Final = 1_000_000  # duration of a read, in [ns], above which no data was waiting when it began
 
 
 class Unread:

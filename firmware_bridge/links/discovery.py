@@ -17,10 +17,8 @@ from firmware_bridge.links.usb_devices import holders
 _IP_TIMEOUT_S: Final = 2.0
 SLOW_LATENCY_MS: Final = 16
 SYS_ROOT: Final = Path("/sys")
-_CAN_TYPE: Final = "280"
-"""Type of a CAN network in sysfs, ARPHRD_CAN."""
-_UP: Final = 1
-"""Flag of a network that is up, IFF_UP."""
+_CAN_TYPE: Final = "280"  # type of a CAN network in sysfs, ARPHRD_CAN
+_UP: Final = 1  # flag of a network that is up, IFF_UP
 _PRETENDED: Final = ("vcan", "vxcan")
 
 

@@ -24,18 +24,15 @@ try:
 except ImportError:
     fcntl = termios = None
 
-FULL_BYTES: Final = 255
-"""Highest value of VMIN; a scan of sixteen taxels has 352 bytes."""
-MOST_BYTES: Final = 65536
-"""Most bytes read at once: as many as a kernel keeps for a serial port."""
+FULL_BYTES: Final = 255  # highest value of VMIN; a scan of sixteen taxels has 352 bytes
+MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 KERNEL_BYTES: Final = 64
 """Bytes that the kernel returns a call where VMIN is set, however many there are; fewer only if no more are there."""
 LONGEST_WAIT_S: Final = 0.02
 """Longest time that fewer than FULL_BYTES wait to be read, in [s]: without a whole scan there is no hurry."""
 LONGEST_REST_S: Final = 0.004
 """Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
-STEP_S: Final = 0.0003
-"""Time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing."""
+STEP_S: Final = 0.0003  # time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing
 
 
 class Piece(NamedTuple):

@@ -21,8 +21,7 @@ GS_USB_IDS: Final = {
 }
 """Adapters by vendor and product id. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
 
-_PLACE: Final = re.compile(r"[0-9]+-[0-9]+(\.[0-9]+)*")
-"""Bus and sockets, as the kernel names a USB device."""
+_PLACE: Final = re.compile(r"[0-9]+-[0-9]+(\.[0-9]+)*")  # bus and sockets, as the kernel names a USB device
 
 # A device without readable texts is still listed: pyusb reports "no langid" where it may not open it.
 _NO_TEXT: Final = (usb.core.USBError, ValueError, NotImplementedError)

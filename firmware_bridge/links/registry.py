@@ -36,8 +36,7 @@ _NAME = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
 _BAUD = re.compile(r"[1-9][0-9]{0,7}")
 _CAN_NETWORK = re.compile(r"v?(?:x|sl)?can[0-9]+")
 _RECORDINGS: Final = (".mcap", ".npz", ".csv")
-_FINITE: Final = ("demo", "replay:")
-"""Beginnings of finite sources, which are not opened again after their end."""
+_FINITE: Final = ("demo", "replay:")  # beginnings of finite sources, which are not opened again after their end
 
 # Each link is imported only where it is used, to save start-up time and memory.
 

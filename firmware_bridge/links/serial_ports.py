@@ -12,8 +12,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from firmware_bridge.errors import NoDeviceError
 from firmware_bridge.links.usb_devices import Recognised
 
-FTDI_X: Final = (0x0403, 0x6015)
-"""Id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables."""
+FTDI_X: Final = (0x0403, 0x6015)  # id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables
 
 KNOWN_ADAPTERS: Final = {
     FTDI_X: "VScom USB-CAN Plus",

@@ -28,16 +28,13 @@ from firmware_bridge.schedule import NS_PER_S, SERVER_QUIET_S
 
 DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0
-REOPENING_S: Final = 1.0
-"""Time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer."""
-FIRST_MESSAGE_S: Final = 0.5
-"""Wait for the first message, in [s]: a server greets at once; no message is no error."""
+REOPENING_S: Final = 1.0  # time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer
+FIRST_MESSAGE_S: Final = 0.5  # wait for the first message, in [s]: a server greets at once; no message is no error
 ANSWER_S: Final = 1.0
 """Time-out of a ping, in [s]: a link read by itself reports a pulled cable, or a server that hangs, after 1.75 s
 without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
 CLOSING_S: Final = 0.2
-MOST_WAITING: Final = 64
-"""Most messages of one read; later ones wait for the next."""
+MOST_WAITING: Final = 64  # most messages of one read; later ones wait for the next
 
 
 class ServerAddress(NamedTuple):

@@ -13,8 +13,7 @@ import numpy as np
 
 from firmware_bridge.errors import CdrError
 
-LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000
-"""Latest time of ROS 2, in [ns] since 1970 (in 2038)."""
+LAST_STAMP_NS: Final = (1 << 31) * 1_000_000_000  # latest time of ROS 2, in [ns] since 1970 (in 2038)
 HEADER: Final = b"\x00\x01\x00\x00"
 _NUMBERS: Final = {"bool": "?", "byte": "B", "float32": "f", "float64": "d"} | {
     f"{sign}int{bits}": code.upper() if sign else code

@@ -22,8 +22,7 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
 
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
-EMULATED: Final = "emulated"
-"""Column of a recording of an emulated sensor, whatever its cells are."""
+EMULATED: Final = "emulated"  # column of a recording of an emulated sensor, whatever its cells are
 _TAXEL: Final = re.compile(r"(?P<force>force[ _])?(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
 _TIMES: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "datetime", "clock", "epoch", "elapsed"}
 _UNITS: Final = {
@@ -38,8 +37,7 @@ _UNITS: Final = {
 }
 _USUAL_PERIODS_S: Final = (0.0005, 0.25)
 """Periods between scans that tell the unit of times without one: none of them is usual in two units."""
-_GAP: Final = 10.0
-"""Usual steps between times from which on a step is a gap, which says nothing about the rate."""
+_GAP: Final = 10.0  # usual steps between times from which on a step is a gap, which says nothing about the rate
 
 
 class CsvColumns:
@@ -114,10 +112,8 @@ def _words(name: str) -> list[str]:
     return re.findall(r"[a-z]+", name.lower().replace("\u00b5", "u").replace("\u03bc", "u"))
 
 
-MOST_CSV_BYTES: Final = 1 << 30
-"""Most bytes of a CSV: some eight hours of one sensor at 100 Hz."""
-LONGEST_CSV_LINE: Final = 1 << 14
-"""Most characters of a line: fifty times a row of counts."""
+MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
+LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
 _META_NAME: Final = "meta_data.csv"
 _META_RATE: Final = "frequency_hz"
 _WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")

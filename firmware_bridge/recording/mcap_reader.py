@@ -51,12 +51,10 @@ from firmware_bridge.scans.scan import VendorReading, is_sensor_name
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
-MOST_KEPT_BYTES: Final = 1 << 31
-"""Most bytes of the scans in memory: a day of one sensor at 100 Hz."""
+MOST_KEPT_BYTES: Final = 1 << 31  # most bytes of the scans in memory: a day of one sensor at 100 Hz
 _SCAN_BYTES: Final = 240
 _VENDOR_BYTES: Final = 1200
-MOST_BAG_BYTES: Final = 1 << 20
-"""Most bytes of a bag's metadata.yaml."""
+MOST_BAG_BYTES: Final = 1 << 20  # most bytes of a bag's metadata.yaml
 MOST_SHOWN_TOPICS: Final = 10
 LONGEST_SHOWN: Final = 60
 

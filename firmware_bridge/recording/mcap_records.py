@@ -18,8 +18,7 @@ from mcap.records import Chunk
 
 MOST_RECORD_BYTES: Final = 1 << 25
 """Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
-MOST_WINDOW_BYTES: Final = 1 << 25
-"""Largest window of zstd, in bytes."""
+MOST_WINDOW_BYTES: Final = 1 << 25  # largest window of zstd, in bytes
 _RECORD: Final = struct.Struct("<BQ")
 MESSAGE: Final = struct.Struct("<HIQQ")
 """Head of a message: channel, sequence, and times at which it was logged and published."""

@@ -158,8 +158,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
 
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
-MOST_NPZ_BYTES: Final = 1 << 31
-"""Most bytes of the arrays that are read: a day of one sensor at 100 Hz."""
+MOST_NPZ_BYTES: Final = 1 << 31  # most bytes of the arrays that are read: a day of one sensor at 100 Hz
 _REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
 _ORIGINS: Final = ("origin", "source")
 """Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""

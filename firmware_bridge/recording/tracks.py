@@ -17,19 +17,13 @@ if TYPE_CHECKING:
     from firmware_bridge.scans.mounting import Mounting
     from firmware_bridge.zeroing.baseline import Baseline
 
-GEOMETRY_METADATA: Final = "geometry"
-"""Name of the MCAP metadata that holds the pad of all sensors."""
-MOUNTING_METADATA: Final = "mounting"
-"""Name of the MCAP metadata that hold the mounting of a sensor each."""
-SOURCE_METADATA: Final = "source"
-"""Name of the MCAP metadata that holds the kind of source."""
+GEOMETRY_METADATA: Final = "geometry"  # name of the MCAP metadata that holds the pad of all sensors
+MOUNTING_METADATA: Final = "mounting"  # name of the MCAP metadata that hold the mounting of a sensor each
+SOURCE_METADATA: Final = "source"  # name of the MCAP metadata that holds the kind of source
 HIGHEST_COUNT: Final = 0xFFFF
-MOST_SENSORS: Final = 64
-"""Most sensors of a recording; one wire can have sixteen."""
-MOST_POSES: Final = 1 << 23
-"""Most poses of a recording: those of a day at 100 Hz, in 3 GB."""
-RATES_HZ: Final = (1e-3, 1e5)
-"""Lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0."""
+MOST_SENSORS: Final = 64  # most sensors of a recording; one wire can have sixteen
+MOST_POSES: Final = 1 << 23  # most poses of a recording: those of a day at 100 Hz, in 3 GB
+RATES_HZ: Final = (1e-3, 1e5)  # lowest and highest rate, in [Hz]: beyond them periods in [ns] overflow, or become 0
 A_RATE: Final = f"a positive number, {RATES_HZ[0]:g} to {RATES_HZ[1]:g}"
 
 

@@ -25,8 +25,7 @@ from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, USPA46, SensorGeom
 
 PAYLOAD_BYTES: Final = 8
 CONTROLLERS: Final = range(16)
-SDAS: Final = 8
-"""Number of data lines that an id of layout C can name, with TAXELS_OF_SDA taxels on each."""
+SDAS: Final = 8  # number of data lines that an id of layout C can name, with TAXELS_OF_SDA taxels on each
 TAXELS_OF_SDA: Final = 16
 BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from

@@ -25,8 +25,7 @@ late is no evidence of a slow clock."""
 LONGEST_STEP_NS: Final = 20_000_000
 STOOD_NS: Final = 1_000_000_000
 """Time between two arrivals, in [ns], up to which this machine may have stood still, which makes no clock slow."""
-MOST_BACK: Final = 8
-"""Steps back by over half of BACK_NS in that time from which stamps are no clock."""
+MOST_BACK: Final = 8  # steps back by over half of BACK_NS in that time from which stamps are no clock
 SLOWEST: Final = 6
 """Factor by which stamps that are a clock are slower than arrivals at most: a serial line of 115,200 baud is 4 times
 slower than its bus, and stamps in units of 10 ms are 10 times too slow."""

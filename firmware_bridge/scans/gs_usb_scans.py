@@ -10,8 +10,7 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 TICK_NS: Final = 1_000
-WRAP_TICKS: Final = 1 << 32
-"""Ticks after which the 32-bit stamps wrap: 71.6 minutes of microseconds."""
+WRAP_TICKS: Final = 1 << 32  # ticks after which the 32-bit stamps wrap: 71.6 minutes of microseconds
 
 
 class GsUsbScans:

@@ -18,8 +18,7 @@ from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.scan import Scan, VendorReading
 
-AS_MAPPED: Final = tuple(range(USPA44.taxel_count))
-"""Default order of the default pad's taxels."""
+AS_MAPPED: Final = tuple(range(USPA44.taxel_count))  # default order of the default pad's taxels
 
 
 @dataclass(frozen=True)

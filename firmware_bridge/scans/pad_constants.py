@@ -27,12 +27,10 @@ PAD_RANGES: Final = MappingProxyType(
 )
 """Constants of a pad, in this order, and their ranges: wider than for any pad, so that only slips are refused."""
 GAIN_RANGE: Final = (0.01, 100.0)
-GAINS: Final = len(AXES) * USPA44.taxel_count
-"""Number of gains of the default pad."""
+GAINS: Final = len(AXES) * USPA44.taxel_count  # number of gains of the default pad
 GAIN_SPREAD: Final = 0.075
 """Standard deviation of a chip's gain on one axis about 1, over new sensors: +-15 % are seen on devices."""
-LEVEL_90: Final = 1.645
-"""Half width of a normal 90 % interval, in standard deviations."""
+LEVEL_90: Final = 1.645  # half width of a normal 90 % interval, in standard deviations
 UNMEASURED_CERTAINTY: Final = 0.9
 """Certainty of gains without intervals: entered by a person, who has measured them somehow."""
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import SensorGeometry
 
-ABSENT: Final = -1
-"""Marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1."""
+ABSENT: Final = -1  # marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1
 
 
 LONGEST_SENSOR_NAME: Final = 64

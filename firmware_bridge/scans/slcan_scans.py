@@ -22,18 +22,14 @@ from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 _MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000
-_MIXED_NS: Final = SCAN_GIVEN_UP_NS
-"""Longest time for which frames wait while others are fed, in [ns]."""
+_MIXED_NS: Final = SCAN_GIVEN_UP_NS  # longest time for which frames wait while others are fed, in [ns]
 _JOINED_NS: Final = 5_000_000
 """Time before its stamp, in [ns], at which no frame can arrive: the error of stamps and of their offset."""
 
-FOREIGN: Final = 255
-"""Number of no sensor."""
-BEFORE: Final = -1
-"""Place of frames that came before the present ones."""
+FOREIGN: Final = 255  # number of no sensor
+BEFORE: Final = -1  # place of frames that came before the present ones
 _IDS: Final = 1 << 11
-_TWO_BYTES: Final = np.dtype(">u2")
-"""The first two of a frame: its id, and 4 bits of its length."""
+_TWO_BYTES: Final = np.dtype(">u2")  # the first two of a frame: its id, and 4 bits of its length
 
 
 class MixedCycles:

@@ -26,18 +26,13 @@ there, and an FTDI chip holds bytes back for 16. After a longer one, as when the
 another press."""
 SHORTEST_PAUSE_NS: Final = 1_500_000
 """Shortest time that counts as a pause, in [ns]: stamps and adapters with steps of 1 ms show less without one."""
-MOST_INTERVALS: Final = 128
-"""Intervals between cycles that give the period."""
-LEAST_INTERVALS: Final = 8
-"""Intervals from which it shows lost cycles, and pauses are judged by the shorter ones."""
-RENEWED_EVERY: Final = 32
-"""Cycles after which the period is computed again, once there are so many intervals."""
+MOST_INTERVALS: Final = 128  # intervals between cycles that give the period
+LEAST_INTERVALS: Final = 8  # intervals from which it shows lost cycles, and pauses are judged by the shorter ones
+RENEWED_EVERY: Final = 32  # cycles after which the period is computed again, once there are so many intervals
 LATER: Final = 64
 """Share of a period by which the ends of cycles may come later each time, since the period is an estimate."""
-MOST_LATE: Final = 3
-"""Cycles in a row that end late after which that is their pace."""
-MOST_LATE_IN_PIECES: Final = 5
-"""The same where several are read at once: an FTDI chip delays three of them."""
+MOST_LATE: Final = 3  # cycles in a row that end late after which that is their pace
+MOST_LATE_IN_PIECES: Final = 5  # the same where several are read at once: an FTDI chip delays three of them
 MOST_DOUBTS: Final = 8
 """Signs of another order in a row, without a whole cycle between them, after which the order is dropped."""
 

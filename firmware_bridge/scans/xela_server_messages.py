@@ -26,17 +26,14 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 
 HIGHEST_COUNT: Final = 0xFFFF
-LONGEST_MESSAGE_BYTES: Final = 1 << 18
-"""Most bytes of a message: sixteen sensors with every field take a third of it."""
+LONGEST_MESSAGE_BYTES: Final = 1 << 18  # most bytes of a message: sixteen sensors with every field take a third of it
 MOST_SENSORS: Final = 16
 HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
-LATEST_S: Final = 1e11
-"""Latest valid time, in [s] since 1970."""
+LATEST_S: Final = 1e11  # latest valid time, in [s] since 1970
 WELCOME: Final = "Welcome"
-PRETENDED_VERSION: Final = "_emulated"
-"""Suffix of an emulated server's version, which separates it from the vendor's."""
+PRETENDED_VERSION: Final = "_emulated"  # suffix of an emulated server's version, which separates it from the vendor's
 _HEX_WORDS: Final = re.compile("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?").fullmatch
 _COUNTED: Final[tuple[str, ...]] = (
     "messages",

@@ -27,13 +27,11 @@ from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
-USUAL_UPS_HZ: Final = 83.0
-"""Rate of a taxel by the vendor's data sheet, for a server that does not report it."""
+USUAL_UPS_HZ: Final = 83.0  # rate of a taxel by the vendor's data sheet, for a server that does not report it
 DUE_PERIODS: Final = 1.5
 """Periods after which an unchanged taxel counts as renewed where taxels come one by one; changed ones come earlier."""
 DUE_IN_CYCLE_PERIODS: Final = 0.5
-SLOW_SHARE: Final = 0.5
-"""Share of the median `ups` below which a scan does not wait for a taxel."""
+SLOW_SHARE: Final = 0.5  # share of the median `ups` below which a scan does not wait for a taxel
 STALE_NS: Final = 150_000_000
 """Age beyond the server's usual one at which an arriving reading counts as stale, in [ns]; more than a clock may be set
 back unnoticed."""

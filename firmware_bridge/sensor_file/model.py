@@ -34,8 +34,7 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, LAST_UNIX_S, Base
 
 FILE_FORMAT: Final = "tactile-sensor"
 FILE_VERSION: Final = 1
-MOST_BYTES: Final = 1 << 16
-"""Most bytes of a sensor file; a sensor takes 2 kB."""
+MOST_BYTES: Final = 1 << 16  # most bytes of a sensor file; a sensor takes 2 kB
 LONGEST_LINE_BYTES: Final = 2048
 """Most bytes of a line, twice a line of all gains. The time of tomllib grows with the square of a key's dots: 60 kB
 took 27 s."""
@@ -45,8 +44,7 @@ PARTS: Final = ("mounting", "force", "baseline", "gains")
 
 
 LARGEST_MM: Final = 1e5
-_OFF: Final = 1e-3
-"""Most by which a quaternion's norm may differ from 1."""
+_OFF: Final = 1e-3  # most by which a quaternion's norm may differ from 1
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ Origin = Literal["start-up", "demand", "file", "recording", "unsure"]
 
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
-MOST_FILE_BYTES: Final = 1 << 20
-"""Most bytes of a baseline file; a sensor takes about 2 kB."""
-LAST_UNIX_S: Final = 1e11
-"""Latest valid time, in [s] since 1970 (the year 5138)."""
+MOST_FILE_BYTES: Final = 1 << 20  # most bytes of a baseline file; a sensor takes about 2 kB
+LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
 
 Orders = Mapping[str, Sequence[int]]

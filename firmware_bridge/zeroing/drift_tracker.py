@@ -20,10 +20,8 @@ from firmware_bridge.zeroing.baseline import Baseline, deformation
 BLOCK_NS: Final = 500_000_000
 SAMPLE_NS: Final = 25_000_000
 """Time between the scans of a block, in [ns]: twenty give a median within a third of the noise, at a fifth the cost."""
-FEWEST_SCANS: Final = 8
-"""Least number of scans in a block, which lasts longer where scans are rare."""
-GAP_NS: Final = 5_000_000_000
-"""Time without a scan after which the pad may have been replaced or moved, in [ns]."""
+FEWEST_SCANS: Final = 8  # least number of scans in a block, which lasts longer where scans are rare
+GAP_NS: Final = 5_000_000_000  # time without a scan after which the pad may have been replaced or moved, in [ns]
 REST_BLOCKS: Final = 4
 """Still blocks before drift is followed or a rest level compared: by then a pad has recovered from a press."""
 COMMON_PER_S: Final = 20.0
@@ -33,14 +31,12 @@ COMMON_COUNTS: Final = 50.0
 36 counts; at this limit the summed z is still half of a contact's."""
 OWN_SHARE: Final = 0.65
 """Largest own drift of a taxel as a share of the common drift: six tenths are seen, and a press has more than one."""
-OWN_PER_S: Final = 0.05
-"""Highest rate of a taxel's own drift beyond that share, in [counts/s]."""
+OWN_PER_S: Final = 0.05  # highest rate of a taxel's own drift beyond that share, in [counts/s]
 TOUCH_COUNTS: Final = 10.0
 """Largest change of a taxel ahead of the common drift that is no touch: .01 N, nine times a block's highest noise."""
 RATE_S: Final = 2.0
 """Time over which the rate of the common drift is smoothed, in [s]: a taxel's share of it must not be one of noise."""
-NOISE_PER_S: Final = 0.2
-"""Rate that noise causes, in [counts/s]: four of its standard deviations."""
+NOISE_PER_S: Final = 0.2  # rate that noise causes, in [counts/s]: four of its standard deviations
 SLOW_PER_S: Final = 1.0
 """Rate of the common drift, in [counts/s], up to which a taxel's own drift is not followed while one may be touched."""
 STILL_COUNTS: Final = 7.0
@@ -49,8 +45,7 @@ STEP_COUNTS: Final = 15.0
 """Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause."""
 BACK_COUNTS: Final = 8.0
 """Size of a step up to which it counts as none, and the rest is followed. Smaller than a touch."""
-VOTE_COUNTS: Final = 4.0
-"""Largest own step of a taxel that contributes to the common drift: the size of noise."""
+VOTE_COUNTS: Final = 4.0  # largest own step of a taxel that contributes to the common drift: the size of noise
 FEWEST_VOTERS: Final = 4
 
 _ZEROED: Final = "since it was zeroed"

@@ -23,8 +23,7 @@ grip."""
 TOUCH_COUNTS: Final = 1500.0
 """Rise of the summed z that is a contact, some 1.3 N; a free pad warms by less within a recording."""
 FEWEST_TOUCHED: Final = 5
-STEP: Final = 8
-"""Scans by which a stretch is made longer at a time."""
+STEP: Final = 8  # scans by which a stretch is made longer at a time
 
 
 class Stretch(NamedTuple):

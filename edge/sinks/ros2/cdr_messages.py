@@ -190,8 +190,7 @@ def _taxel_places_m(geometry: SensorGeometry) -> NDArray[np.float64]:
     return np.pad(geometry.taxel_centres_mm() / 1e3, ((0, 0), (0, 1)))
 
 
-LONGEST_TOPIC: Final = 247
-"""Limit of ROS; DDS takes 255, some of which are for prefixes."""
+LONGEST_TOPIC: Final = 247  # limit of ROS; DDS takes 255, some of which are for prefixes
 _ALLOWED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLAIN: Final = re.compile(r"(?!s[0-9])(?!x_)[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 _FROM_DIGIT: Final = re.compile(r"[0-9][A-Za-z0-9]*(_[A-Za-z0-9]+)*")

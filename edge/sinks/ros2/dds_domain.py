@@ -19,8 +19,7 @@ from cyclonedds.topic import Topic
 from edge.errors import SinkError, UsageError
 from firmware_bridge.recording.cdr import Field, MessageType
 
-LARGEST_DOMAIN: Final = 232
-"""Largest domain number that still has ports."""
+LARGEST_DOMAIN: Final = 232  # largest domain number that still has ports
 _LOOPBACK: Final = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
 # The default lets each writer wait a second at its end for a reader that has stopped.
 _QUICK_END: Final = "<Internal><WriterLingerDuration>100ms</WriterLingerDuration></Internal>"

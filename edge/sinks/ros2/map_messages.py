@@ -13,8 +13,7 @@ from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.scan import ABSENT, Scan
 
 _POINT_FIELDS: Final = ("x", "y", "z", "fx", "fy", "fz", "sigma")
-_FLOAT32: Final = 7
-"""Number of float32 in sensor_msgs/PointField."""
+_FLOAT32: Final = 7  # number of float32 in sensor_msgs/PointField
 
 
 class Unit(NamedTuple):
