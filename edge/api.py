@@ -44,7 +44,7 @@ from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import RunFacts, Sink
-from edge.pipeline.source_setup import links_to, settled, with_recorded
+from edge.pipeline.source_setup import links_to, sensor_settings, with_recorded
 from edge.sinks import registry as forms
 from edge.sinks.registry import Fan
 from edge.validation import check_positive
@@ -207,7 +207,7 @@ def open_source(
         check_positive("rate_hz", rate_hz)
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
-    known = settled(sensor, id_map)
+    known = sensor_settings(sensor, id_map)
     links = links_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
     return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
 

@@ -27,7 +27,7 @@ from edge.api import (
     save_baselines,
     unfinished_load,
 )
-from edge.cli.run_help import understood
+from edge.cli.run_help import parsed_options
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 from firmware_bridge.in_place import BACKUP_SUFFIX
@@ -92,7 +92,7 @@ def _command(arguments: Sequence[str]) -> int | None:
             f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"
         )
         raise UsageError(f"no command {name!r}: {meant}")
-    return _ACTIONS[name](understood(name, rest))
+    return _ACTIONS[name](parsed_options(name, rest))
 
 
 def _follow(
@@ -150,9 +150,9 @@ def _baseline(options: argparse.Namespace) -> None:
 
     replaced = options.out.exists()
     if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
-        from edge.pipeline.replay_setup import recorded_baselines, settled
+        from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 
-        kind, known = "replay", settled(options.sensor, options.id_map)
+        kind, known = "replay", sensor_settings(options.sensor, options.id_map)
         baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
         print("\n".join(notes), file=sys.stderr)
     else:

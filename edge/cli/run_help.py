@@ -230,7 +230,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
     return made
 
 
-def understood(command: str, arguments: Sequence[str]) -> argparse.Namespace:
+def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the options of a command, and check of a run all that can be checked before anything is opened."""
     options = parser(command).parse_args(arguments)
     if "sink" not in options:

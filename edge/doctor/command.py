@@ -18,7 +18,7 @@ from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_press
 from edge.doctor.write_sensor_file import check_writable, keep
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
-from edge.pipeline.source_setup import references, refuse_emulated, settled
+from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
 from edge.terminal.progress_bar import SECONDS, Progress
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
@@ -200,10 +200,10 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
         forget_learned(options.sensor, options.forget_gains)
         print(f"{options.sensor}: learned gains of sensor {options.forget_gains} removed", file=out)
         return 0
-    known = settled(options.sensor, options.id_map)
+    known = sensor_settings(options.sensor, options.id_map)
     if options.out is not None:
         check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
-    before = references(options.baseline, known)
+    before = stored_baselines(options.baseline, known)
     with stop_on_signals() as stop:
         link, known, watched = prepare(options.source, known, before, options.rate_hz)
         visit = Visit(options, link, known, err, stop, clock_s)

@@ -16,7 +16,7 @@ from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import LineFacts
 from edge.doctor.taxel_checks import FEWEST_SCANS, Samples
 from edge.errors import UsageError
-from edge.pipeline.source_setup import links_to, references, refuse_emulated, settled, with_recorded
+from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.base import Link
@@ -249,8 +249,8 @@ def examine(
         UsageError: as for `open_source`; several sources, or baselines or a duration that are out of range.
     """
     check_positive("duration_s", duration_s)
-    known = settled(sensor, id_map)
-    link, known, watched = prepare(texts, known, references(baselines, known), rate_hz)
+    known = sensor_settings(sensor, id_map)
+    link, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
     with link:
         refuse_emulated(known, link.kind, force=False)
         watch(link, watched, duration_s, threading.Event() if stop is None else stop)

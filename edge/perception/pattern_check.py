@@ -180,7 +180,7 @@ class PatternCheck:
             self._strongest, self._score = strength, score
 
 
-def strangers(belonging: Sequence[float], *, posed: bool) -> list[int]:
+def foreign_taps(belonging: Sequence[float], *, posed: bool) -> list[int]:
     """Return the numbers, from 1, of the earlier taps that a pattern is made without, by `PatternCheck.belonging`.
 
     A tap with a pose of its own goes alone. Without poses the taps before it go, too: their turns are counted over it.

@@ -11,7 +11,7 @@ from edge.inference.trust import Trust
 from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
 from edge.perception.gain_following import SensorPad
-from edge.perception.pattern_check import SAME_STRENGTH, PatternCheck, strangers
+from edge.perception.pattern_check import SAME_STRENGTH, PatternCheck, foreign_taps
 from edge.perception.step import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
@@ -62,7 +62,7 @@ class Check:
             return every, None
         belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
         posed = step.pose is not None and window.poses is not None
-        dropped = strangers(belonging, posed=posed)
+        dropped = foreign_taps(belonging, posed=posed)
         if not dropped:
             return every, belonging
         settled = [

@@ -209,7 +209,7 @@ class Runtime:
         """Pass a scan through the stages of its sensor before the model."""
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
-        sensor = self._sensors.get(scan.sensor) or self._meet(scan)
+        sensor = self._sensors.get(scan.sensor) or self._new_sensor(scan)
         step = Step(scan, self._origin)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = (self._tracks.get(scan.sensor) or self._tracks.get(None) or None) if self._tracks else None
@@ -232,7 +232,7 @@ class Runtime:
             made.traction = None if tractions is None else tractions[row].copy()
             sensor.finish(step, window, made, given[0])
 
-    def _meet(self, scan: Scan) -> Sensor:
+    def _new_sensor(self, scan: Scan) -> Sensor:
         name = scan.sensor
         per_newton, pad, measured = self._counts_per_newton, self._pad, self._measured
         pad = pad.get(name) if isinstance(pad, Mapping) else pad

@@ -13,7 +13,7 @@ from edge.perception.result import Result
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.runtime_setup import open_runtime
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import settled
+from edge.pipeline.source_setup import sensor_settings
 from edge.validation import check_positive
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track
@@ -54,7 +54,7 @@ def infer(
         baseline = Baseline.from_counts(SENSOR, _checked("baseline", baseline, lowest=0), 0.0)
     recording = Recording(Path("array"), (Track(baseline.sensor, scans, None),), rate_hz)
     pad = pad_of(*scans.shape[2:])
-    known = settled(None, pad.name if pad in PADS else ModelMap(pad.name, pad, {}))
+    known = sensor_settings(None, pad.name if pad in PADS else ModelMap(pad.name, pad, {}))
     known = replace(known, sensors={baseline.sensor: SensorEntry(baseline=baseline)})
     with Source(ReplayLink([recording], paced=False), sensor_file=known) as source:
         return list(Stream(source, open_runtime(model, source)))

@@ -42,7 +42,7 @@ def take_baselines(
     """
     check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)
-    source.lend()
+    source.reserve()
     clock = (lambda: math.nan) if source.kind == "replay" else time.time  # never today's, of an old file
     skipped: dict[str, int] = {}
     estimators: dict[str, BaselineEstimator] = {}

@@ -103,7 +103,7 @@ class Commands:
         return commands
 
 
-def obey(commands: Commands, runtime: "Runtime", may_come: Callable[[str], bool] = lambda name: False) -> None:
+def carry_out(commands: Commands, runtime: "Runtime", may_come: Callable[[str], bool] = lambda name: False) -> None:
     """Carry out the commands that were put since the last call; one for a sensor that `may_come` yet waits for it."""
     for command in commands.poll():
         if command.name == "reset":

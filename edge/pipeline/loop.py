@@ -10,7 +10,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences, PaceSetter
-from edge.pipeline.commands import Commands, obey
+from edge.pipeline.commands import Commands, carry_out
 from edge.pipeline.gain_keeper import GainKeeper
 from edge.pipeline.pose_queue import PoseIntake, PoseQueue
 from edge.pipeline.run_statistics import Statistics
@@ -108,7 +108,7 @@ class Loop:
             self.finish()
             return
         if self._commands is not None:
-            self._obey(self._commands)
+            self._carry_out(self._commands)
         self.poses.begun = self.poses.begun or any(isinstance(one, TimedPose) for one in taken)
         if self.poses.begun:
             self._take_poses(taken)
@@ -120,7 +120,7 @@ class Loop:
                     self._make_patterns()
             elif isinstance(one, Notice):
                 self._make_patterns()
-                self._heed(one)
+                self._take_notice(one)
         # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
         self.left = min(self.left or self._runtime.waiting, self._runtime.waiting)
         self.left -= self._infer()
@@ -161,11 +161,11 @@ class Loop:
         most = max((scans for other, scans in heard.items() if other.startswith(prefix)), default=0)
         return f"no sensor {name!r}: sensors are {', '.join(sorted(heard))}" if most >= ALL_HEARD_SCANS else None
 
-    def _obey(self, commands: Commands) -> None:
+    def _carry_out(self, commands: Commands) -> None:
         def may_come(name: str) -> bool:
             return name not in self.statistics.scans_of_each() and self.no_sensor(name) is None
 
-        obey(commands, self._runtime, may_come)
+        carry_out(commands, self._runtime, may_come)
         self.statistics.commands_refused = commands.refused
         now_s = self._clock_s()
         if commands.reason is not None and now_s - self._refused_s >= REFUSED_AGAIN_S:
@@ -255,7 +255,7 @@ class Loop:
                 sink.write(result, counters)
         self.made.append(result)
 
-    def _heed(self, notice: Notice) -> None:
+    def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
         if notice.kind in ("lost", "silent", "back"):
             self._runtime.lose_touch(notice.sensors, same_pad=not notice.text)  # no text: a recording jumped

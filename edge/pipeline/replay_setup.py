@@ -9,7 +9,7 @@ from shlex import quote
 from types import MappingProxyType
 
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import settled, with_recorded
+from edge.pipeline.source_setup import sensor_settings, with_recorded
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.registry import place_recordings, recording_paths
@@ -62,7 +62,7 @@ def open_recording(
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
     pad = tracks[0].geometry
-    file = settled(sensor, None if sensor is not None else _named(pad))
+    file = sensor_settings(sensor, None if sensor is not None else _named(pad))
     known = with_recorded(file, [replay])
     recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines

@@ -97,7 +97,7 @@ class Stream:
         self._worker: ThreadPoolExecutor | None = None
         self._clock_s = clock_s
         self._clock_ns = clock_ns
-        source.lend(self)
+        source.reserve(self)
 
     def __repr__(self) -> str:
         statistics = self.statistics

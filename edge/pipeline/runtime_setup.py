@@ -12,7 +12,7 @@ from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.runtime import Runtime
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import of_single_csv, references
+from edge.pipeline.source_setup import of_single_csv, stored_baselines
 from edge.validation import check_whole
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
@@ -88,7 +88,7 @@ def open_runtime(
         estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
         contacts=load_contact_model() if nominal and learn else None,
         geometry=known.geometry,
-        baselines=of_single_csv(references(baselines, known), source.name),
+        baselines=of_single_csv(stored_baselines(baselines, known), source.name),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,

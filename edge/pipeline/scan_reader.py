@@ -158,7 +158,7 @@ class Source:
         atexit.unregister(self.close)
         self._open.close()
 
-    def lend(self, stream: "Reading | None" = None) -> None:
+    def reserve(self, stream: "Reading | None" = None) -> None:
         """Let a stream take the scans from now on; None only asks whether one could.
 
         Raises:

@@ -15,7 +15,7 @@ from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, lo
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
 
 
-def settled(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
+def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:
     """Return the settings of the sensors, by a sensor file and an id map as requested.
 
     Raises:
@@ -83,7 +83,9 @@ def refuse_emulated(known: SensorFile, kind: SourceKind, force: bool) -> None:
             )
 
 
-def references(baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile) -> Mapping[str, Baseline]:
+def stored_baselines(
+    baselines: Mapping[str, Baseline] | str | Path | None, known: SensorFile
+) -> Mapping[str, Baseline]:
     """Return the baselines of free pads: stored ones, or their file, before those of the sensor file."""
     if isinstance(baselines, (str, Path)):
         return load_baselines(baselines, known.orders)

@@ -8,7 +8,7 @@ from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseQueue
 from edge.sinks.registry import needs_cyclone_dds
 from edge.sinks.ros2.cdr_messages import base_topic
-from edge.sinks.zenoh import close_session, open_session, opening, understood
+from edge.sinks.zenoh import close_session, open_session, opening, parsed_target
 
 if TYPE_CHECKING:
     import zenoh
@@ -36,7 +36,7 @@ def check_poses(text: str) -> tuple[str | None, str, str]:
     form, _, target = form_text.partition(":")
     if form == "zenoh":
         target = target or DEFAULT_KEY
-        understood(target)
+        parsed_target(target)
     elif form == "ros2" and target:
         target = base_topic(target)
     else:

@@ -141,9 +141,9 @@ def check_sink(text: str) -> tuple[str, str]:
     if form == "ros2":
         _ros2_topic(target)
     if form == "zenoh":
-        from edge.sinks.zenoh import understood
+        from edge.sinks.zenoh import parsed_target
 
-        understood(target)
+        parsed_target(target)
     return form, target
 
 

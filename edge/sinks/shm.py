@@ -196,7 +196,7 @@ class SharedMemorySink(Sink):
         if self._file < 0:
             return
         self._words[HEARTBEAT_AT // _WORD] = 0
-        self._unname(self._file)
+        self._unlink(self._file)
         self._words.release()
         self._memory.close()
         os.close(self._file)
@@ -251,11 +251,11 @@ class SharedMemorySink(Sink):
                 pid = int.from_bytes(head[_WRITER_PID_AT : _WRITER_PID_AT + _WORD], "little")
                 raise SinkError(f"{self._path} is written by process {pid}: end it, or choose another name") from error
             os.pwrite(descriptor, bytes(_WORD), HEARTBEAT_AT)  # for readers that still look at it
-            self._unname(descriptor)
+            self._unlink(descriptor)
         finally:
             os.close(descriptor)
 
-    def _unname(self, descriptor: int) -> None:
+    def _unlink(self, descriptor: int) -> None:
         """Free the name, unless it is another's by now."""
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(descriptor), self._path.stat()):

@@ -109,7 +109,7 @@ def chunks(sensor: str) -> str:
     return quote(sensor, safe="/" if all(sensor.split("/")) else "")
 
 
-def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
+def parsed_target(target: str) -> tuple[str, dict[str, Any] | Path]:
     """Return key and configuration of a target; a UsageError where it has another form."""
     key, asked, option = target.partition("?")
     if not all(key.split("/")) or set(key) & set("*$#") or key.startswith("@") or "/@" in key:
@@ -128,7 +128,7 @@ def understood(target: str) -> tuple[str, dict[str, Any] | Path]:
 
 def open_session(target: str) -> "tuple[str, zenoh.Session]":
     """Return the key of a target, and an open session; a SinkError where zenoh is missing, or cannot be opened."""
-    key, configuration = understood(target)
+    key, configuration = parsed_target(target)
     try:
         import zenoh
     except ImportError as error:

@@ -99,7 +99,7 @@ class Server:
     def close(self) -> None:
         """Inform viewers that the run has ended, and free the port."""
         self._ending = True
-        self._rouse()
+        self._wake()
         if self._thread is not None:
             self._thread.join()
         self._socket.close()
@@ -107,9 +107,9 @@ class Server:
     def wake(self) -> None:
         """Wake the server, because there is something new for its viewers. Never waits."""
         if self._watched:
-            self._rouse()
+            self._wake()
 
-    def _rouse(self) -> None:
+    def _wake(self) -> None:
         loop = self._loop
         if loop is not None:
             with contextlib.suppress(RuntimeError):  # it has ended at that moment

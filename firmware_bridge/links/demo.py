@@ -63,7 +63,7 @@ class DemoLink(Link):
             self._link = SlcanSerialLink(_await_port(self._process))
             self._link.__enter__()
         except BaseException:
-            self._reap()
+            self._collect_ended()
             raise
         return self
 
@@ -74,7 +74,7 @@ class DemoLink(Link):
                 link.__exit__(*exc_info)
                 self._counts = link.counters()
         finally:
-            self._reap()
+            self._collect_ended()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
@@ -115,7 +115,7 @@ class DemoLink(Link):
         """Return the counters of the serial link, the last ones after it was closed."""
         return self._link.counters() if self._link else dict(self._counts)
 
-    def _reap(self) -> None:
+    def _collect_ended(self) -> None:
         process, self._process = self._process, None
         if process is None:
             return

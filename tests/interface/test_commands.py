@@ -17,7 +17,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, write_model
 
 from edge.cli.user_commands import user_commands
-from edge.pipeline.commands import RESET, Command, CommandLines, Commands, obey, read_stdin
+from edge.pipeline.commands import RESET, Command, CommandLines, Commands, carry_out, read_stdin
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []
@@ -130,7 +130,7 @@ def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
             os.kill(os.getpid(), signal.SIGUSR1)
             deadline_s = time.monotonic() + 20
             while len(runtime.done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
-                obey(everything, runtime)
+                carry_out(everything, runtime)
             assert everything.refused == 1
     runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
     assert runtime.done == ["reset", ("4", True)]

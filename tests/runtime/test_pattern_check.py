@@ -13,7 +13,7 @@ from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, strangers
+from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, foreign_taps
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -198,7 +198,7 @@ class TestBelonging:
         [([0.1, 0.9, 0.2], [2], [2, 3]), ([], [], []), ([0.1, 0.49], [], []), ([0.5], [1], [1])],
     )
     def test_a_tap_with_a_pose_of_its_own_goes_alone(self, shares, alone, with_those_before):
-        assert strangers(shares, posed=True) == alone and strangers(shares, posed=False) == with_those_before
+        assert foreign_taps(shares, posed=True) == alone and foreign_taps(shares, posed=False) == with_those_before
 
 
 EVERY = RuntimeOptions(every_scan=True, follow_drift=False)

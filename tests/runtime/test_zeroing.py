@@ -37,7 +37,7 @@ class Script:
     def __init__(self, given):
         self._given = given
 
-    def lend(self):
+    def reserve(self):
         """Has no other stream."""
 
     def counters(self):

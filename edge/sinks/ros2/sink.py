@@ -118,7 +118,7 @@ class Ros2Sink(Sink):
         if result.pattern is not None:
             self._show(sensor, result, unix_ns)
         elif result.state != "dropped":  # a newer scan has already published a pattern
-            self._withdraw(sensor, unix_ns, 0.0 if result.contact is False else np.nan)
+            self._clear(sensor, unix_ns, 0.0 if result.contact is False else np.nan)
         force = wrench(result, self._run.geometry, unix_ns)
         if force is not None:
             self._publish_to(sensor, "wrench", WRENCH_STAMPED, lambda: force)
@@ -136,7 +136,7 @@ class Ros2Sink(Sink):
             if event.sensor not in (None, name) or not name.startswith(event.sensors):
                 continue
             if event.kind in _OUTAGES:
-                self._withdraw_all(sensor, event.time_ns, event.kind)
+                self._clear_of_all(sensor, event.time_ns, event.kind)
             if event.kind in (*_OUTAGES, "trouble"):
                 sensor.trouble[event.kind] = event.text
             elif event.kind == "well":
@@ -152,7 +152,7 @@ class Ros2Sink(Sink):
     def close(self) -> None:
         """Publish that the run has ended, and leave the domain."""
         for sensor in self._sensors.values():
-            self._withdraw_all(sensor, self._now_ns(), "ended")
+            self._clear_of_all(sensor, self._now_ns(), "ended")
         self._diagnose(ended=True)
         self._sensors.clear()
         if self._asked is not None:
@@ -212,7 +212,7 @@ class Ros2Sink(Sink):
             self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
         self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._run.geometry, frame, unix_ns))
 
-    def _withdraw(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
+    def _clear(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
 
         A wrench becomes zero as the pattern does. Controllers refuse NaN, so an unknown one is not published.
@@ -231,8 +231,8 @@ class Ros2Sink(Sink):
         empty = partial(points, replace(sensor.last, pattern=None), self._run.geometry, sensor.frame, unix_ns)
         self._publish_to(sensor, "points", POINT_CLOUD, empty)
 
-    def _withdraw_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
-        self._withdraw(sensor, time_ns + self._unix_offset_ns, np.nan)
+    def _clear_of_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
+        self._clear(sensor, time_ns + self._unix_offset_ns, np.nan)
         self._publish_numbers(sensor, None, why)
 
     def _publish_numbers(self, sensor: _Sensor, result: Result | None, state: str) -> None:
