@@ -26,7 +26,7 @@ def scans(sequences):
 
 @pytest.mark.night
 def test_the_report_has_every_range_and_method(bench, tmp_path):
-    page = force.run(bench, tmp_path)
+    page = force.run_force(bench, tmp_path)
     with page.with_suffix(".csv").open() as file:
         rows = list(csv.DictReader(file))
     columns = {"PSNR dB", "SSIM", "SSIM at own scale", "relative error %", "parameters", "MMAC", "run time ms"}
@@ -35,7 +35,6 @@ def test_the_report_has_every_range_and_method(bench, tmp_path):
     assert len(rows) == 5 * len({row["force N"] for row in rows})
     assert rows[0]["force N"] == "0.1..0.2"
     assert all(int(row["taps"]) <= int(row["scans"]) for row in rows)
-    assert page.with_suffix(".png").stat().st_size > 10_000
 
 
 def test_forces_lie_within_their_range(sequences, scans):

@@ -1,4 +1,4 @@
-"""Run experiments: each writes NAME.md, NAME.csv and NAME.png.
+"""Run experiments: each writes a page NAME.md and its tables as CSV, some a plot.
 
 python -m train.experiments table3 angle --reports reports
 """
@@ -32,9 +32,9 @@ EXPERIMENTS: Final = {
     "table4": ("paper.tables:run_table4", "STSR at five scales"),
     "angle": ("paper.tables:run_angle", "MTSR-2 by angle between its taps"),
     "taps": ("paper.tables:run_taps", "one to seven taps"),
-    "force": ("paper.force", "error by contact force"),
-    "force-recovery": ("paper.force_recovery", "force through press, hold and release"),
-    "unseen": ("paper.unseen", "surfaces that were not trained on"),
+    "force": ("paper.force:run_force", "error by contact force"),
+    "force-recovery": ("paper.force:run_recovery", "force through press, hold and release"),
+    "unseen": ("paper.tables:run_unseen", "surfaces that were not trained on"),
     "real": ("sensor.real", "real grips: shape of faces, patterns against readings"),
     "fig5": ("paper.fig5", "alpha and beta against force"),
     "fig7": ("paper.fig7", "tPSF, PSF and depth against FEM"),
