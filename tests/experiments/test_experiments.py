@@ -8,6 +8,8 @@ import pytest
 from edge_samples import ROOT
 
 from train.experiments.__main__ import EXPERIMENTS, function_of, main
+from train.experiments.paper.protocol import HELD_OUT
+from train.experiments.paper.tables import training_sets
 from train.experiments.support import workbench
 from train.experiments.support.workbench import Workbench
 
@@ -16,6 +18,7 @@ COLUMNS = {
     "table4": {"scale", "test PSNR dB", "paper's test PSNR dB", "MMAC", "run time ms"},
     "angle": {"network", "angle deg", "test PSNR dB", "over STSR dB", "run time ms"},
     "taps": {"network", "taps given", "test PSNR dB", "over STSR dB", "run time ms"},
+    "unseen": {"trained on", "tested on", "taps", "test PSNR dB", "covered %", "width %", "run time ms", "steps"},
     "fig5": {"surface"},
     "fig7": {"method", "error %", "ms a pattern"},
 }
@@ -48,7 +51,7 @@ def run(folder, name, *options, again=False):
     return report
 
 
-AT_NIGHT = ("table3", "table4", "angle", "taps")
+AT_NIGHT = ("table3", "table4", "angle", "taps", "unseen")
 """Networks of the paper's size, and a training for each row, take half a minute."""
 NAMES = [pytest.param(name, marks=pytest.mark.night) if name in AT_NIGHT else name for name in COLUMNS]
 
@@ -72,6 +75,24 @@ def test_table3_has_every_method_and_the_papers_figures(folder):
     assert {"bilinear", "bicubic", "linear map", "srgan", "stsr", "mtsr2", "compact stsr", "compact mtsr7"} <= set(rows)
     assert rows["mtsr2"]["paper's test PSNR dB"] == "23.8"
     assert float(rows["stsr"]["MMAC"]) == pytest.approx(7321, abs=1)
+
+
+@pytest.mark.night
+def test_unseen_has_every_training_set_on_every_test_set_over_the_one_without_figures(folder):
+    with run(folder, "unseen").with_suffix(".csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len({(row["trained on"], row["tested on"], row["taps"]) for row in rows}) == len(rows) == 5 * 4 * 2
+    assert all(row["over the 15 dB"] == "+0.00 (+0.00..+0.00)" for row in rows if row["trained on"] == "15")
+
+
+@pytest.mark.night
+def test_training_sets_keep_to_their_names(folder):
+    sets = training_sets(Workbench(folder / "data", folder / "checkpoints", quick=True))
+    surfaces = {name: set(data.family.tolist()) for name, (_, data) in sets.items()}
+    assert [name for name, there in surfaces.items() if there & set(HELD_OUT)] == ["18 + figures"]
+    assert surfaces["15, half as long"] == surfaces["15"]
+    assert surfaces["15 + figures"] - surfaces["15"] == {"glyph", "polygon"}
+    assert surfaces["18 + figures"] == surfaces["15 + figures"] | set(HELD_OUT)
 
 
 @pytest.mark.night
