@@ -56,15 +56,15 @@ class TestVerdicts:
         odd = np.stack([press(x=9000)] * trust_checks.CONTACTS)
         good = np.stack([press()] * trust_checks.CONTACTS)
         found = trust_checks.verdicts_on(model, [odd, good], [None, None])
-        assert len(found.sensor) == 2 * trust_checks.CONTACTS and found.checked.all()
-        assert set(found.reason[found.sensor == 0]) == {"unfamiliar"} and set(found.reason[found.sensor == 1]) == {""}
-        assert found.suspected == {1: [False, False], 3: [True, False], 5: [True, False], 10: [True, False]}
-        row = found.cells()
-        assert row["contacts"] == 22 and str(row["flagged %"]).startswith("50.0") and row["unexplained %"] == 0
+        assert (found["contacts"], found["too light"]) == (2 * trust_checks.CONTACTS, 0)
+        assert str(found["flagged %"]).startswith("50.0")
+        assert (found["unfamiliar %"], found["unexplained %"]) == (50, 0)
+        after = [float(str(found[f"sensor, after {number} %"]).split()[0]) for number in trust_checks.AFTER]
+        assert after == [0, 50, 50, 50]
 
     def test_what_begins_no_contact_counts_nowhere(self):
         found = trust_checks.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
-        assert found.cells() == {"contacts": 0}
+        assert found == {"contacts": 0}
 
     def test_a_share_of_none_has_an_interval_too(self):
         assert trust_checks.share(np.zeros(100, dtype=bool)) == "0.0 (0.0..3.6)"

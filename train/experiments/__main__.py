@@ -20,14 +20,8 @@ from train.experiments.support.workbench import Workbench
 EXPERIMENTS: Final = {
     "families": ("sensor.families", "the shipped model and its intervals on every family, next to baselines"),
     "pads": ("sensor.pads", "the shipped model on pads that are off the nominal one"),
-    "trust-checks": (
-        "sensor.trust_checks",
-        "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
-    ),
-    "posed-taps": (
-        "sensor.posed_taps",
-        "taps from known poses: one to seven, by schedule, the paper's too, and with wrong poses",
-    ),
+    "trust-checks": ("sensor.trust_checks", "patterns not believed and taps dropped, rightly and wrongly"),
+    "posed-taps": ("sensor.posed_taps", "one to seven taps from known poses, by schedule, and with wrong poses"),
     "table3": ("paper.tables:run_table3", "all methods at x10 on the same targets"),
     "table4": ("paper.tables:run_table4", "STSR at five scales"),
     "angle": ("paper.tables:run_angle", "MTSR-2 by angle between its taps"),

@@ -128,8 +128,7 @@ def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
     for name, field in FIELDS.items():
         alone = [field(np.random.default_rng([SEED, number])) for number in range(len(readings))]
         given[f"{name}, the pad free"] = ([np.tile(one, (CONTACTS, 1, 1, 1)) for one in alone], nothing)
-    every = tracked(given.items(), "faults", "fault")
-    return [{"fault": name} | verdicts_on(model, *one).cells() for name, one in every]
+    return [{"fault": name} | verdicts_on(model, *one) for name, one in tracked(given.items(), "faults", "fault")]
 
 
 AFTER: Final = (1, 3, 5, 10)
@@ -141,31 +140,6 @@ _OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad
 RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
 """RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
 _LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
-
-
-class Verdicts(NamedTuple):
-    """Verdicts on m contacts of several sensors: the reason is empty where believed, too light ones are not checked.
-
-    `suspected` tells for each number of AFTER whether each sensor with more contacts than that was suspected.
-    """
-
-    sensor: NDArray[np.int64]
-    reason: NDArray[np.str_]
-    checked: NDArray[np.bool_]
-    suspected: dict[int, list[bool]]
-
-    def cells(self) -> Row:
-        """Return shares of the contacts, and of suspected sensors, as cells of a row."""
-        row: Row = {"contacts": len(self.sensor)}
-        if not len(self.sensor):
-            return row
-        row |= {"too light": int((~self.checked).sum()), "flagged %": share(np.isin(self.reason, _OWN), self.sensor)}
-        row |= {f"{reason} %": round(100 * float((self.reason == reason).mean()), 1) for reason in _OWN[1:]}
-        return row | {
-            f"sensor, after {number} %": share(np.array(sensors))
-            for number, sensors in self.suspected.items()
-            if sensors
-        }
 
 
 class Judged(NamedTuple):
@@ -218,23 +192,32 @@ def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
     return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
 
 
-def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Verdicts:
-    """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds."""
+def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Row:
+    """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds.
+
+    They are shares of the contacts, of which too light ones are not checked, and of the sensors with more contacts than
+    each number of AFTER that were suspected by then, as cells of a row.
+    """
     rows: list[tuple[int, str, bool]] = []
     suspected: dict[int, list[bool]] = {number: [] for number in AFTER}
     for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
-        sensor, seen = PushedSensor(model, pad, seed=number), 0
+        pushed, seen = PushedSensor(model, pad, seed=number), 0
         for counts in contacts:
-            result = sensor.touch(counts)
+            result = pushed.touch(counts)
             if result.pattern is None:
                 continue
             rows.append((number, result.untrusted_reason or "", result.trusted is not None))
-            sensor.free()  # it brings the events of the contact, which follow from the evidence of those before
+            pushed.free()  # it brings the events of the contact, which follow from the evidence of those before
             if seen in suspected:
-                suspected[seen].append(sensor.suspected)
+                suspected[seen].append(pushed.suspected)
             seen += 1
-    number, reason, checked = zip(*rows, strict=True) if rows else ((), (), ())
-    return Verdicts(np.array(number, dtype=int), np.array(reason, dtype=str), np.array(checked, dtype=bool), suspected)
+    if not rows:
+        return {"contacts": 0}
+    sensor, reason, checked = map(np.array, zip(*rows, strict=True))
+    flagged = share(np.isin(reason, _OWN), sensor)
+    row: Row = {"contacts": len(rows), "too light": int((~checked).sum()), "flagged %": flagged}
+    row |= {f"{name} %": round(100 * float((reason == name).mean()), 1) for name in _OWN[1:]}
+    return row | {f"sensor, after {number} %": share(np.array(some)) for number, some in suspected.items() if some}
 
 
 def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
