@@ -18,9 +18,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation import metrics
 from edge.evaluation.classical_methods import fit_gain
-from edge.evaluation.metrics import contact_iou, psnr_db, ssim
+from edge.evaluation.metrics import contact_iou, psnr_db, ssim, volume_mm3
 from edge.perception.contact_options import ON_COUNTS
 from edge.perception.tap_tracker import TapTracker
 from edge.terminal.progress_bar import tracked
@@ -131,6 +130,7 @@ PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0
 PRESS, HOLD, RELEASE, REST = range(4)
 _ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])
 RANGE_N: Final = TEST_FORCE_N
+_PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
 CLAIM_N: Final = 0.02 * RANGE_N
 """Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
 
@@ -169,7 +169,7 @@ def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisan
     clean = between_frames(sequences.counts[index, 0], share)[:, None]
     newest = apply_nuisances(clean, nuisances, seed, tap_s=course.time_s[-1], angle_deg=angle_deg[:, :1])[0, 0]
     earlier = read_windows(sequences.counts[index], end, nuisances, seed, PRESS_S / end, angle_deg)[0, 1:]
-    whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), sequences.scale)
+    whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), USPA44.pixel_pitch_mm(sequences.scale))
     return Scans(
         windows=np.concatenate([newest[:, None], np.broadcast_to(earlier, (len(newest), *earlier.shape))], axis=1),
         force_n=sequences.force_at(index, share)[0],
@@ -215,11 +215,6 @@ def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], co
         way = way[np.argsort(true_n[way], kind="stable")]
         ways.append(np.interp(at_n, true_n[way], found_n[way]))
     return 100 * float(np.abs(ways[0] - ways[1]).max()) / RANGE_N
-
-
-def volume_mm3(patterns: NDArray[np.floating], scale: int) -> NDArray[np.floating]:
-    """Return the sum of patterns (n, H, W) in [mm] over their area, (n,) in [mm3]."""
-    return metrics.volume_mm3(patterns, USPA44.pixel_pitch_mm(scale))
 
 
 def _rms_percent(error_n: NDArray[np.floating]) -> float:
@@ -294,8 +289,8 @@ def training_presses(data: PressSet, presses: int) -> Scans:
     """Return training presses, read by sensors that were just zeroed."""
     picked = data.pick(np.random.default_rng([SEED, 1]).integers(len(data), size=presses)).with_taps(_TAPS)
     readings = read_presses(picked, _ZEROED, SEED)
-    return Scans(readings, picked.force_n[:, 2], volume_mm3(picked.patterns.astype(np.float32), data.scale))
+    return Scans(readings, picked.force_n[:, 2], volume_mm3(picked.patterns.astype(np.float32), _PIXEL_MM))
 
 
 def _volume_of(network: Method) -> Callable[[Scans], NDArray[np.floating]]:
-    return lambda scans: volume_mm3(network.patterns(scans.windows), SCALE)
+    return lambda scans: volume_mm3(network.patterns(scans.windows), _PIXEL_MM)
