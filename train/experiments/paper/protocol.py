@@ -78,8 +78,12 @@ def from_base(name: str, taps: int, steps: int, scale: int = SCALE) -> Training:
     return Training(f"taps-{name}", network, recipe, scale, BASE.name, seed)
 
 
-def seed_size(network: str) -> Training:
-    """Return the training of a network of the paper, limited by time."""
+def seed_size(name: str) -> Training:
+    """Return the training of a network of the paper, limited by time.
+
+    `stsr longer` is trained on for as long as MTSR-2 from the STSR, so that the two differ by the second tap alone.
+    """
+    network, _, longer = name.partition(" ")
     taps = int(network.removeprefix("mtsr")) if network.startswith("mtsr") else 1
     recipe = Recipe(
         steps=_ENDLESS,
@@ -88,19 +92,12 @@ def seed_size(network: str) -> Training:
         weight_decay=1e-2,
         given=given_taps(taps),
         bf16=True,
-        minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
+        minutes=_SEED_MINUTES.get(name, _SEED_MINUTES_MORE),
     )
-    start = {"srgan": "seed-srcnn"}.get(network, "seed-stsr" if taps > 1 else None)
-    return Training(f"seed-{network}", network, recipe, start=start)
+    start = "seed-srcnn" if network == "srgan" else "seed-stsr" if taps > 1 or longer else None
+    return Training(f"seed-{name}", network, recipe, start=start)
 
 
-SEED_STSR_LONGER: Final = replace(
-    seed_size("stsr"),
-    name="seed-stsr longer",
-    recipe=replace(seed_size("stsr").recipe, minutes=_SEED_MINUTES_MORE),
-    start="seed-stsr",
-)
-"""STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
 _STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
 
 
