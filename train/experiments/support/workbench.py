@@ -44,23 +44,14 @@ Figures = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Method:
-    """Method from windows to patterns.
-
-    Attributes:
-        name: as shown in tables.
-        taps: taps of a window that the method uses.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        run: windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm], or None.
-        cost: parameters, multiply-accumulates and run time, as cells of a row.
-        training: steps and time, as cells of a row.
-    """
+    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm]."""
 
     name: str
-    taps: int
-    contact_level: float
+    taps: int  # of a window that the method uses
+    contact_level: float  # share of a pattern's maximum from which a pixel counts as touched
     run: Callable[[NDArray[np.float32]], tuple[NDArray[np.floating], NDArray[np.float32] | None]]
-    cost: Row = field(default_factory=dict)
-    training: Row = field(default_factory=dict)
+    cost: Row = field(default_factory=dict)  # parameters, multiply-accumulates and run time, as cells of a row
+    training: Row = field(default_factory=dict)  # steps and time, as cells of a row
 
     def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
         """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
