@@ -4,9 +4,9 @@ What is judged here has set nothing: networks, checks and limits were fitted on 
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +142,8 @@ RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
 _LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
 
 
-class Judged(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Judged:
     """Contacts of n sensors, one each, which the runtime checked, at an index (n,) among the presses.
 
     `off` is the RMS error over the RMS of the truth; `light` are those between the counts that end and begin a contact.
@@ -263,7 +264,7 @@ def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: Fr
         on_db, used, foreign = guarded(guarding, counts, truth, taps)
         row: Row = {"earlier taps": name, "windows": len(counts)}
         by_tap: Row = {f"tap {number} %": share(foreign[:, number - 1], pads) for number in range(1, taps)}
-        some, every = share(foreign.any(axis=1), pads), share(used == 1, pads)
+        some, every = share(np.logical_or.reduce(foreign, axis=1), pads), share(used == 1, pads)
         dropped.append(row | by_tap | {"some dropped %": some, "all dropped %": every})
         row[single.name] = round(float(alone_db.mean()), 2)
         for how, found_db in (("no guard", off_db), ("guard", on_db)):
