@@ -10,10 +10,10 @@ on several threads), and the program from raw counts to records (saturated, wrap
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -66,8 +66,7 @@ FREE_SCANS, TOUCHED_SCANS, KEPT_SCANS = 30, 40, 10
 """Scans of the free pad and of the case; a taxel's last reading is kept for a few scans."""
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
+class Case(NamedTuple):
     """One row of the table: a stiff or extreme input, the measured quantity and its upper bound.
 
     Where the case must be refused the value is None, and `note` the error; else it may hold the states of the records.
@@ -179,7 +178,7 @@ def graph_cases() -> Iterator[Case]:
         for name, window in given.items():
             yield from _graph(name, window, one, several, peer)
         for name, pad in pads(one.contract).items():
-            size_mm = largest(one, given["press"], one.contract.pad_row(pad))
+            size_mm = largest(one.run(given["press"], one.contract.pad_row(pad)), one.deviation)
             yield Case(name, "largest, mm", size_mm, MOST_MM, model=path.stem)
     for model in (DEFAULT_MODEL, POSED_MODEL):
         session = ModelSession(find_model(model))
@@ -217,25 +216,21 @@ def _graph(
     name: str, window: NDArray[np.float32], one: ModelSession, several: ModelSession, peer: ModelSession | None
 ) -> Iterator[Case]:
     pattern = one.run(window).copy()
-    size, full_scale = float(np.abs(pattern).max()), one.contract.output_full_scale
-    touch = name in TOUCHES or name.endswith("taps")
-    if (
-        (trust := one.contract.read_trust())
-        and name in extreme_windows(one.contract)
-        and name not in NO_TOUCH
-        and not touch
-    ):
+    size_mm, full_scale = largest(pattern, one.deviation), one.contract.output_full_scale
+    size, touch = float(np.abs(pattern).max()), name in TOUCHES or name.endswith("taps")
+    extreme = name in extreme_windows(one.contract)
+    if extreme and not touch and name not in NO_TOUCH and (trust := one.contract.read_trust()):
         verdict = PatternCheck(trust, one.contract).judge(0, window[0], pattern, one.deviation, one.traction, 0)
         yield Case(name, "believed", float(verdict.trusted is True), 0.0, model=one.name)
     strength = max(1.0, float(np.abs(window).max()))  # patterns grow with the readings: no bound beyond them
-    yield Case(name, "largest over the largest reading, mm", largest(one, window) / strength, MOST_MM, model=one.name)
+    yield Case(name, "largest over the largest reading, mm", size_mm / strength, MOST_MM, model=one.name)
     spread = float(np.abs(several.run(window) - pattern).max())
     together = one.run_together([window] * TOGETHER)
     spread = max(spread, float(np.abs(together - pattern).max()))
     most = SAME if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
     what = f"{THREADS} threads and {TOGETHER} windows, to one"
     yield Case(name, what, spread / max(size, full_scale), most, model=one.name)
-    if peer is not None and (touch or name in extreme_windows(one.contract)):
+    if peer is not None and (touch or extreme):
         in_float = peer.run(window)
         apart, largest_float = float(np.abs(in_float - pattern).max()), float(np.abs(in_float).max())
         share, most = apart / max(largest_float, full_scale), INT8_PRESS if touch else INT8_BEYOND
@@ -244,12 +239,7 @@ def _graph(
         yield Case(name, "int8 to float32", share, most, model=one.name)
 
 
-def largest(session: ModelSession, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> float:
-    """Return the largest value of pattern and deviation; NaN unless all are finite and every deviation is above 0."""
-    return largest_of(session.run(window, pad), session.deviation)
-
-
-def largest_of(pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None) -> float:
+def largest(pattern: NDArray[np.float32], deviation: NDArray[np.float32] | None) -> float:
     """Return the largest value of both; NaN unless all are finite and every deviation is above 0."""
     maps = [pattern] if deviation is None else [pattern, deviation]
     sure = all(np.isfinite(one).all() for one in maps) and (deviation is None or bool((deviation > 0).all()))
@@ -293,7 +283,7 @@ def played(name: str, model: ModelSession, raw: NDArray[np.int32], patterns: boo
     states = ", ".join(dict.fromkeys(result.state for result in results))
     if not patterns:
         return Case(name, "patterns made of it", float(len(made)), 0.0, states, model.name)
-    sizes = [largest_of(pattern, deviation) for pattern, deviation in made]
+    sizes = [largest(pattern, deviation) for pattern, deviation in made]
     return Case(name, "largest in a record, mm", float(np.max(sizes, initial=0.0)), MOST_MM, states, model.name)
 
 

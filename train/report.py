@@ -1,4 +1,4 @@
-"""Report of an experiment: a table as CSV and Markdown, a plot as PNG, and the command and machine that made them."""
+"""Report of an experiment: tables as CSV and Markdown, a plot as PNG, and the command and machine that made them."""
 
 import csv
 import shlex
@@ -23,7 +23,7 @@ _RESAMPLES: Final = 2000
 
 
 class Report:
-    """Collector of an experiment's results, written as NAME.csv, NAME.md and NAME.png.
+    """Collector of an experiment's results, written as NAME.md, NAME.csv and, where it has a plot, NAME.png.
 
     The head of the page names the experiment's source, and the models and frozen sets that it has used by then. A quick
     run was cut short for a test: said at the top of the page.
@@ -59,12 +59,12 @@ class Report:
         self._parts.append("\n".join([caption, "", *(f"| {line} |" for line in lines)]))
 
     @contextmanager
-    def figure(self, part: str = "", size: tuple[float, float] = (8, 5)) -> Iterator[Figure]:
-        """Add a plot to the page, saved as NAME.png or NAME-PART.png."""
+    def figure(self, size: tuple[float, float] = (8, 5)) -> Iterator[Figure]:
+        """Add a plot to the page, saved as NAME.png."""
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
-        path = self._file(".png", part)
+        path = self._file(".png")
         figure.savefig(path, dpi=110, metadata={"Software": None})
         self._parts.append(f"![{path.stem}]({path.name})")
 
@@ -73,11 +73,11 @@ class Report:
         head = [f"# {self._path.name}", str(provenance(_command(), [self._source], self._models, SEED))]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")
-        page = self._file(".md", "")
+        page = self._file(".md")
         page.write_text("\n\n".join(head + self._parts) + "\n")
         return page
 
-    def _file(self, suffix: str, part: str) -> Path:
+    def _file(self, suffix: str, part: str = "") -> Path:
         return self._path.with_name(self._path.name + (f"-{part}" if part else "") + suffix)
 
 
@@ -90,12 +90,6 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
-
-
-def band(series: Iterable[tuple[NDArray[np.floating], NDArray[np.integer]]]) -> tuple[NDArray, NDArray]:
-    """Return the means of m series of values and taps, (m,), and their intervals' reach to both sides, (2, m)."""
-    mean, bounds = zip(*((values.mean(), bootstrap_interval(values, taps)) for values, taps in series), strict=True)
-    return np.array(mean), np.abs(np.transpose(bounds) - np.array(mean))
 
 
 def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:

@@ -12,7 +12,7 @@ from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 from edge.inference.contract import ANY_BATCH
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
-from train.experiments.sensor import shipped, trust_checks
+from train.experiments.sensor import trust_checks
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS, steel_field
 from train.experiments.sensor.shipped import PushedSensor
 from train.families.catalogue import SHARES
@@ -53,26 +53,26 @@ class TestFaults:
 class TestVerdicts:
     def test_suspicion_is_counted_after_contacts_that_have_ended(self):
         model = FakeModel(make_trusted_contract())
-        odd = np.stack([press(x=9000)] * shipped.CONTACTS)
-        good = np.stack([press()] * shipped.CONTACTS)
-        found = shipped.verdicts_on(model, [odd, good], [None, None])
-        assert len(found.sensor) == 2 * shipped.CONTACTS and found.checked.all()
-        assert found.flagged[found.sensor == 0].all() and not found.flagged[found.sensor == 1].any()
-        assert found.suspected == {1: [False, False], 3: [True, False], 5: [True, False], 10: [True, False]}
-        row = found.cells()
-        assert row["contacts"] == 22 and str(row["flagged %"]).startswith("50.0") and row["unexplained %"] == 0
+        odd = np.stack([press(x=9000)] * trust_checks.CONTACTS)
+        good = np.stack([press()] * trust_checks.CONTACTS)
+        found = trust_checks.verdicts_on(model, [odd, good], [None, None])
+        assert (found["contacts"], found["too light"]) == (2 * trust_checks.CONTACTS, 0)
+        assert str(found["flagged %"]).startswith("50.0")
+        assert (found["unfamiliar %"], found["unexplained %"]) == (50, 0)
+        after = [float(str(found[f"sensor, after {number} %"]).split()[0]) for number in trust_checks.AFTER]
+        assert after == [0, 50, 50, 50]
 
     def test_what_begins_no_contact_counts_nowhere(self):
-        found = shipped.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
-        assert found.cells() == {"contacts": 0}
+        found = trust_checks.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
+        assert found == {"contacts": 0}
 
     def test_a_share_of_none_has_an_interval_too(self):
-        assert shipped.share(np.zeros(100, dtype=bool)) == "0.0 (0.0..3.6)"
-        assert shipped.share(np.ones(100, dtype=bool)) == "100.0 (96.4..100.0)"
-        assert shipped.share(np.zeros(100, dtype=bool), np.zeros(100, dtype=int)) == "0.0 (0.0..97.5)"
+        assert trust_checks.share(np.zeros(100, dtype=bool)) == "0.0 (0.0..3.6)"
+        assert trust_checks.share(np.ones(100, dtype=bool)) == "100.0 (96.4..100.0)"
+        assert trust_checks.share(np.zeros(100, dtype=bool), np.zeros(100, dtype=int)) == "0.0 (0.0..97.5)"
 
     def test_presses_of_a_pad_get_the_gains_of_one_sensor(self, wide):
-        one = shipped.of_one_sensor_each(wide)
+        one = trust_checks.of_one_sensor_each(wide)
         for pad in np.unique(wide.presses.pad):
             mine = wide.presses.pad == pad
             assert np.ptp(one.gains[mine], axis=0).max() == 0
@@ -80,14 +80,14 @@ class TestVerdicts:
             assert even == pytest.approx(wide.presses.counts[mine] / wide.gains[mine][:, None], rel=1e-4)
 
     def test_every_sensor_has_as_many_contacts(self, wide):
-        contacts = shipped.contacts_of(wide)
-        assert {len(one) for one in contacts} == {shipped.CONTACTS}
+        contacts = trust_checks.contacts_of(wide)
+        assert {len(one) for one in contacts} == {trust_checks.CONTACTS}
         assert all(len(np.unique(wide.presses.pad[one])) == 1 for one in contacts)
 
 
 def test_patterns_that_are_off_are_counted_by_how_far(wide):
     """The fake model's patterns are in no relation to the truth: what counts is who is counted where."""
-    found = shipped.judged(FakeModel(make_trusted_contract()), wide, [None] * len(wide))
+    found = trust_checks.judged(FakeModel(make_trusted_contract()), wide, [None] * len(wide))
     assert len(found.off) and np.isfinite(found.off).all() and (found.off > 1).all()
     cells = found.cells(np.ones(len(found.off), dtype=bool))
     assert cells["contacts"] == cells["> 50% off"] == cells["> 100% off"] == len(found.off)
@@ -101,11 +101,12 @@ class TestTaps:
         elsewhere = np.roll(press(), 2, axis=-1)
         right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))
         truth = np.zeros((1, 40, 40), dtype=np.float32)
-        found = [trust_checks.guarded(model, one, truth, 4) for one in (right, wrong)]
-        assert [one.taps_used.tolist() for one in found] == [[4], [1]]
-        assert [one.foreign.tolist() for one in found] == [[[False] * 3], [[True] * 3]]
-        alone = trust_checks.guarded(model, wrong, truth, 1)
-        assert alone.psnr_db == pytest.approx(found[1].psnr_db, abs=0.05) and found[0].psnr_db != found[1].psnr_db
+        right_db, used, foreign = trust_checks.guarded(model, right, truth, 4)
+        assert (used.tolist(), foreign.tolist()) == ([4], [[False] * 3])
+        wrong_db, used, foreign = trust_checks.guarded(model, wrong, truth, 4)
+        assert (used.tolist(), foreign.tolist()) == ([1], [[True] * 3])
+        alone_db, _, _ = trust_checks.guarded(model, wrong, truth, 1)
+        assert alone_db == pytest.approx(wrong_db, abs=0.05) and right_db != wrong_db
 
     def test_cases_change_earlier_taps_alone_or_mirror_all(self, wide):
         firm = trust_checks.firm(wide)

@@ -1,1 +1,1 @@
-"""The experiments: each one command that writes a table and a plot into reports/."""
+"""The experiments: each one command that writes a page with tables into reports/."""

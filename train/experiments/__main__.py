@@ -1,4 +1,4 @@
-"""Run experiments: each writes NAME.md, NAME.csv and NAME.png.
+"""Run experiments: each writes a page NAME.md and its tables as CSV, some a plot.
 
 python -m train.experiments table3 angle --reports reports
 """
@@ -20,21 +20,15 @@ from train.experiments.support.workbench import Workbench
 EXPERIMENTS: Final = {
     "families": ("sensor.families", "the shipped model and its intervals on every family, next to baselines"),
     "pads": ("sensor.pads", "the shipped model on pads that are off the nominal one"),
-    "trust-checks": (
-        "sensor.trust_checks",
-        "patterns that are not believed, rightly and wrongly, and foreign taps that are dropped",
-    ),
-    "posed-taps": (
-        "sensor.posed_taps",
-        "taps from known poses: one to seven, by schedule, the paper's too, and with wrong poses",
-    ),
+    "trust-checks": ("sensor.trust_checks", "patterns not believed and taps dropped, rightly and wrongly"),
+    "posed-taps": ("sensor.posed_taps", "one to seven taps from known poses, by schedule, and with wrong poses"),
     "table3": ("paper.tables:run_table3", "all methods at x10 on the same targets"),
     "table4": ("paper.tables:run_table4", "STSR at five scales"),
     "angle": ("paper.tables:run_angle", "MTSR-2 by angle between its taps"),
     "taps": ("paper.tables:run_taps", "one to seven taps"),
-    "force": ("paper.force", "error by contact force"),
-    "force-recovery": ("paper.force_recovery", "force through press, hold and release"),
-    "unseen": ("paper.unseen", "surfaces that were not trained on"),
+    "force": ("paper.force:run_force", "error by contact force"),
+    "force-recovery": ("paper.force:run_recovery", "force through press, hold and release"),
+    "unseen": ("paper.tables:run_unseen", "surfaces that were not trained on"),
     "real": ("sensor.real", "real grips: shape of faces, patterns against readings"),
     "fig5": ("paper.fig5", "alpha and beta against force"),
     "fig7": ("paper.fig7", "tPSF, PSF and depth against FEM"),

@@ -31,7 +31,7 @@ _BINS: Final = 8
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Tap, train, and write table and plot."""
+    """Tap, train, and write both tables."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
     places = random_poses(np.random.default_rng(5), len(names))
@@ -57,21 +57,22 @@ def run(bench: Workbench, folder: Path) -> Path:
     surface = np.repeat(np.array(names)[held_out], taps.counts.shape[1])
     force_n, indentation_mm = taps.force_n[held_out].ravel(), taps.indentation_mm[held_out].ravel()
 
+    rows: list[Row] = []
+    lines: list[Row] = []
+    for name in SURFACES:
+        mine = surface == name
+        rows += [{"surface": name} | row for row in _by_force(force_n[mine], {key: seen[key][mine] for key in seen})]
+        lines += [
+            {"surface": name, "parameter": key} | _line(force_n[mine], value[mine]) for key, value in seen.items()
+        ]
+
     report = Report("fig5", folder, __file__, bench.used, quick=bench.quick)
     report.table(
-        [row for name in SURFACES for row in _by_force(name, force_n, seen, surface == name)],
+        rows,
         "Alpha and beta by contact force at poses that the network has not seen: means, and the median of the betas "
         "found by search.",
     )
-    report.table(
-        [
-            _line(name, key, force_n[surface == name], value[surface == name])
-            for name in SURFACES
-            for key, value in seen.items()
-        ],
-        "Straight lines through them.",
-        "lines",
-    )
+    report.table(lines, "Straight lines through them.", "lines")
     error = np.sqrt(np.mean((reach - indentation_mm) ** 2)) / indentation_mm.max()
     report.say(
         f"Training loss {losses[0]:.4g} at first, {losses[-1]:.4g} at last. On the held-out taps "
@@ -79,16 +80,6 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"{100 * error:.1f} % of the largest. gamma = {float(read.gamma):.3g} mm^0.5, "
         f"k_scale = {float(net.k_scale):.3g} mm per (100 counts/mm^2)."
     )
-    with report.figure() as figure:
-        left, right = figure.subplots(1, 2)
-        for name in SURFACES:
-            where = surface == name
-            left.plot(force_n[where], seen["alpha"][where], ".", label=name)
-            (dots,) = right.plot(force_n[where], seen["beta"][where], ".")
-            right.plot(force_n[where], seen["beta by search"][where], "x", color=dots.get_color(), ms=3, alpha=0.3)
-        left.set(xlabel="force [N]", ylabel="alpha [mm/mm²]")
-        right.set(xlabel="force [N]", ylabel="beta [mm]; x by search")
-        left.legend()
     return report.write()
 
 
@@ -115,14 +106,11 @@ def _search(net: PsfNet, read: PsfParameters, scans: Tensor, images: Tensor) -> 
     return betas_mm[torch.stack(left).argmin(dim=0)]
 
 
-def _by_force(
-    name: str, force_n: NDArray[np.floating], seen: dict[str, NDArray[np.floating]], where: NDArray[np.bool_]
-) -> list[Row]:
-    edges = np.linspace(0, force_n[where].max(), _BINS + 1)
+def _by_force(force_n: NDArray[np.floating], seen: dict[str, NDArray[np.floating]]) -> list[Row]:
+    edges = np.linspace(0, force_n.max(), _BINS + 1)
     bin_of = np.clip(np.digitize(force_n, edges) - 1, 0, _BINS - 1)
     return [
         {
-            "surface": name,
             "force N": float(force_n[inside].mean()),
             "alpha mm/mm2": float(seen["alpha"][inside].mean()),
             "beta mm": float(seen["beta"][inside].mean()),
@@ -130,17 +118,12 @@ def _by_force(
             "scans": int(inside.sum()),
         }
         for number in range(_BINS)
-        if (inside := where & (bin_of == number)).any()
+        if (inside := bin_of == number).any()
     ]
 
 
-def _line(name: str, key: str, force_n: NDArray[np.floating], value: NDArray[np.floating]) -> Row:
+def _line(force_n: NDArray[np.floating], value: NDArray[np.floating]) -> Row:
     slope, start = np.polyfit(force_n, value, 1)
     left = np.mean((value - start - slope * force_n) ** 2)
-    return {
-        "surface": name,
-        "parameter": key,
-        "at no force": float(start),
-        "slope per N": float(slope),
-        "share explained": float(1 - left / max(np.var(value), 1e-30)),
-    }
+    share = float(1 - left / max(np.var(value), 1e-30))
+    return {"at no force": float(start), "slope per N": float(slope), "share explained": share}

@@ -5,11 +5,10 @@ indentation; the report states the conversion of each to millimetres.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from timeit import repeat
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, Verdict, press_or_recall, relief
+from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall, relief
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
@@ -41,14 +40,12 @@ Maps = NDArray[np.float32]
 """Maps (surfaces, steps, 40, 40) in [mm]."""
 
 
-@dataclass(frozen=True, slots=True)
-class Method:
-    """Method that computes maps of all surfaces and steps, and the time for one surface's steps, of the fastest run.
+class Method(NamedTuple):
+    """Maps of all surfaces and steps by a method, and its time for one surface's steps, of the fastest run.
 
     Where `scaled`, maps are in its own unit: one factor brings all to [mm], by least squares against the truth.
     """
 
-    name: str
     maps: Maps
     time_s: float
     scaled: bool = False
@@ -70,9 +67,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     The full run takes about half an hour on one core, nearly all of it for the finite elements.
     """
-    surfaces = PLATES[0][:2] if bench.quick else PLATES[0]
-    meshes = _QUICK_MESHES if bench.quick else MESHES
-    steps = 2 if bench.quick else STEPS
+    surfaces, meshes, steps = (PLATES[0][:2], _QUICK_MESHES, 2) if bench.quick else (PLATES[0], MESHES, STEPS)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     verdicts = {
         mesh: [
@@ -81,24 +76,22 @@ def run(bench: Workbench, folder: Path) -> Path:
         ]
         for mesh in meshes
     }
-    finest = verdicts[meshes[0]]
-    truth = np.stack([verdict.patterns_mm for verdict in finest])
-    force_n = np.stack([verdict.force_n for verdict in finest])
-    methods = _methods(surfaces, indentation_mm, force_n)
-    psfs = [method for method in methods if method.name.startswith("PSF")]
-    best = min(psfs, key=lambda method: float(method.rms_mm(truth).mean()))
-    methods = [method for method in methods if method is best or method not in psfs]
-    methods[methods.index(best)] = replace(best, name="PSF")
-    layer = next(method for method in methods if method.name == "layer")
-    methods += [
-        Method(f"FEM {mesh}", np.stack([verdict.patterns_mm for verdict in found]), _time_s(found))
+    by_fem = {
+        f"FEM {mesh}": Method(
+            np.stack([one.patterns_mm for one in found]), float(np.mean([one.run_s.sum() for one in found]))
+        )
         for mesh, found in verdicts.items()
-    ]
+    }
+    truth = by_fem[f"FEM {meshes[0]}"].maps
+    force_n = np.stack([one.force_n for one in verdicts[meshes[0]]])
+    methods, beta_mm = _methods(surfaces, indentation_mm, force_n, truth)
+    methods |= by_fem
 
     report = Report("fig7", folder, __file__, bench.used, quick=bench.quick)
-    report.say(_how(len(surfaces), steps, best.name.removeprefix("PSF, ")))
+    report.say(_how(len(surfaces), steps, beta_mm))
+    layer = methods["layer"].maps
     report.table(
-        [_row(method, truth, layer.maps, indentation_mm) for method in methods],
+        [{"method": name} | _cells(method, truth, layer, indentation_mm) for name, method in methods.items()],
         f"RMS error over the 40 x 40 window, in % of the indentation; truth is FEM at {meshes[0]}. Mean over "
         "surfaces and steps, in brackets the best and the worst surface. What heaps up around the contact counts as 0, "
         "as no PSF pulls, except in the column that is named so.",
@@ -108,30 +101,18 @@ def run(bench: Workbench, folder: Path) -> Path:
         {
             "mesh": str(mesh),
             "force, % of the finest's": float(100 * (np.stack([one.force_n for one in found]) / force_n).mean()),
-            "s a surface": _time_s(found),
+            "s a surface": by_fem[f"FEM {mesh}"].time_s,
         }
         for mesh, found in verdicts.items()
     ]
     report.table(fem, "The finite elements.", "fem")
-    with report.figure(size=(11, 4.5)) as figure:
-        left, right = figure.subplots(1, 2)
-        for method in methods:
-            errors = method.rms_mm(truth)
-            if errors.any():
-                left.plot(indentation_mm, 1e3 * errors.mean(axis=0), ".-", label=method.name)
-                percent = float((100 * errors / indentation_mm).mean())
-                right.semilogx(1e3 * method.time_s / steps, percent, "o", label=method.name)
-        left.set(xlabel="indentation [mm]", ylabel="RMS error [µm]")
-        right.set(xlabel="run time [ms a pattern]", ylabel="RMS error [% of the indentation]")
-        right.set_ylim(bottom=0)
-        left.legend(fontsize=8)
     return report.write()
 
 
 def _methods(
-    surfaces: tuple[str, ...], indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
-) -> list[Method]:
-    """Return the methods that are faster than finite elements, applied to all surfaces."""
+    surfaces: tuple[str, ...], indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating], truth: Maps
+) -> tuple[dict[str, Method], float]:
+    """Return the methods that are faster than finite elements, by name, and the beta of the best PSF in [mm]."""
     margin = (_PAD_PX - 4 * SCALE) // 2
     depth_mm = np.stack([depth_image(relief(name), CENTRE, _PAD_PX, _PIXEL_MM) for name in surfaces])
     window = slice(margin, _PAD_PX - margin)
@@ -139,51 +120,36 @@ def _methods(
     step_mm = indentation_mm.astype(np.float32)
     solver = ContactSolver(Layer(), _PAD_PX, _PIXEL_MM)
 
-    def by_tpsf(i: int) -> Maps:
-        return tpsf_pattern(touching[i], step_mm, _PIXEL_MM)
-
-    def by_psf(i: int, beta_mm: float) -> Maps:
+    def by_psf(beta_mm: float, i: int) -> Maps:
         area = torch.from_numpy(touching[i]).float()
         return spread(area, torch.tensor([beta_mm]), _PIXEL_MM).numpy() * step_mm[:, None, None]
-
-    def by_depth(i: int) -> Maps:
-        return touching[i] * step_mm[:, None, None]
-
-    def by_force(i: int) -> Maps:
-        return touching[i] * force_n[i].astype(np.float32)[:, None, None]
 
     def by_layer(i: int) -> Maps:
         unit = solver.solve(depth_mm[i : i + 1]).displacement_mm[:, window, window]
         return unit * step_mm[:, None, None]
 
-    return [
-        _made("tPSF", by_tpsf, len(surfaces)),
-        *(
-            _made(f"PSF, beta {beta_mm:g} mm", partial(by_psf, beta_mm=beta_mm), len(surfaces), scaled=True)
-            for beta_mm in PSF_BETAS_MM
-        ),
-        _made("Depth x indentation", by_depth, len(surfaces)),
-        _made("Depth x force", by_force, len(surfaces), scaled=True),
-        _made("layer", by_layer, len(surfaces)),
-    ]
+    def made(make: Callable[[int], Maps], *, scaled: bool = False) -> Method:
+        maps = np.stack([make(i) for i in range(len(surfaces))])
+        return Method(maps, min(repeat(partial(make, 0), number=1)), scaled)
+
+    psfs = {beta_mm: made(partial(by_psf, beta_mm), scaled=True) for beta_mm in PSF_BETAS_MM}
+    best_mm = min(psfs, key=lambda beta_mm: float(psfs[beta_mm].rms_mm(truth).mean()))
+    methods = {
+        "tPSF": made(lambda i: tpsf_pattern(touching[i], step_mm, _PIXEL_MM)),
+        "PSF": psfs[best_mm],
+        "Depth x indentation": made(lambda i: touching[i] * step_mm[:, None, None]),
+        "Depth x force": made(lambda i: touching[i] * force_n[i].astype(np.float32)[:, None, None], scaled=True),
+        "layer": made(by_layer),
+    }
+    return methods, best_mm
 
 
-def _made(name: str, make: Callable[[int], Maps], surfaces: int, scaled: bool = False) -> Method:
-    maps = np.stack([make(i) for i in range(surfaces)])
-    return Method(name, maps, min(repeat(partial(make, 0), number=1)), scaled)
-
-
-def _time_s(found: list[Verdict]) -> float:
-    return float(np.mean([verdict.run_s.sum() for verdict in found]))
-
-
-def _row(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.floating]) -> Row:
+def _cells(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.floating]) -> Row:
     percent = 100 * method.rms_mm(truth) / indentation_mm
     by_surface = percent.mean(axis=1)
     pressed = np.maximum(truth, 0)
     psnr = psnr_db(np.maximum(method.against(pressed), 0), pressed, MAX_INDENTATION_MM)
     return {
-        "method": method.name,
         "error %": f"{percent.mean():.2f} ({by_surface.min():.2f}..{by_surface.max():.2f})",
         "PSNR dB": float(psnr.mean()) if percent.any() else None,
         "error %, heaps too": float((100 * method.rms_mm(truth, heaps=True) / indentation_mm).mean()),
@@ -193,9 +159,9 @@ def _row(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.fl
 
 
 def _by_step(
-    methods: list[Method], truth: Maps, indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
+    methods: dict[str, Method], truth: Maps, indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
 ) -> list[Row]:
-    errors = {method.name: 1e3 * method.rms_mm(truth).mean(axis=0) for method in methods}
+    errors = {name: 1e3 * method.rms_mm(truth).mean(axis=0) for name, method in methods.items()}
     return [
         {
             "indentation mm": float(depth_mm),
@@ -206,16 +172,16 @@ def _by_step(
     ]
 
 
-def _how(surfaces: int, steps: int, psf: str) -> str:
+def _how(surfaces: int, steps: int, beta_mm: float) -> str:
     return (
         f"{surfaces} letters at p5 r0, {steps} indentations up to {MAX_INDENTATION_MM} mm, all methods on the same "
         f"touching pixels, gaussian kernel. tPSF: its plateau is the indentation, its beta of {BETA_MM} mm was "
         "fitted to the layer's surface, not to these maps. PSF (no plateau): times the indentation and one alpha for "
         f"all maps, by least squares against the truth it is compared with, and the best of {len(PSF_BETAS_MM)} betas "
-        f"against FEM ({psf}). Depth x indentation: the touching pixels at the indentation, sharp. Depth x force, as "
-        "the paper has it: one factor fitted in the same way. layer: bonded layer without sides, Polonsky-Keer, "
-        f"Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's ratio "
-        f"{LAYER.poisson:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
+        f"against FEM (beta {beta_mm:g} mm). Depth x indentation: the touching pixels at the indentation, sharp. Depth "
+        "x force, as the paper has it: one factor fitted in the same way. layer: bonded layer without sides, "
+        f"Polonsky-Keer, Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's "
+        f"ratio {LAYER.poisson:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
         "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
         "was worked out."
     )

@@ -1,31 +1,40 @@
-"""Error by contact force, small forces included.
+"""Figs. 14 and 15: error by contact force, small forces included, and force through press, hold and release.
 
 PSNR is taken against one full scale for all, so it is highest for the shallowest patterns. The effect of the force on
 shapes shows in the error relative to the truth's own RMS, and in SSIM with the truth's own peak as full scale.
 
-Source: Wu and Liu 2024, Fig. 14.
+A pattern's deformation summed over its area becomes newtons by one factor, fitted on training presses. There are no
+offsets, and no course is shifted, so that drift, lag and residual loads remain visible.
+
+Source: Wu and Liu 2024, Figs. 14 and 15.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import log
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.metrics import contact_iou, psnr_db, ssim
+from edge.evaluation.classical_methods import fit_gain
+from edge.evaluation.metrics import contact_iou, psnr_db, ssim, volume_mm3
+from edge.perception.contact_options import ON_COUNTS
+from edge.perception.tap_tracker import TapTracker
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import USPA44
 from train.data.generation_config import SEED
-from train.data.paper_taps import PaperTaps, windows
+from train.data.paper_taps import PaperTaps, between_frames, windows
+from train.data.press_batches import read_presses
+from train.data.presses import PressSet
 from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
 from train.experiments.support.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM
-from train.physics.sensor_noise import Nuisances
-from train.report import Report, Row, band, with_interval
+from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows
+from train.report import Report, Row, with_interval
+from train.surfaces.poses import TARGET_ANGLES_DEG
 
 EDGES_N: Final = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 8.0)
 _NETWORKS: Final = ("stsr", "mtsr2", "mtsr4")
@@ -34,8 +43,7 @@ _REACHED: Final = 0.99
 """Share of the requested force that a press must reach: some presses reach their largest indentation before."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bin:
+class Bin(NamedTuple):
     """Scans of one range of forces: windows (n, K, 3, rows, cols) in zeroed counts, truth (n, H, W), sequences (n,).
 
     The newest tap is pressing, the earlier ones are at their ends.
@@ -48,7 +56,7 @@ class Bin:
     tap: NDArray[np.int64]
 
 
-def run(bench: Workbench, folder: Path) -> Path:
+def run_force(bench: Workbench, folder: Path) -> Path:
     """Write the report `force`; the full run takes a few minutes once the networks are there."""
     data = mixed(bench)
     methods = [*compact_methods(bench, data, _NETWORKS), *classical_methods(bench, data, _CLASSICAL)]
@@ -59,9 +67,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         for number, bounds in enumerate(pairwise(EDGES_N))
         if (scans := scans_between(sequences, bounds, draws, [SEED, number]))
     ]
-    figures = {
-        method.name: [errors(method, scans) for scans in bins] for method in tracked(methods, "forces", "method")
-    }
+    rows = [_row(method, scans) for scans in tracked(bins, "forces", "range") for method in methods]
     report = Report("force", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"The {len(sequences)} test taps, newest scan somewhere on its press, earlier taps at their ends of "
@@ -71,25 +77,7 @@ def run(bench: Workbench, folder: Path) -> Path:
         "against the declared full scale: the less there is, the better they look. Relative error is RMS error over "
         "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they measure errors of shape."
     )
-    report.table(
-        [_row(method, scans, figures[method.name][i]) for i, scans in enumerate(bins) for method in methods],
-        "Errors by contact force, with 95 % intervals by tap.",
-    )
-    middle_n = [float(np.sqrt(np.prod(scans.force_n))) for scans in bins]
-    shown = {"psnr_db": "PSNR [dB]", "ssim_own": "SSIM at own scale", "relative_percent": "relative error [%]"}
-    with report.figure(size=(13, 4.5)) as figure:
-        axes = figure.subplots(1, len(shown))
-        for place, (key, label) in zip(axes, shown.items(), strict=True):
-            for name, found in figures.items():
-                mean, (below, above) = band((one[key], scans.tap) for one, scans in zip(found, bins, strict=True))
-                (line,) = place.plot(middle_n, mean, "o-", label=name)
-                place.fill_between(
-                    middle_n, mean - below, mean + above, color=line.get_color(), alpha=0.15, linewidth=0
-                )
-            place.set(xscale="log", xlabel="force [N]", ylabel=label)
-            place.set_xticks(EDGES_N, [f"{edge:g}" for edge in EDGES_N])
-            place.minorticks_off()
-        axes[0].legend()
+    report.table(rows, "Errors by contact force, with 95 % intervals by tap.")
     return report.write()
 
 
@@ -122,7 +110,8 @@ def errors(method: Method, scans: Bin) -> Figures:
     }
 
 
-def _row(method: Method, scans: Bin, found: Figures) -> Row:
+def _row(method: Method, scans: Bin) -> Row:
+    found = errors(method, scans)
     return {
         "force N": "{:g}..{:g}".format(*scans.force_n),
         "scans": len(scans.tap),
@@ -135,3 +124,173 @@ def _row(method: Method, scans: Bin, found: Figures) -> Row:
         "IoU": round(float(found["contact_iou"].mean()), 4),
         **method.cost,
     }
+
+
+PRESS_S, HOLD_S, RELEASE_S, REST_S = 2.0, 5.0, 1.0, 2.0
+PRESS, HOLD, RELEASE, REST = range(4)
+_ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])
+RANGE_N: Final = TEST_FORCE_N
+_PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
+CLAIM_N: Final = 0.02 * RANGE_N
+"""Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
+
+
+class Course:
+    """Scans of one press at a rate, which starts from a free pad at 0 s.
+
+    `time_s` (t,) are their times in [s], `share` those of the set force, and `phase` is PRESS, HOLD, RELEASE or REST,
+    each with its end but not its start.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self.rate_hz = rate_hz
+        self.time_s: NDArray[np.float64] = np.arange(1, round(_ENDS_S[-1] * rate_hz) + 1) / rate_hz
+        self.share: NDArray[np.float64] = np.interp(self.time_s, [0, *_ENDS_S], [0, 1, 1, 0, 0])
+        self.phase: NDArray[np.int64] = np.searchsorted(_ENDS_S, self.time_s - 0.5 / rate_hz)
+
+
+class Scans(NamedTuple):
+    """Windows (n, K, 3, rows, cols) in zeroed counts, with their true forces and volumes of patterns, (n,)."""
+
+    windows: NDArray[np.float32]
+    force_n: NDArray[np.floating]
+    volume_mm3: NDArray[np.floating]
+
+
+def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisances) -> Scans:
+    """Return the scans of a sequence's newest tap along a course.
+
+    One sensor reads all taps of the sequence; the earlier taps are read at their ends.
+    """
+    index, seed = np.array([number]), [SEED, 3, number]
+    angle_deg = sequences.poses[index, :, 2]
+    end = sequences.share_at_force(index, TEST_FORCE_N)
+    share = end[:, :1] * course.share
+    clean = between_frames(sequences.counts[index, 0], share)[:, None]
+    newest = apply_nuisances(clean, nuisances, seed, tap_s=course.time_s[-1], angle_deg=angle_deg[:, :1])[0, 0]
+    earlier = read_windows(sequences.counts[index], end, nuisances, seed, PRESS_S / end, angle_deg)[0, 1:]
+    whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), USPA44.pixel_pitch_mm(sequences.scale))
+    return Scans(
+        windows=np.concatenate([newest[:, None], np.broadcast_to(earlier, (len(newest), *earlier.shape))], axis=1),
+        force_n=sequences.force_at(index, share)[0],
+        volume_mm3=whole_mm3 * course.share,  # flat contacts: in proportion to the indentation
+    )
+
+
+def contact(scans: Scans, course: Course) -> NDArray[np.bool_]:
+    """Return the scans (n,) in which the runtime detects a contact."""
+    tracker = TapTracker(taps=1)
+    times_ns = np.rint(course.time_s * 1e9).astype(np.int64)
+    return np.array(
+        [tracker.push(scan, int(now_ns)).contact for scan, now_ns in zip(scans.windows[:, 0], times_ns, strict=True)]
+    )
+
+
+def course_errors(
+    true_n: NDArray[np.floating], found_n: NDArray[np.floating], gate: NDArray[np.bool_], course: Course
+) -> dict[str, float]:
+    """Return the figures of one press, in [% of RANGE_N] or in [% of scans]."""
+    resting = course.phase == REST
+    return {
+        "error %": _rms_percent(found_n - true_n),
+        "with its own factor %": _rms_percent(fit_gain(found_n, true_n) * found_n - true_n),
+        "above the threshold %": _rms_percent(np.where(gate, found_n, 0) - true_n),
+        "loop %": loop_percent(true_n, found_n, course),
+        "at no load %": 100 * float(np.abs(found_n[resting]).mean()) / RANGE_N,
+        "false contact, % of scans": 100 * float((found_n[resting] > CLAIM_N).mean()),
+        "past the threshold, % of scans": 100 * float(gate[resting].mean()),
+        "loaded but missed, % of scans": 100 * float((~gate[~resting]).mean()),
+    }
+
+
+def loop_percent(true_n: NDArray[np.floating], found_n: NDArray[np.floating], course: Course) -> float:
+    """Return the largest difference between press and release at equal true force, in [% of RANGE_N].
+
+    Both branches are interpolated linearly between scans; the tenths next to their turning points are left out.
+    """
+    at_n = np.linspace(0.1, 0.9, 33) * true_n.max()
+    ways: list[NDArray[np.float64]] = []
+    for phase in (PRESS, RELEASE):
+        way = np.flatnonzero(course.phase == phase)
+        way = way[np.argsort(true_n[way], kind="stable")]
+        ways.append(np.interp(at_n, true_n[way], found_n[way]))
+    return 100 * float(np.abs(ways[0] - ways[1]).max()) / RANGE_N
+
+
+def _rms_percent(error_n: NDArray[np.floating]) -> float:
+    return 100 * float(np.sqrt(np.mean(error_n**2))) / RANGE_N
+
+
+_TAPS: Final = 4
+_ANGLE: Final = 1
+"""Index of the test angle at which each surface is pressed: 30 degrees, the paper's target."""
+_ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
+CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
+
+
+def run_recovery(bench: Workbench, folder: Path) -> Path:
+    """Write the report `force-recovery`; the full run takes some minutes once the networks are there."""
+    data = mixed(bench)
+    course = Course(20.0 if bench.quick else 100.0)
+    known = training_presses(data, 50 if bench.quick else 600)
+    networks = compact_methods(bench, data, ("stsr", "mtsr4"))
+    measures: dict[str, Callable[[Scans], NDArray[np.floating]]] = {
+        "summed z": lambda scans: scans.windows[:, 0, 2].sum(axis=(1, 2)),
+        **{network.name: _volume_of(network) for network in networks},
+        "true pattern": lambda scans: scans.volume_mm3,
+    }
+    costs: dict[str, Row] = {"summed z": {"parameters": 1, "MMAC": 0.0}, "true pattern": {}}
+    costs |= {network.name: network.cost for network in networks}
+    newtons_per_unit = {name: fit_gain(measure(known), known.force_n) for name, measure in measures.items()}
+    sequences = bench.held_out("test").newest(_TAPS)
+    sequences = sequences.pick(np.arange(_ANGLE, len(sequences), len(TARGET_ANGLES_DEG)))
+
+    rows: list[Row] = []
+    by_surface: list[Row] = []
+    for condition, nuisances in CONDITIONS.items():
+        figures: dict[str, list[dict[str, float]]] = {name: [] for name in measures}
+        for number in tracked(range(len(sequences)), condition, "press"):
+            scans = pressed(sequences, number, course, nuisances)
+            gate = contact(scans, course)
+            for name, measure in measures.items():
+                found_n = newtons_per_unit[name] * measure(scans)
+                figures[name].append(course_errors(scans.force_n, found_n, gate, course))
+        for name, presses in figures.items():
+            row: Row = {"nuisances": condition, "model": name}
+            for label in presses[0]:
+                row[label] = with_interval(np.array([press[label] for press in presses]), np.arange(len(presses)))
+            rows.append(row | {"N per unit": newtons_per_unit[name]} | costs[name])
+        for number, surface in enumerate(sequences.surfaces):
+            cells: Row = {f"{name} error %": round(presses[number]["error %"], 2) for name, presses in figures.items()}
+            by_surface.append({"nuisances": condition, "surface": str(surface)} | cells)
+
+    report = Report("force-recovery", folder, __file__, bench.used, quick=bench.quick)
+    report.say(
+        f"{len(sequences)} surfaces at the held-out position, each pressed to {TEST_FORCE_N:g} N (or as deep as may "
+        f"be) in {PRESS_S:g} s, held {HOLD_S:g} s, released in {RELEASE_S:g} s, then {REST_S:g} s at no load, at "
+        f"{course.rate_hz:g} scans a second. Every press is read by a sensor of its own, whose lag goes through the "
+        "whole course. `just zeroed` is without drift and earth field, `drifted` with all nuisances. One factor per "
+        f"method from {len(known.force_n)} training presses on sensors just zeroed, no offset anywhere. `true pattern` "
+        "is what a pattern without error would give."
+    )
+    report.say(
+        f"Errors in % of {RANGE_N:g} N: RMS over the whole course, with the common factor and with the one that suits "
+        "the press best, which leaves out what shape and gain do to the factor. Loop: largest difference between press "
+        "and release at equal true force. At no load: mean |force|, and false contacts: scans whose pattern sums up to "
+        f"more than {CLAIM_N:g} N, and scans that pass the runtime's contact threshold ({ON_COUNTS:g} counts of summed "
+        "z), below which no pattern is made; that threshold misses loaded scans, too."
+    )
+    report.table(rows, "Force recovery, means over presses with 95 % intervals.")
+    report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
+    return report.write()
+
+
+def training_presses(data: PressSet, presses: int) -> Scans:
+    """Return training presses, read by sensors that were just zeroed."""
+    picked = data.pick(np.random.default_rng([SEED, 1]).integers(len(data), size=presses)).with_taps(_TAPS)
+    readings = read_presses(picked, _ZEROED, SEED)
+    return Scans(readings, picked.force_n[:, 2], volume_mm3(picked.patterns.astype(np.float32), _PIXEL_MM))
+
+
+def _volume_of(network: Method) -> Callable[[Scans], NDArray[np.floating]]:
+    return lambda scans: volume_mm3(network.patterns(scans.windows), _PIXEL_MM)

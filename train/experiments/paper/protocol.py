@@ -1,7 +1,7 @@
 """The paper's protocol: its data, the networks that are trained on them, and the methods that are compared."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
+from edge.evaluation.metrics import judge
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World
-from train.errors import CheckpointError
-from train.experiments.support.workbench import Figures, Method, Workbench, error_cells, median_ms
+from train.experiments.support.workbench import Figures, Method, Workbench, median_ms
 from train.fit import given_taps
 from train.freeze import CLASSICAL_WINDOWS, fit_classical
 from train.learning.checkpoint import Training
-from train.learning.interval_fit import LEVEL, half_width_mm
 from train.learning.training_loop import Recipe
 from train.physics.gripped import FINE_SCALE, SCALE
 from train.report import Row, with_interval
@@ -69,60 +68,43 @@ def by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
 
 def compact(name: str) -> Training:
     """Return the training of a compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
-    return BASE if name == "stsr" else _from_base(name, int(name.removeprefix("mtsr")), 2000)
+    return BASE if name == "stsr" else from_base(name, int(name.removeprefix("mtsr")), 2000)
 
 
-def at_scale(scale: int) -> Training:
-    """Return the training of the compact STSR at another scale: the base's trunk with new output layers."""
-    return BASE if scale == BASE.scale else _from_base(f"stsr-x{scale}", 1, 2500, scale)
-
-
-def at_angle(angle_step_deg: float) -> Training:
-    """Return the training of the compact MTSR-2 for taps turned by an angle."""
-    return _from_base(f"mtsr2-{angle_step_deg:g}-deg", 2, 1500)
-
-
-def alike(name: str) -> Training:
-    """Return a compact network's training from the base, equally long for every name."""
-    return _from_base("stsr-alike", 1, 2000) if name == "stsr" else compact(name)
-
-
-def _from_base(name: str, taps: int, steps: int, scale: int = SCALE) -> Training:
+def from_base(name: str, taps: int, steps: int, scale: int = SCALE) -> Training:
+    """Return the training of a compact network from the base's trunk; at another scale its output layers are new."""
     recipe = Recipe(steps=steps, learning_rate=1e-3, given=given_taps(taps))
     network, seed = ("compact-stsr", 1) if taps == 1 else (f"compact-mtsr{taps}", 1 + taps)
     return Training(f"taps-{name}", network, recipe, scale, BASE.name, seed)
 
 
-def seed_size(network: str) -> Training:
-    """Return the training of a network of the paper, limited by time."""
-    starts = network.startswith("mtsr")
+def seed_size(name: str) -> Training:
+    """Return the training of a network of the paper, limited by time.
+
+    `stsr longer` is trained on for as long as MTSR-2 from the STSR, so that the two differ by the second tap alone.
+    """
+    network, _, longer = name.partition(" ")
+    taps = int(network.removeprefix("mtsr")) if network.startswith("mtsr") else 1
     recipe = Recipe(
         steps=_ENDLESS,
         batch=SEED_BATCH,
         learning_rate=5e-4,
         weight_decay=1e-2,
-        given=given_taps(int(network.removeprefix("mtsr")) if starts else 1),
+        given=given_taps(taps),
         bf16=True,
-        minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
+        minutes=_SEED_MINUTES.get(name, _SEED_MINUTES_MORE),
     )
-    start = {"srgan": "seed-srcnn"}.get(network, "seed-stsr" if starts else None)
-    return Training(f"seed-{network}", network, recipe, start=start)
+    start = "seed-srcnn" if network == "srgan" else "seed-stsr" if taps > 1 or longer else None
+    return Training(f"seed-{name}", network, recipe, start=start)
 
 
-SEED_STSR_LONGER: Final = replace(
-    seed_size("stsr"),
-    name="seed-stsr longer",
-    recipe=replace(seed_size("stsr").recipe, minutes=_SEED_MINUTES_MORE),
-    start="seed-stsr",
-)
-"""STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
 _STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
 
 
 def trained(bench: Workbench, training: Training, data: PressSet, validation: FrozenSet) -> Method:
     """Return a trained network; the network that it starts from is trained first."""
     if training.start:
-        trained(bench, _STARTS[training.start], data, validation)
+        bench.fit(_STARTS[training.start], data, validation)
     return bench.network(training, data, validation)
 
 
@@ -141,55 +123,35 @@ def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) ->
     fits, scan = fitted_methods(path, SCALE), np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
 
     def method(name: str) -> Method:
-        def cost() -> Row:
-            parameters = 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1
-            mega_macs, run_time_ms = round(method_macs(name, SCALE) / 1e6, 3), median_ms(partial(fits[name], scan))
-            return {"parameters": parameters, "MMAC": mega_macs, "run time ms": run_time_ms}
-
+        parameters = 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1
+        mega_macs, run_time_ms = round(method_macs(name, SCALE) / 1e6, 3), median_ms(partial(fits[name], scan))
+        cost: Row = {"parameters": parameters, "MMAC": mega_macs, "run time ms": run_time_ms}
         return Method(name, 1, CONTACT_LEVEL, lambda windows: (fits[name](windows[:, 0]), None), cost)
 
     return [method(name) for name in names]
 
 
-def judged(method: Method, sets: Mapping[str, FrozenSet], given: int | None = None) -> tuple[Row, Figures]:
-    """Return errors on each set as cells of a row, and every metric of every frame of the last set."""
-    figures = {split: method.judged(frozen, given) for split, frozen in sets.items()}
-    cells = [error_cells(figures[split], frozen, split) for split, frozen in sets.items()]
-    return {name: cell for row in cells for name, cell in row.items()}, [*figures.values()][-1]
+def judged(method: Method, sets: Mapping[str, FrozenSet], given: int | None = None) -> tuple[Row, NDArray[np.float64]]:
+    """Return errors on each set as cells of a row, and the PSNR in [dB] of every frame of the last set, (n,).
 
-
-@dataclass(frozen=True, slots=True)
-class Intervals:
-    """Patterns and deviations predicted for the n frames of a frozen set, with the truth, (n, H, W) in [mm] each."""
-
-    frozen: FrozenSet
-    truth: NDArray[np.float32]
-    pattern: NDArray[np.floating]
-    deviation: NDArray[np.float32]
-
-    def covered(self, level: float = LEVEL) -> NDArray[np.bool_]:
-        """Return a mask (n, H, W), true where the truth lies within the interval."""
-        return np.abs(self.truth - self.pattern) <= half_width_mm(self.deviation, level)
-
-    def width_percent(self) -> NDArray[np.floating]:
-        """Return the width of the intervals, (n, H, W), in [% of the frame's indentation]."""
-        return 200 * half_width_mm(self.deviation) / self.frozen.indentation_mm[:, None, None]
-
-    def cells(self) -> Row:
-        """Return coverage and mean width of the 90 % interval, each with its interval by tap, as cells of a row."""
-        return {
-            "covered %": with_interval(100 * self.covered().mean(axis=(1, 2)), self.frozen.tap, 1),
-            "width %": with_interval(self.width_percent().mean(axis=(1, 2)), self.frozen.tap, 1),
-        }
-
-
-def intervals(method: Method, frozen: FrozenSet, given: int | None = None) -> Intervals:
-    """Run a network on every frame, with the newest `given` taps or all that it takes.
-
-    Raises:
-        CheckpointError: the network predicts no deviations.
+    The method gets the newest `given` taps, or all that it uses.
     """
-    pattern, deviation = method.run(frozen.windows(method.taps, given))
-    if deviation is None:
-        raise CheckpointError(f"{method.name} gives no deviations: take a compact network")
-    return Intervals(frozen, frozen.patterns(), pattern, deviation)
+    row: Row = {}
+    psnr_db = np.empty(0)
+    for split, frozen in sets.items():
+        figures = judge(method.patterns(frozen.windows(method.taps, given)), frozen, method.contact_level)
+        row |= error_cells(figures, frozen, split)
+        psnr_db = figures["psnr_db"]
+    return row, psnr_db
+
+
+def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
+    """Return mean errors over a frozen set as cells of a row, PSNR with its interval by tap."""
+    return {
+        f"{split} PSNR dB": with_interval(figures["psnr_db"], frozen.tap),
+        f"{split} SSIM": round(float(figures["ssim"].mean()), 4),
+        f"{split} SSIM global": round(float(figures["ssim_global"].mean()), 4),
+        f"{split} RMSE %": round(float(figures["rmse_percent"].mean()), 3),
+        f"{split} IoU": round(float(figures["contact_iou"].mean()), 4),
+        f"{split} boundary mm": round(float(figures["boundary_mm"].mean()), 3),
+    }

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.metrics import psnr_db
-from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
-from train.data.frozen_presses import FrozenPresses, freeze_presses
+from train.data.frozen_presses import freeze_presses
 from train.data.generation_config import SEED, one_thread
 from train.data.presses import PressSet
 from train.data.world import press_shapes
@@ -48,8 +47,7 @@ class OffPad(NamedTuple):
     @property
     def can_be(self) -> bool:
         """True where such a pad is possible: rubber does not swell when pressed, and sides do not push back."""
-        pad = self.pad
-        return pad.poisson <= 0.499 and pad.free_sides >= 0
+        return self.pad.poisson <= 0.499 and self.pad.free_sides >= 0
 
 
 NONE_OFF: Final = OffPad("thickness_mm", 0)
@@ -66,7 +64,13 @@ def run(bench: Workbench, folder: Path) -> Path:
     jobs = cast(Iterator[PressSet], pool(joblib.delayed(pressed)(one.pad, shapes) for one in off))
     read = {one: freeze_presses(made, SEED) for one, made in zip(tracked(off, "pads", "pad"), jobs, strict=True)}
     model = bench.model()
-    scores = {SHORT[known]: _psnr_db(model, read, known) for known in (NOTHING, ALL)}
+    scores = {
+        SHORT[known]: {
+            one: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
+            for one, frozen in read.items()
+        }
+        for known in (NOTHING, ALL)
+    }
     report = Report("pads", folder, __file__, bench.used, quick=bench.quick)
     plain = {name: with_interval(psnr[NONE_OFF], np.arange(count)) for name, psnr in scores.items()}
     report.say(
@@ -79,16 +83,6 @@ def run(bench: Workbench, folder: Path) -> Path:
     )
     rows = loss_rows(scores, list(read))
     report.table(rows, "PSNR lost against the nominal pad in dB, press by press, with 95 % intervals.")
-    with report.figure(size=(10, 5)) as figure:
-        grid = figure.subplots(2, (len(names) + 1) // 2, squeeze=False, sharey=True).ravel()
-        for axes, constant in zip(grid, names, strict=False):
-            mine = sorted((one for one in read if one.constant == constant or one == NONE_OFF), key=lambda o: o.percent)
-            for name, psnr in scores.items():
-                lost = [float((psnr[NONE_OFF] - psnr[one]).mean()) for one in mine]
-                axes.plot([one.percent for one in mine], lost, "o-", label=name, markersize=3)
-            axes.set(title=constant, xlabel="off [%]")
-        grid[0].set_ylabel("PSNR lost [dB]")
-        grid[0].legend(fontsize=7)
     return report.write()
 
 
@@ -121,10 +115,3 @@ def pressed(pad: Pad, shapes: list[tuple[str, Tapped]]) -> PressSet:
     rng = np.random.default_rng(SHAPES_SEED + 1)
     families = np.array([family for family, _ in shapes])
     return press_shapes(rng, GrippedPad(pad), families, [shape for _, shape in shapes], 0)
-
-
-def _psnr_db(model: ModelSession, read: dict[OffPad, FrozenPresses], known: str) -> dict[OffPad, NDArray[np.float64]]:
-    return {
-        off: psnr_db(infer_presses(model, frozen, known).patterns, frozen.patterns(), MAX_INDENTATION_MM)
-        for off, frozen in read.items()
-    }

@@ -1,16 +1,14 @@
-"""Shipped models on readings, by the session of the runtime and by the whole of it, with its verdicts on contacts."""
+"""Shipped models on readings, by the session of the runtime and by the whole of it."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
 
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.result import Result
 from edge.perception.runtime import Model, Runtime
 from edge.perception.sensor import NOISE_COUNTS
@@ -19,7 +17,6 @@ from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ScanSeries
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.frozen_presses import FrozenPresses
-from train.report import Row, bootstrap_interval
 
 NOTHING, ALL = "nothing", "pad and gains"
 """Levels of knowledge about a sensor: nothing, or all constants of its pad with the taxels' gains."""
@@ -120,131 +117,3 @@ class PushedSensor:
             for _ in range(_TAP_SCANS):
                 self.push(earlier + self.noise(), infer=False)
         return self.touch(window[0])
-
-
-AFTER: Final = (1, 3, 5, 10)
-"""Contacts after which the running evidence is looked at."""
-CONTACTS: Final = max(AFTER) + 1
-"""Contacts of each sensor; the evidence of one is weighed when the next begins."""
-_OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
-"""Reasons that a scan gives by itself."""
-RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
-"""RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
-_LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
-
-
-@dataclass(frozen=True, slots=True)
-class Verdicts:
-    """Verdicts on m contacts of several sensors: the reason is empty where believed, too light ones are not checked.
-
-    `suspected` tells for each number of AFTER whether each sensor with more contacts than that was suspected.
-    """
-
-    sensor: NDArray[np.int64]
-    reason: NDArray[np.str_]
-    checked: NDArray[np.bool_]
-    suspected: dict[int, list[bool]]
-
-    @property
-    def flagged(self) -> NDArray[np.bool_]:
-        """Contacts (m,) that a scan speaks against by itself."""
-        return np.isin(self.reason, _OWN)
-
-    def cells(self) -> Row:
-        """Return shares of the contacts, and of suspected sensors, as cells of a row."""
-        row: Row = {"contacts": len(self.sensor)}
-        if not len(self.sensor):
-            return row
-        row |= {"too light": int((~self.checked).sum()), "flagged %": share(self.flagged, self.sensor)}
-        row |= {f"{reason} %": round(100 * float((self.reason == reason).mean()), 1) for reason in _OWN[1:]}
-        return row | {
-            f"sensor, after {number} %": share(np.array(sensors))
-            for number, sensors in self.suspected.items()
-            if sensors
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """Contacts of n sensors, one each, which the runtime checked, at an index (n,) among the presses.
-
-    `off` is the RMS error over the RMS of the truth; `light` are those between the counts that end and begin a contact.
-    """
-
-    index: NDArray[np.int64]
-    off: NDArray[np.float64]
-    believed: NDArray[np.bool_]
-    light: NDArray[np.bool_]
-
-    def cells(self, here: NDArray[np.bool_]) -> Row:
-        """Return the shares of those `here` (n,) that are not believed as cells of a row."""
-        right = ~self.believed[here & (self.off < RIGHT)]
-        row: Row = {"contacts": int(here.sum())}
-        row[f"of those < {RIGHT:.0%} off, not believed %"] = share(right) if len(right) else None
-        for least in (WRONG, FAR_OFF):
-            found = ~self.believed[here & (self.off > least)]
-            row[f"> {least:.0%} off"] = len(found)
-            row[f"> {least:.0%} off, not believed %"] = share(found) if len(found) else None
-        return row
-
-
-def share(hits: NDArray[np.bool_], groups: NDArray[np.integer] | None = None) -> str:
-    """Return a share in percent with its 95 % interval by group, which is Clopper and Pearson's where all are alike."""
-    groups = np.arange(len(hits)) if groups is None else groups
-    mean = float(hits.mean())
-    if 0 < mean < 1:
-        low, high = bootstrap_interval(hits.astype(float), groups)
-    else:
-        count = len(np.unique(groups))
-        low, high = (0.0, beta.ppf(0.975, 1, count)) if mean == 0 else (beta.ppf(0.025, count, 1), 1.0)
-    return f"{100 * mean:.1f} ({100 * low:.1f}..{100 * high:.1f})"
-
-
-def of_one_sensor_each(wide: FrozenPresses) -> FrozenPresses:
-    """Return the presses with the gains of one sensor for each pad, in place of those of a sensor for each press."""
-    _, first, place = np.unique(wide.presses.pad, return_index=True, return_inverse=True)
-    gains = wide.gains[first][place]
-    return FrozenPresses(replace(wide.presses, counts=wide.presses.counts * (gains / wide.gains)[:, None]), gains)
-
-
-def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
-    """Return the presses that make the contacts of each sensor; one with few firm presses repeats them."""
-    firm = sensors.presses.counts[:, 0, 2].sum(axis=(1, 2)) >= ON_COUNTS
-    pads = sensors.presses.pad
-    mine = [np.flatnonzero(firm & (pads == pad)) for pad in np.unique(pads)]
-    return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
-
-
-def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Verdicts:
-    """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds."""
-    rows: list[tuple[int, str, bool]] = []
-    suspected: dict[int, list[bool]] = {number: [] for number in AFTER}
-    for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
-        sensor, seen = PushedSensor(model, pad, seed=number), 0
-        for counts in contacts:
-            result = sensor.touch(counts)
-            if result.pattern is None:
-                continue
-            rows.append((number, result.untrusted_reason or "", result.trusted is not None))
-            sensor.free()  # it brings the events of the contact, which follow from the evidence of those before
-            if seen in suspected:
-                suspected[seen].append(sensor.suspected)
-            seen += 1
-    number, reason, checked = zip(*rows, strict=True) if rows else ((), (), ())
-    return Verdicts(np.array(number, dtype=int), np.array(reason, dtype=str), np.array(checked, dtype=bool), suspected)
-
-
-def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
-    """Return the verdicts on the newest taps of presses, each of a sensor of its own, with what its file holds."""
-    truths = presses.patterns()
-    rows: list[tuple[int, float, bool, bool]] = []
-    for number, (counts, pad) in enumerate(zip(presses.presses.counts[:, 0], pads, strict=True)):
-        sum_z = float(counts[2].sum())
-        if sum_z < OFF_COUNTS:
-            continue
-        result = PushedSensor(model, pad, seed=number, options=_LIGHT).touch(counts)
-        if result.pattern is None or result.trusted is None:
-            continue
-        off = float(np.sqrt(np.mean((result.pattern - truths[number]) ** 2) / np.mean(truths[number] ** 2)))
-        rows.append((number, off, result.trusted, sum_z < ON_COUNTS))
-    return Judged(*map(np.array, zip(*rows, strict=True)))

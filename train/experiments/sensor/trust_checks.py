@@ -3,18 +3,19 @@
 What is judged here has set nothing: networks, checks and limits were fitted on other pads' presses.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import INT8_SUFFIX
 from edge.inference.onnx_session import ModelSession
-from edge.perception.contact_options import ON_COUNTS
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS, RuntimeOptions
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.scans.pad_constants import Pad
@@ -25,22 +26,11 @@ from train.data.world import World
 from train.errors import CheckpointError
 from train.experiments.sensor.real import play
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
-from train.experiments.sensor.shipped import (
-    ALL,
-    CONTACTS,
-    NOTHING,
-    PushedSensor,
-    contacts_of,
-    judged,
-    known_pads,
-    of_one_sensor_each,
-    share,
-    verdicts_on,
-)
+from train.experiments.sensor.shipped import ALL, NOTHING, PushedSensor, known_pads
 from train.experiments.support.workbench import Workbench
 from train.families.catalogue import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
-from train.report import Report, Row, signed_interval
+from train.report import Report, Row, bootstrap_interval, signed_interval
 
 JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
@@ -76,8 +66,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     if recording_paths(recordings_folder()):
         report.table(_grips(models), _GRIPS, "grips")
     report.table(_detected(model, sensors), _DETECTED, "faults")
-    for rows, caption, part in tap_tables(model, bench.models / f"{_MODELS[1]}{INT8_SUFFIX}.onnx", sensors):
-        report.table(rows, caption, part)
+    _tap_tables(report, model, bench.models / f"{_MODELS[1]}{INT8_SUFFIX}.onnx", sensors)
     return report.write()
 
 
@@ -139,8 +128,113 @@ def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
     for name, field in FIELDS.items():
         alone = [field(np.random.default_rng([SEED, number])) for number in range(len(readings))]
         given[f"{name}, the pad free"] = ([np.tile(one, (CONTACTS, 1, 1, 1)) for one in alone], nothing)
-    judged = tracked(given.items(), "faults", "fault")
-    return [{"fault": name} | verdicts_on(model, *one).cells() for name, one in judged]
+    return [{"fault": name} | verdicts_on(model, *one) for name, one in tracked(given.items(), "faults", "fault")]
+
+
+AFTER: Final = (1, 3, 5, 10)
+"""Contacts after which the running evidence is looked at."""
+CONTACTS: Final = max(AFTER) + 1
+"""Contacts of each sensor; the evidence of one is weighed when the next begins."""
+_OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
+"""Reasons that a scan gives by itself."""
+RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
+"""RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
+_LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Contacts of n sensors, one each, which the runtime checked, at an index (n,) among the presses.
+
+    `off` is the RMS error over the RMS of the truth; `light` are those between the counts that end and begin a contact.
+    """
+
+    index: NDArray[np.int64]
+    off: NDArray[np.float64]
+    believed: NDArray[np.bool_]
+    light: NDArray[np.bool_]
+
+    def cells(self, here: NDArray[np.bool_]) -> Row:
+        """Return the shares of those `here` (n,) that are not believed as cells of a row."""
+        right = ~self.believed[here & (self.off < RIGHT)]
+        row: Row = {"contacts": int(here.sum())}
+        row[f"of those < {RIGHT:.0%} off, not believed %"] = share(right) if len(right) else None
+        for least in (WRONG, FAR_OFF):
+            found = ~self.believed[here & (self.off > least)]
+            row[f"> {least:.0%} off"] = len(found)
+            row[f"> {least:.0%} off, not believed %"] = share(found) if len(found) else None
+        return row
+
+
+def share(hits: NDArray[np.bool_], groups: NDArray[np.integer] | None = None) -> str:
+    """Return a share in percent with its 95 % interval by group, which is Clopper and Pearson's where all are alike."""
+    groups = np.arange(len(hits)) if groups is None else groups
+    mean = float(hits.mean())
+    if 0 < mean < 1:
+        low, high = bootstrap_interval(hits.astype(float), groups)
+    else:
+        count = len(np.unique(groups))
+        low, high = (0.0, beta.ppf(0.975, 1, count)) if mean == 0 else (beta.ppf(0.025, count, 1), 1.0)
+    return f"{100 * mean:.1f} ({100 * low:.1f}..{100 * high:.1f})"
+
+
+def of_one_sensor_each(wide: FrozenPresses) -> FrozenPresses:
+    """Return the presses with the gains of one sensor for each pad, in place of those of a sensor for each press."""
+    _, first, place = np.unique(wide.presses.pad, return_index=True, return_inverse=True)
+    gains = wide.gains[first][place]
+    return FrozenPresses(replace(wide.presses, counts=wide.presses.counts * (gains / wide.gains)[:, None]), gains)
+
+
+def contacts_of(sensors: FrozenPresses) -> list[NDArray[np.int64]]:
+    """Return the presses that make the contacts of each sensor; one with few firm presses repeats them."""
+    firm = sensors.presses.counts[:, 0, 2].sum(axis=(1, 2)) >= ON_COUNTS
+    pads = sensors.presses.pad
+    mine = [np.flatnonzero(firm & (pads == pad)) for pad in np.unique(pads)]
+    return [np.resize(presses, CONTACTS) for presses in mine if len(presses)]
+
+
+def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Sequence[Pad | None]) -> Row:
+    """Return the verdicts on each sensor's contacts (n, 3, rows, cols) in their order, with what its file holds.
+
+    They are shares of the contacts, of which too light ones are not checked, and of the sensors with more contacts than
+    each number of AFTER that were suspected by then, as cells of a row.
+    """
+    rows: list[tuple[int, str, bool]] = []
+    suspected: dict[int, list[bool]] = {number: [] for number in AFTER}
+    for number, (contacts, pad) in enumerate(zip(sensors, pads, strict=True)):
+        pushed, seen = PushedSensor(model, pad, seed=number), 0
+        for counts in contacts:
+            result = pushed.touch(counts)
+            if result.pattern is None:
+                continue
+            rows.append((number, result.untrusted_reason or "", result.trusted is not None))
+            pushed.free()  # it brings the events of the contact, which follow from the evidence of those before
+            if seen in suspected:
+                suspected[seen].append(pushed.suspected)
+            seen += 1
+    if not rows:
+        return {"contacts": 0}
+    sensor, reason, checked = map(np.array, zip(*rows, strict=True))
+    flagged = share(np.isin(reason, _OWN), sensor)
+    row: Row = {"contacts": len(rows), "too light": int((~checked).sum()), "flagged %": flagged}
+    row |= {f"{name} %": round(100 * float((reason == name).mean()), 1) for name in _OWN[1:]}
+    return row | {f"sensor, after {number} %": share(np.array(some)) for number, some in suspected.items() if some}
+
+
+def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
+    """Return the verdicts on the newest taps of presses, each of a sensor of its own, with what its file holds."""
+    truths = presses.patterns()
+    rows: list[tuple[int, float, bool, bool]] = []
+    for number, (counts, pad) in enumerate(zip(presses.presses.counts[:, 0], pads, strict=True)):
+        sum_z = float(counts[2].sum())
+        if sum_z < OFF_COUNTS:
+            continue
+        result = PushedSensor(model, pad, seed=number, options=_LIGHT).touch(counts)
+        if result.pattern is None or result.trusted is None:
+            continue
+        off = float(np.sqrt(np.mean((result.pattern - truths[number]) ** 2) / np.mean(truths[number] ** 2)))
+        rows.append((number, off, result.trusted, sum_z < ON_COUNTS))
+    return Judged(*map(np.array, zip(*rows, strict=True)))
 
 
 _DEPTHS: Final = (0.85, 1.15)
@@ -156,16 +250,7 @@ _GUARDED: Final = (
 )
 
 
-class Guarded(NamedTuple):
-    """Outcome for n windows: PSNR (n,) in [dB], taps used (n,), and which earlier ones do not belong, (n, K - 1)."""
-
-    psnr_db: NDArray[np.float64]
-    taps_used: NDArray[np.int64]
-    foreign: NDArray[np.bool_]
-
-
-def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> Iterator[tuple[list[Row], str, str]]:
-    """Yield the tables of dropped taps and of PSNR: rows, caption and name."""
+def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: FrozenPresses) -> None:
     guarding, unguarded = (ModelSession(several, taps=_TAPS) for _ in range(2))
     unguarded.contract = replace(unguarded.contract, trust={})
     taps, name_of = guarding.contract.taps, guarding.name
@@ -174,21 +259,20 @@ def tap_tables(single: ModelSession, several: Path, sensors: FrozenPresses) -> I
     dropped: list[Row] = []
     losses: list[Row] = []
     for name, (counts, truth) in tracked(cases(sensors).items(), "tapping", "case"):
-        alone, off, on = (
-            guarded(model, counts, truth, number)
-            for model, number in ((single, 1), (unguarded, taps), (guarding, taps))
-        )
+        alone_db, _, _ = guarded(single, counts, truth, 1)
+        off_db, _, _ = guarded(unguarded, counts, truth, taps)
+        on_db, used, foreign = guarded(guarding, counts, truth, taps)
         row: Row = {"earlier taps": name, "windows": len(counts)}
-        by_tap: Row = {f"tap {number} %": share(on.foreign[:, number - 1], pads) for number in range(1, taps)}
-        some, every = share(np.logical_or.reduce(on.foreign, axis=1), pads), share(on.taps_used == 1, pads)
+        by_tap: Row = {f"tap {number} %": share(foreign[:, number - 1], pads) for number in range(1, taps)}
+        some, every = share(np.logical_or.reduce(foreign, axis=1), pads), share(used == 1, pads)
         dropped.append(row | by_tap | {"some dropped %": some, "all dropped %": every})
-        row[single.name] = round(float(alone.psnr_db.mean()), 2)
-        for how, one in (("no guard", off), ("guard", on)):
-            row[f"{name_of}, {how}"] = round(float(one.psnr_db.mean()), 2)
-            row[f"{how}, over one tap"] = signed_interval(one.psnr_db - alone.psnr_db, pads)
+        row[single.name] = round(float(alone_db.mean()), 2)
+        for how, found_db in (("no guard", off_db), ("guard", on_db)):
+            row[f"{name_of}, {how}"] = round(float(found_db.mean()), 2)
+            row[f"{how}, over one tap"] = signed_interval(found_db - alone_db, pads)
         losses.append(row)
-    yield dropped, _DROPPED, "taps"
-    yield losses, _GUARDED, "psnr"
+    report.table(dropped, _DROPPED, "taps")
+    report.table(losses, _GUARDED, "psnr")
 
 
 def firm(sensors: FrozenPresses) -> FrozenPresses:
@@ -225,14 +309,17 @@ def next_of_pad(pads: NDArray[np.integer]) -> NDArray[np.int64]:
     return result
 
 
-def guarded(model: Model, windows: NDArray[np.floating], truth: NDArray[np.float32], taps: int) -> Guarded:
-    """Push each window through a runtime of its own, the newest tap being inferred."""
+def guarded(
+    model: Model, windows: NDArray[np.floating], truth: NDArray[np.float32], taps: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Push each window through a runtime of its own, the newest tap being inferred.
+
+    Returns the PSNR (n,) in [dB], the taps used (n,), and which earlier ones do not belong, (n, K - 1).
+    """
     patterns, used, foreign = [], [], []
     for number, counts in enumerate(windows):
         result = PushedSensor(model, seed=number).tap(counts[:taps])
         patterns.append(np.asarray(result.pattern))  # there is one, since taps that begin no contact are left out
         used.append(result.taps_used)
         foreign.append([mismatch >= 0.5 for mismatch in result.tap_mismatch or ()])
-    return Guarded(
-        psnr_db(np.stack(patterns), truth, MAX_INDENTATION_MM), np.array(used), np.array(foreign, dtype=bool)
-    )
+    return psnr_db(np.stack(patterns), truth, MAX_INDENTATION_MM), np.array(used), np.array(foreign, dtype=bool)
