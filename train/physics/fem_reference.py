@@ -13,17 +13,19 @@ Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from torch import Tensor
 
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.pad_geometry import USPA44
@@ -54,9 +56,6 @@ _MAX_NEWTON: Final = 12
 _MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
 """Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
-
-Tensors = NDArray[np.floating]
-"""Tensors (3, 3, ...) as in finite-element codes: the tensor's axes first, the points last."""
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
@@ -179,8 +178,10 @@ class _Press:
 
     def __init__(self, region: Any, rubber: "MooneyRivlin", size: int) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
+        stress = torch.func.grad(rubber.energy)
+        stiffness = torch.func.jacfwd(stress)
         material = felupe.Material(
-            stress=lambda x: [rubber.stress(x[0]), x[-1]], elasticity=lambda x: [rubber.stiffness(x[0])]
+            stress=lambda x: [_at_points(stress, x[0]), x[-1]], elasticity=lambda x: [_at_points(stiffness, x[0])]
         )
         # The mixed elements add the volumetric part.
         self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
@@ -282,48 +283,16 @@ class MooneyRivlin(NamedTuple):
         bulk = shear * 2 * (1 + nu) / (3 * (1 - 2 * nu))
         return cls((1 - C2_SHARE) * shear / 2, C2_SHARE * shear / 2, bulk)
 
-    def stress(self, gradient: Tensors) -> Tensors:
-        """Return the first Piola-Kirchhoff stress d psi / dF, (3, 3, ...) in [MPa]."""
-        volume, inverse = _volume_and_inverse(gradient)
-        first, second = (
-            weight * volume**-power * (slope - power * invariant * inverse)
-            for weight, power, invariant, slope in self._terms(gradient)
-        )
-        return first + second
-
-    def stiffness(self, gradient: Tensors) -> Tensors:
-        """Return the stiffness d^2 psi / dF dF, (3, 3, 3, 3, ...) in [MPa], with dJ/dF = J F^-T."""
-        volume, inverse = _volume_and_inverse(gradient)
-        one = np.eye(3).reshape(3, 3, *(1,) * (gradient.ndim - 2))
-        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
-        left = np.einsum("im...,km...->ik...", gradient, gradient)
-        curve1 = 2 * np.einsum("ik...,jl...->ijkl...", one, one)
-        curve2 = 4 * _outer(gradient, gradient) + np.einsum("ii...->...", right) * curve1
-        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", one, right)
-        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", left, one)
-        curve2 -= 2 * np.einsum("il...,kj...->ijkl...", gradient, gradient)
-        pair, parts = _outer(inverse, inverse), []
-        for (weight, power, invariant, slope), curve in zip(self._terms(gradient), (curve1, curve2), strict=True):
-            mixed = _outer(slope, inverse)
-            by_volume = power * invariant * (power * pair + np.swapaxes(pair, 1, 3))
-            by_both = power * (mixed + np.moveaxis(mixed, (0, 1), (2, 3)))
-            parts.append(weight * volume**-power * (curve - by_both + by_volume))
-        return parts[0] + parts[1]
-
-    def _terms(self, gradient: Tensors) -> Iterator[tuple[float, float, Tensors, Tensors]]:
-        """Yield the weight of I1 and I2, their power of 1/J, their value, and their derivative by F."""
-        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
-        i1 = np.einsum("ii...->...", right)
-        yield self.c1_mpa, 2 / 3, i1, 2 * gradient
-        i2 = (i1**2 - np.einsum("ij...,ij...->...", right, right)) / 2
-        yield self.c2_mpa, 4 / 3, i2, 2 * (i1 * gradient - np.einsum("ik...,kj...->ij...", gradient, right))
+    def energy(self, gradient: Tensor) -> Tensor:
+        """Return psi in [MPa] at one point with a gradient F (3, 3)."""
+        right, volume = gradient.mT @ gradient, torch.linalg.cross(gradient[0], gradient[1]) @ gradient[2]
+        first = right.trace()
+        second = (first**2 - (right**2).sum()) / 2
+        return self.c1_mpa * (first * volume ** (-2 / 3) - 3) + self.c2_mpa * (second * volume ** (-4 / 3) - 3)
 
 
-def _volume_and_inverse(gradient: Tensors) -> tuple[Tensors, Tensors]:
-    """Return J and F^-T."""
-    turned = np.moveaxis(gradient, (0, 1), (-1, -2))
-    return np.linalg.det(turned), np.moveaxis(np.linalg.inv(turned), (-2, -1), (0, 1))
-
-
-def _outer(a: Tensors, b: Tensors) -> Tensors:
-    return np.einsum("ij...,kl...->ijkl...", a, b)
+def _at_points(function: Callable[[Tensor], Tensor], gradient: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return a tensor of each point's F, with the points last as in felupe, of gradients (3, 3, ...)."""
+    flat = torch.from_numpy(gradient.reshape(3, 3, -1))
+    found = torch.func.vmap(function, in_dims=-1, out_dims=-1)(flat).numpy()
+    return found.reshape(*found.shape[:-1], *gradient.shape[2:])
