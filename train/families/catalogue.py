@@ -57,29 +57,18 @@ _MOST_TRIES: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Tapped:
-    """One shape under K taps.
+    """One shape under K taps, newest first."""
 
-    Attributes:
-        heights_mm: (K, m, m) at the pad's places, newest tap first.
-        cover: compliant cover of the shape or the pad.
-        poses: (K, 3) of the pad in the newest tap's axes, see `firmware_bridge.poses.pad_pose`.
-        angle_deg: (K,), turn of the pad seen from above, for the earth's field.
-    """
-
-    heights_mm: NDArray[np.float32]
-    cover: Cover
-    poses: NDArray[np.float64]
-    angle_deg: NDArray[np.float64]
+    heights_mm: NDArray[np.float32]  # (K, m, m) at the pad's places
+    cover: Cover  # of the shape or the pad
+    poses: NDArray[np.float64]  # (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg]
+    angle_deg: NDArray[np.float64]  # (K,), turn of the pad seen from above, for the earth's field
 
 
 def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: NDArray[np.float64]) -> Tapped:
-    """Draw one shape of a family, tapped from poses.
+    """Draw one shape of a family, and where it lies, tapped from poses (K, 3) in the newest tap's axes.
 
-    Args:
-        rng: draws the shape and where it lies.
-        family: a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
-        pad: the pad that taps.
-        poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
+    A family is a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
     """
     if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)

@@ -21,17 +21,11 @@ from train.physics.side_correction import FreeSides, SideGive
 
 @dataclass(frozen=True, slots=True)
 class Cover:
-    """Compliance of the object, and a cloth or glove between it and the pad.
+    """Compliance of the object, and a cloth or glove between it and the pad."""
 
-    Attributes:
-        soft_mpa: shear modulus of a soft object, thick and incompressible; 0 for a rigid one.
-        cloth_mm: thickness of the cloth; 0 for none.
-        cloth_mpa: its modulus under even pressure.
-    """
-
-    soft_mpa: float = 0.0
-    cloth_mm: float = 0.0
-    cloth_mpa: float = 1.0
+    soft_mpa: float = 0.0  # shear modulus of a soft object, thick and incompressible; 0 for a rigid one
+    cloth_mm: float = 0.0  # thickness of the cloth; 0 for none
+    cloth_mpa: float = 1.0  # its modulus under even pressure
 
     def compliance(self, layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the joint compliance of pad and cover at wave numbers, in [mm/MPa]."""
@@ -74,18 +68,11 @@ The pad bulges next to a contact, by at most 0.39 of the indentation over the 18
 
 @dataclass(frozen=True, slots=True)
 class ContactResult:
-    """Solution of a batch of poses.
+    """Solution of a batch of poses."""
 
-    Attributes:
-        pressure_mpa: (n, size, size), in [MPa].
-        steps: conjugate-gradient steps of the slowest pose.
-        residual: (n,) root mean square gap where pressure acts or surfaces overlap, as a share of the indentation.
-        solver: solver of the poses.
-    """
-
-    pressure_mpa: NDArray[np.float32]
-    steps: int
-    residual: NDArray[np.float32]
+    pressure_mpa: NDArray[np.float32]  # (n, size, size)
+    steps: int  # of the slowest pose's conjugate gradients
+    residual: NDArray[np.float32]  # (n,), RMS gap where pressure acts or surfaces overlap, over the indentation
     solver: "ContactSolver"
 
     @property
@@ -100,16 +87,7 @@ class ContactResult:
 
 
 class ContactSolver:
-    """Solver of poses on a square grid over one pad.
-
-    Args:
-        layer: the pad.
-        size: cells along a side.
-        cell_mm: cell size, in [mm].
-        dtype: torch.float32 or torch.float64.
-        cover: of the surface or the pad.
-        sides: the pad's free sides; None for an infinite layer.
-    """
+    """Solver of poses on a square grid over one pad, `size` cells a side; without `sides` the layer is infinite."""
 
     def __init__(
         self,

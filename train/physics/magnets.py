@@ -22,19 +22,13 @@ _DIPOLE_CLEARANCE: Final = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Magnet:
-    """Small axial cylinder in the pad and the chip under it; no data sheet states their sizes.
-
-    Attributes:
-        remanence_t: of the material; 1.2 is common neodymium.
-        height_mm: of the magnet's centre above the board.
-        chip_height_mm: of the sensitive spot above the board, under the magnet's centre.
-    """
+    """Small axial cylinder in the pad and the chip under it; no data sheet states their sizes."""
 
     diameter_mm: float = 1.0
     thickness_mm: float = 0.5
-    remanence_t: float = 1.2
-    height_mm: float = 2.5
-    chip_height_mm: float = 0.5
+    remanence_t: float = 1.2  # common neodymium
+    height_mm: float = 2.5  # of the magnet's centre above the board
+    chip_height_mm: float = 0.5  # of the sensitive spot above the board, under the magnet's centre
 
     def __post_init__(self) -> None:
         if not (self.diameter_mm > 0 and self.thickness_mm > 0 and self.remanence_t > 0):
