@@ -17,8 +17,8 @@ from shapely.geometry.base import BaseGeometry
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from train.data.generation_config import SEED
 from train.data.paper_taps import between_frames, tap
+from train.data.presses import SEED
 from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
 from train.physics.magnets import Magnet, dipole_mt

@@ -11,12 +11,11 @@ from edge.evaluation.evaluate import judge
 from edge.inference.bundled import BUNDLE_DIR
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
-from train.data.contact_kinds import KINDS, fit_kinds
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, paper_taps
+from train.data.presses import SEED
 from train.data.world import World, solve_pad
 from train.demo import demo_recording
-from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, main
+from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import HALF_PITCH_MM

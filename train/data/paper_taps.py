@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge.terminal.progress_bar import tracked
-from train.data.generation_config import SEED, one_thread
+from train.data.presses import SEED, one_thread
 from train.errors import DatasetError
 from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps

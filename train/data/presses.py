@@ -1,14 +1,20 @@
-"""Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash."""
+"""Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash.
+
+A set is made again with the same bytes from its seed, on one thread.
+"""
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
@@ -16,6 +22,8 @@ from firmware_bridge.recording.npz_reader import read_npz
 from train.errors import DatasetError
 from train.physics.resample import resample, resample_touching
 
+SEED: Final = 20240228
+"""Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
@@ -39,6 +47,18 @@ _AXES: Final = {
     "indentation_mm": ("float32", "n"),
 }
 """Type and axes of each array; a letter is the same length everywhere."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit torch and BLAS to one thread each: a sum split over threads differs in its last bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44
-from train.data.generation_config import one_thread
-from train.data.presses import VERSION, PressSet, join_presses
+from train.data.presses import VERSION, PressSet, join_presses, one_thread
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad

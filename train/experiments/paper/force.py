@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.terminal.progress_bar import tracked
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, windows
+from train.data.presses import SEED
 from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
 from train.experiments.support.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N

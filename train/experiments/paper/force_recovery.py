@@ -20,10 +20,9 @@ from edge.perception.contact_options import ON_COUNTS
 from edge.perception.tap_tracker import TapTracker
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, between_frames
 from train.data.press_batches import read_presses
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet
 from train.experiments.paper.protocol import compact_methods, mixed
 from train.experiments.support.workbench import Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
