@@ -18,7 +18,7 @@ from train.demo import demo_recording
 from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import NAMES, Nuisances
-from train.surfaces.poses import HALF_PITCH_MM
+from train.surfaces.poses import HALF_PITCH_MM, PLACES_MM
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,13 @@ def figures_alone(count: int) -> World:
 @pytest.fixture(scope="module")
 def frozen(sequences):
     return freeze(sequences, Nuisances(), SEED)
+
+
+def test_sequences_are_the_papers_targets_each_tap_turned_back_one_more_step(sequences):
+    assert sequences.surfaces.tolist() == ["O"] * 4 + ["small circle"] * 4
+    turns_deg = [[newest, newest - 5, newest - 10] for newest in (0, 30, 60, 90)] * 2
+    assert sequences.poses[..., 2] == pytest.approx(np.array(turns_deg), abs=2.01)
+    assert sequences.poses[..., :2] == pytest.approx(np.full((8, 3, 2), PLACES_MM["test"]), abs=0.401)
 
 
 def test_frames_rise_to_the_set_force_and_share_their_earlier_taps(frozen):

@@ -10,8 +10,8 @@ from train.surfaces.named_surfaces import (
     AREA_MM2,
     FIGURE_HEIGHT_MM,
     GLYPH_REACH_MM,
+    LETTERS,
     PLATE_MM,
-    PLATES,
     POLYGON_REACH_MM,
     SURFACES,
     figure,
@@ -25,12 +25,10 @@ def top_mm2(mesh):
     return mesh.area_faces[(mesh.triangles[:, :, 2] > -1e-9).all(axis=1)].sum()
 
 
-def test_two_plates_hold_nine_letters_and_three_shapes_in_three_forms():
-    assert [len(plate) for plate in PLATES] == [9, 9]
+def test_there_are_nine_letters_and_three_shapes_in_three_forms():
     assert len(set(SURFACES)) == 18
-    assert PLATES[0] + PLATES[1] == SURFACES
-    assert "".join(PLATES[0]) == "CFILOPSTU"
-    assert PLATES[1][::3] == ("hollow circle", "hollow square", "hollow triangle")
+    assert "".join(LETTERS) == "".join(SURFACES[:9]) == "CFILOPSTU"
+    assert SURFACES[9::3] == ("hollow circle", "hollow square", "hollow triangle")
 
 
 @pytest.mark.parametrize("name", SURFACES)

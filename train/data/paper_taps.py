@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge.terminal.progress_bar import tracked
 from train.data.presses import SEED, one_thread
-from train.errors import DatasetError
 from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
@@ -29,7 +28,7 @@ from train.physics.resample import resample, resample_touching
 from train.physics.sensor_noise import Nuisances, Seed, jitter_poses, read_windows
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, Split, paper_taps_of
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split
 
 FORCE_N: Final = 9.2
 """Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
@@ -61,13 +60,7 @@ class PaperTaps:
         return self.counts.shape[1]
 
     def newest(self, taps: int) -> "PaperTaps":
-        """Return the sequences with only their newest `taps` taps.
-
-        Raises:
-            DatasetError: the sequences have fewer taps.
-        """
-        if not 1 <= taps <= self.taps:
-            raise DatasetError(f"{taps} taps asked for, but these sequences have {self.taps}")
+        """Return the sequences with only their newest `taps` taps."""
         return replace(self, **{name: getattr(self, name)[:, :taps] for name in _PER_TAP})
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PaperTaps":
@@ -103,16 +96,18 @@ def paper_taps(
 ) -> PaperTaps:
     """Tap each flat surface at the places of a split, in four turns; poses and truth are off by a robot's error."""
     pad = GrippedPad(NOMINAL)
-    names, sent = paper_taps_of(split, surfaces, taps, angle_step_deg)
+    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    turns_deg = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    sent = [Pose(*PLACES_MM[split], turn_deg) for _ in surfaces for turn_deg in turns_deg]
     poses: list[Pose] = []
     while part := sent[len(poses) :][: _AT_ONCE * taps]:
         rng = np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)])
         poses += jitter_poses(rng, part, Nuisances())
     numbers = tracked(range(len(names)), "tapping", "sequence")
-    solved = [tap(pad, names[at], poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
+    solved = [tap(pad, [names[at]] * taps, poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
     return PaperTaps(
         surfaces=np.array(names),
-        poses=np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in poses]).reshape(-1, taps, 3),
+        poses=np.array(poses).reshape(-1, taps, 3),
         counts=np.stack([one.counts for one in solved]),
         force_n=np.stack([one.force_n for one in solved]),
         indentation_mm=np.stack([one.indentation_mm for one in solved]),
@@ -121,9 +116,10 @@ def paper_taps(
     )
 
 
-def tap(pad: GrippedPad, surface: str, poses: Sequence[Pose], force_n: float) -> Taps:
-    """Return whole taps of a flat surface from poses over it."""
-    return pad.tap(np.stack([heights_of(surface, pose, pad) for pose in poses]), force_n)
+def tap(pad: GrippedPad, surfaces: Sequence[str], poses: Sequence[Pose], force_n: float) -> Taps:
+    """Return whole taps of flat surfaces, each from a pose over it."""
+    heights_mm = [heights_of(surface, pose, pad) for surface, pose in zip(surfaces, poses, strict=True)]
+    return pad.tap(np.stack(heights_mm), force_n)
 
 
 def windows(

@@ -157,10 +157,7 @@ def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nui
     """Return the true poses of a sensor that was commanded to these poses."""
     off = _cut_normal(rng, (len(poses), 3))
     off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
-    return [
-        Pose(pose.x_mm + float(x_mm), pose.y_mm + float(y_mm), pose.angle_deg + float(turn_deg))
-        for pose, (x_mm, y_mm, turn_deg) in zip(poses, off, strict=True)
-    ]
+    return [Pose(*true) for true in (np.array(poses) + off).tolist()]
 
 
 def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:

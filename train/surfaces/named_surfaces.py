@@ -62,12 +62,10 @@ _STROKES: Final[dict[str, list[Points]]] = {
 _CORNERS: Final = {"circle": 96, "square": 4, "triangle": 3}
 
 LETTERS: Final = tuple(_STROKES)
+"""Names of the nine surfaces on the first of the paper's contact plates."""
 SHAPES: Final = tuple(f"{form} {shape}" for shape in _CORNERS for form in ("hollow", "large", "small"))
-
-PLATES: Final = (LETTERS, SHAPES)
-"""Names of the surfaces on the paper's two contact plates, nine each."""
 SURFACES: Final = LETTERS + SHAPES
-"""Names of the 18 surfaces."""
+"""Names of the 18 surfaces, nine on each plate."""
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:

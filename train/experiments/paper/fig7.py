@@ -26,7 +26,7 @@ from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
 from train.surfaces.depth_image import depth_image
-from train.surfaces.named_surfaces import PLATES
+from train.surfaces.named_surfaces import LETTERS
 
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)
@@ -70,7 +70,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     The full run takes about half an hour on one core, nearly all of it for the finite elements.
     """
-    surfaces = PLATES[0][:2] if bench.quick else PLATES[0]
+    surfaces = LETTERS[:2] if bench.quick else LETTERS
     meshes = _QUICK_MESHES if bench.quick else MESHES
     steps = 2 if bench.quick else STEPS
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
