@@ -19,6 +19,7 @@ from firmware_bridge.poses.pad_pose import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from train.data.paper_taps import between_frames, tap
 from train.data.presses import SEED
+from train.physics.contact import BARE
 from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL
@@ -223,8 +224,9 @@ def _pressed(
         if len(meets):
             turn = np.radians(place[start + meets, 2])
             drag = -_DRAG_MM * np.stack([np.cos(turn), -np.sin(turn)], axis=1)  # in the pad's axes
-            still, even = np.zeros(len(meets)), np.full(len(meets), friction)
-            counts[start + meets] = pad.press(heights[meets], deep_mm[start + meets], drag, still, even).counts
+            still, even, bare = np.zeros(len(meets)), np.full(len(meets), friction), [BARE] * len(meets)
+            pressed = pad.press(heights[meets], deep_mm[start + meets], drag, still, even, bare)
+            counts[start + meets] = pressed.counts
     return counts
 
 

@@ -175,7 +175,9 @@ def test_a_press_that_takes_too_much_force_goes_less_deep():
 @pytest.mark.parametrize("depth_mm", [0.0, -0.1, 0.51, float("nan")])
 def test_a_press_beyond_what_is_linear_is_refused(pad, depth_mm):
     with pytest.raises(PressError, match=f"indentation of {depth_mm:g} mm, expected above 0 to 0.5 mm"):
-        pad.press(face(pad).repeat(2, 0), np.array([0.2, depth_mm]), np.zeros((2, 2)), np.zeros(2), np.ones(2))
+        pad.press(
+            face(pad).repeat(2, 0), np.array([0.2, depth_mm]), np.zeros((2, 2)), np.zeros(2), np.ones(2), [BARE] * 2
+        )
 
 
 def test_nothing_under_the_pad_is_refused(pad):

@@ -197,14 +197,6 @@ class TestFriction:
             # Measured 0.2 % at most.
             assert np.linalg.norm(one.force_n - force_n) < 0.01 * np.linalg.norm(one.force_n)
 
-    def test_what_does_not_fit_is_refused(self):
-        solver = FrictionSolver(Layer(), SIZE, CELL_MM)
-        pressure = np.ones((2, SIZE, SIZE))
-        with pytest.raises(ValueError, match=r"friction is -1\.0, expected 0 or more"):
-            solver.solve(pressure, np.zeros((2, 2)), np.zeros(2), np.array([1.0, -1.0]))
-        with pytest.raises(ValueError, match="a slide is not finite"):
-            solver.solve(pressure, np.full((2, 2), np.nan), np.zeros(2), np.ones(2))
-
 
 class TestMagnets:
     RIGHT, BACK, DOWN, LEAN_X, LEAN_Y = range(5)

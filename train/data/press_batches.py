@@ -88,14 +88,8 @@ _SURE: Final = 0.1
 class PressBatches:
     """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
 
-    Windows of one tap are drawn from sequences with fewer taps where these exist, because they are many more.
-
-    Args:
-        presses: some of them with all K taps.
-        given: share of windows with 1, 2, ... K taps; older taps are dropped.
-        batch: windows in a batch.
-        seed: of all draws.
-        nuisances: of the sensors.
+    `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped. Windows of one tap are drawn
+    from sequences with fewer taps where these exist, because they are many more.
 
     Raises:
         DatasetError: there are no presses of K taps.
@@ -255,10 +249,7 @@ def stated_poses(
 ) -> NDArray[np.float32]:
     """Return true poses (n, K, 3) as a robot states them, (n, K, 5): off by errors, whose sizes come last.
 
-    Args:
-        rng: draws the errors.
-        poses: of the taps in the newest one's axes, newest first.
-        errors: standard deviations in [mm] and [deg], stated and kept to; None to draw them as in training.
+    Standard deviations `errors` in [mm] and [deg] are stated and kept to; without them they are drawn as in training.
     """
     shape = (*poses.shape[:2], 1)
     if errors is None:

@@ -121,20 +121,17 @@ class ContactSolver:
         tolerance: float = 1e-3,
         covered: NDArray[np.floating] | None = None,
     ) -> ContactResult:
-        """Press surfaces into the pad, with depth images as input.
+        """Press surfaces into the pad until the residual is below the tolerance.
 
         For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
 
         Args:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
-            tolerance: residual at which a pose is done.
+            tolerance: largest residual.
             covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
         """
-        shapes = {depth_mm.shape[1:], depth_mm.shape[1:] if covered is None else covered.shape[1:]}
-        if shapes != {(self.size, self.size)}:
-            raise ValueError(f"depth images and covered shares of {shapes}, expected (n, {self.size}, {self.size})")
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         if not (indentation > 0).all():
             raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")

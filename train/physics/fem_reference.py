@@ -131,12 +131,9 @@ class FemPresses(NamedTuple):
 
 
 class FemPad:
-    """Pad bonded to its board, with free sides.
+    """Pad bonded to its board, with free sides, its material that of the layer at small strain.
 
-    Args:
-        scale: nodes per taxel pitch: they lie on the pixels of the pattern at this scale, and on the pad's rim.
-        cells_high: elements over the thickness.
-        layer: thickness, and the material at small strain.
+    Nodes lie on the pixels of the pattern at a scale, and on the pad's rim.
     """
 
     def __init__(self, scale: int, cells_high: int, layer: Layer = LAYER) -> None:
@@ -151,12 +148,10 @@ class FemPad:
         self._region = felupe.RegionHexahedron(mesh)
 
     def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
-        """Press a surface in, each step starting from the last one's equilibrium.
+        """Press a surface in at rising indentations (s,), each step starting from the last one's equilibrium.
 
-        Args:
-            depth_mm: (size, size), depth of the surface below its highest point over each node, in [mm]; the
-                image of size x size cells of cell_mm fits, because its rim is the pad's up to a fraction of a cell.
-            indentation_mm: (s,), rising, in [mm].
+        Depths (size, size) are below its highest point over each node; the image of size x size cells of cell_mm fits,
+        because its rim is the pad's up to a fraction of a cell.
 
         Raises:
             NoEquilibriumError: the elements do not converge.

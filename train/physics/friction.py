@@ -65,21 +65,11 @@ class FrictionSolver:
         friction: NDArray[np.floating],
         tolerance: float = 1e-3,
     ) -> FrictionResult:
-        """Slide and turn surfaces that touch with these pressures.
+        """Slide (n, 2) surfaces to the right and back, and turn them (n,) about the pad's centre from right to back.
 
-        Args:
-            pressure_mpa: (n, size, size), in contact where it is above 0, in [MPa].
-            slide_mm: (n, 2), of the surface to the right and back, in [mm].
-            twist_rad: (n,), of the surface about the pad's centre, from right to back.
-            friction: (n,), coefficients mu, >= 0.
-            tolerance: residual at which a pose is done.
+        They touch with pressures (n, size, size), where these are above 0, and have coefficients of friction mu (n,).
         """
         count = len(pressure_mpa)
-        if not (np.asarray(friction) >= 0).all():
-            raise ValueError(f"friction is {np.min(friction)}, expected 0 or more")
-        for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):
-            if not np.isfinite(given).all():
-                raise ValueError(f"a {name} is not finite, expected numbers")
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
         turn = twist_rad[:, None, None] * along_mm
         moved_mm = (

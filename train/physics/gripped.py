@@ -103,7 +103,7 @@ class GrippedPad:
         slide_mm: NDArray[np.floating],
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
-        covers: Sequence[Cover] | None = None,
+        covers: Sequence[Cover],
         scale: int = SCALE,
     ) -> Presses:
         """Press shapes onto the pad; a press that would exceed MOST_FORCE_N is made less deep.
@@ -114,7 +114,7 @@ class GrippedPad:
             slide_mm: (n, 2), movement of the shape to the right and down the rows after contact, in [mm].
             twist_rad: (n,), turn about the pad's centre from x towards y.
             friction: (n,), Coulomb's coefficient.
-            covers: one for each press; all bare if None.
+            covers: one for each press.
             scale: pattern pixels per taxel pitch.
 
         Raises:
@@ -126,7 +126,6 @@ class GrippedPad:
                 f"indentation of {indentation_mm[~within][0]:g} mm, expected above 0 to {MAX_INDENTATION_MM} mm: "
                 "beyond a tenth of its thickness the pad is not linear; press less deep"
             )
-        covers = [BARE] * len(heights_mm) if covers is None else covers
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
         pressure = np.zeros(cells_mm.shape, dtype=np.float32)
@@ -149,14 +148,11 @@ class GrippedPad:
             indentation_mm=pressed_mm,
         )
 
-    def tap(self, heights_mm: NDArray[np.float32], force_n: NDArray[np.floating] | float) -> Taps:
+    def tap(self, heights_mm: NDArray[np.float32], force_n: float) -> Taps:
         """Press flat figures straight down until the set force or MAX_INDENTATION_MM, whichever comes first.
 
-        On a flat figure the pressure is in proportion to the indentation: one solution serves all frames of a tap.
-
-        Args:
-            heights_mm: (n, m, m) as in `press`, of figures on a plate that the pad does not reach.
-            force_n: set force, one for all or (n,), in [N].
+        Heights (n, m, m) are as in `press`; the pad does not reach the plate under a figure. The pressure is then in
+        proportion to the indentation: one solution serves all frames of a tap.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)

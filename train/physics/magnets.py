@@ -83,11 +83,8 @@ def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
 class MagnetArray:
     """One magnet over one chip per taxel.
 
-    Args:
-        geometry: the taxels.
-        magnet: the same in every taxel.
-        rest: place and lean of each magnet at rest, as a movement, (taxels, 5); None for no deviation.
-        moments: of each magnet as a share of the nominal one, (taxels,); None for nominal moments.
+    `rest` is the place and lean of each magnet at rest, as a movement (taxels, 5), `moments` (taxels,) a share of the
+    nominal one's.
     """
 
     def __init__(

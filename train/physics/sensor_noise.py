@@ -195,20 +195,11 @@ def frame_weights(
     share: NDArray[np.float64],
     relaxation_s: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the weight of each frame of a press in a reading at any moment of it, in closed form.
+    """Return the weight (n, K, m, frames) of each frame of a press in readings at moments `frame`, in closed form.
 
-    Readings are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second
-    difference of the responses to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
-
-    Args:
-        frame: moments of n sensors' K taps, (n, K, m), in frames since the pad was free.
-        frames: of a press; the first one is a step after the pad was free.
-        step_s: time from frame to frame, (n, K), in [s].
-        share: lagging share, (n,).
-        relaxation_s: (n,), above 0 where a share lags, in [s].
-
-    Returns:
-        (n, K, m, frames).
+    Moments (n, K, m) are in frames since the pad was free, one step of `step_s` (n, K) before the first frame. Readings
+    are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second difference of
+    the responses to ramps, and that of the lagging share (n,) is t - tau (1 - exp(-t / tau)), tau the relaxation (n,).
     """
     ramp = np.maximum(frame[..., None] - np.arange(frames + 2), 0)
     if share.any():

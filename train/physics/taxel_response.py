@@ -69,11 +69,9 @@ class Skin:
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """Return the movement of the magnets under loads on the pad: (..., taxels, 5), train.physics.magnets.MOVEMENT.
+        """Return the MOVEMENT of the magnets, (..., taxels, 5), under loads on the pad.
 
-        Args:
-            pressure_mpa: (..., size, size), in [MPa].
-            traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
+        Pressure is (..., size, size), traction (..., 2, size, size) to the right and back.
         """
         taxels, parts, cells = self._response.shape
         moved = pressure_mpa.reshape(-1, cells) @ self._response.reshape(-1, cells).T

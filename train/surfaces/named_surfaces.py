@@ -69,10 +69,7 @@ SURFACES: Final = LETTERS + SHAPES
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:
-    """Return the mesh of one surface, figure and base plate as closed bodies side by side, centred on x = y = 0.
-
-    Args:
-        name: that of a figure, see `figure`; a user's file as `mesh_name` names it, without a plate.
+    """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0.
 
     Raises:
         SurfaceError: no surface of that name.
