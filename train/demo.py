@@ -24,7 +24,7 @@ from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
-from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
+from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
 from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, PLACES_MM, over_surface
@@ -47,6 +47,7 @@ MAGNET_MM: Final = (150.0, 45.0)
 """Distance at which it begins and ends, and at which it stays, in [mm]."""
 MAGNET_COUNTS: Final = 900.0
 """Its largest count there, of any taxel and axis: half of that of the tap."""
+_REST_COUNTS: Final = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
 FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
@@ -88,7 +89,7 @@ def demo_recording() -> dict[str, NDArray]:
     magnet[MAGNET_FRAMES + MAGNET_ALONE_FRAMES :][:TAP_FRAMES] += later[2]
     rng = np.random.default_rng([SEED, 2])
     still = _noise(rng, REST_FRAMES).round()
-    rest = draw_rest(rng, USPA44).round()
+    rest = (_REST_COUNTS + rng.standard_normal(USPA44.scan_shape) * 300.0).astype(np.float32).round()
     magnet += _noise(rng, len(magnet))
     slid, way, letter = _slide(pad)
     after = _noise(rng, STILL_FRAMES).round()

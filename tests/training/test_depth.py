@@ -4,7 +4,7 @@ import trimesh
 from scipy.spatial import Delaunay
 
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
-from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, SURFACES, surface_mesh
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, SURFACES, relief, surface_mesh
 
 SIZE, CELL_MM = 42, 0.47
 CENTRE = Pose(0, 0, 0)
@@ -12,10 +12,6 @@ CENTRE = Pose(0, 0, 0)
 
 def along_mm(size=SIZE, cell_mm=CELL_MM):
     return (np.arange(size) - (size - 1) / 2) * cell_mm
-
-
-def relief(name):
-    return Relief(name, surface_mesh(name))
 
 
 def ball(radius_mm):

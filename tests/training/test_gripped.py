@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.pad_geometry import USPA44
+from train.families.catalogue import heights_of
 from train.families.shape import NOWHERE_MM
 from train.physics.contact import BARE, Cover
 from train.physics.elastic_layer import surface_compliance
@@ -14,7 +15,6 @@ from train.physics.gripped import (
     FRAMES,
     MAX_INDENTATION_MM,
     MOST_FORCE_N,
-    SAMPLES,
     SCALE,
     TRACTION_SCALE,
     GrippedPad,
@@ -22,8 +22,7 @@ from train.physics.gripped import (
 )
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample, resample_touching
-from train.surfaces.depth_image import Pose, Relief, depth_image
-from train.surfaces.named_surfaces import surface_mesh
+from train.surfaces.depth_image import Pose
 
 PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
 
@@ -36,8 +35,7 @@ def pad():
 def figure(pad, name="C", pose=None):
     """Heights of a figure under the pad, (1, m, m) in [mm]."""
     pose = Pose(0.5, -0.5, 20.0) if pose is None else pose
-    relief = Relief(name, surface_mesh(name))
-    return -depth_image(relief, pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)[None]
+    return heights_of(name, pose, pad)[None]
 
 
 def face(pad, slope=0.0):

@@ -162,7 +162,7 @@ def press_shapes(
         [one.cover for one in tapped for _ in range(taps)],
         scale=scale,
     )
-    newest = slice(0, None, taps)
+    newest = {name: getattr(done, name)[::taps] for name in ("touching", "force_n", "twist_nmm", "indentation_mm")}
     return PressSet(
         family=family,
         pad=np.full(n, number, dtype=np.int64),
@@ -170,10 +170,7 @@ def press_shapes(
         counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
         angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),
         poses=np.array([one.poses for one in tapped], dtype=np.float32),
-        patterns=done.patterns[newest].astype(np.float16),
-        touching=done.touching[newest],
-        traction_kpa=done.traction_kpa[newest].astype(np.float16),
-        force_n=done.force_n[newest],
-        twist_nmm=done.twist_nmm[newest],
-        indentation_mm=done.indentation_mm[newest],
+        patterns=done.patterns[::taps].astype(np.float16),
+        traction_kpa=done.traction_kpa[::taps].astype(np.float16),
+        **newest,
     )

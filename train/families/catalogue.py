@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -12,9 +11,9 @@ from train.errors import MeshError, SurfaceError
 from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
 from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.depth_image import Pose, Relief, depth_image
+from train.surfaces.depth_image import Pose, depth_image
 from train.surfaces.meshes import MESH
-from train.surfaces.named_surfaces import SURFACES, surface_mesh
+from train.surfaces.named_surfaces import SURFACES, relief
 from train.surfaces.poses import over_surface, random_poses
 
 FIGURES: Final = ("paper", "glyph", "polygon")
@@ -158,9 +157,4 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
 
 def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
     """Return the heights (m, m) of a surface at the places of a pad at a pose over it."""
-    return -depth_image(_relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
-
-
-@lru_cache(maxsize=64)
-def _relief(name: str) -> Relief:
-    return Relief(name, surface_mesh(name))
+    return -depth_image(relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)

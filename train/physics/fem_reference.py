@@ -31,8 +31,8 @@ from firmware_bridge.extras import how_to_install
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
-from train.surfaces.depth_image import Pose, Relief, depth_image
-from train.surfaces.named_surfaces import surface_mesh
+from train.surfaces.depth_image import Pose, depth_image
+from train.surfaces.named_surfaces import relief
 
 try:
     import felupe
@@ -91,7 +91,7 @@ def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floatin
         "edition": _EDITION,
         "surface": surface,
         "mesh": mesh,
-        "pose": asdict(CENTRE),
+        "pose": CENTRE._asdict(),
         "indentation_mm": np.round(indentation_mm, 6).tolist(),
         "layer": asdict(LAYER),
         "c2_share": C2_SHARE,
@@ -109,11 +109,6 @@ def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floatin
         unfinished.rename(path)
     with np.load(path, allow_pickle=False) as kept:
         return Verdict(*(kept[name].astype(np.float32) for name in ("patterns_mm", "force_n", "run_s")))
-
-
-def relief(surface: str) -> Relief:
-    """Return a named surface as a relief."""
-    return Relief(surface, surface_mesh(surface))
 
 
 class FemPresses(NamedTuple):

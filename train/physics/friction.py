@@ -11,7 +11,6 @@ pressure alone spreads the surface, and the effect of traction on pressure is le
 layer of nu = .5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -24,18 +23,6 @@ from train.physics.pad_grid import PadGrid
 _MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
 """Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
-
-
-@dataclass(frozen=True, slots=True)
-class FrictionResult:
-    """Tractions on the pad to the right and back, (n, 2, size, size), in [MPa].
-
-    `residual` is the root mean square error (n,) over the contact of the movement, which should vanish where cells
-    stick, and oppose the traction where they slip, as a share of the surface's movement.
-    """
-
-    traction_mpa: NDArray[np.float32]
-    residual: NDArray[np.float32]
 
 
 class FrictionSolver:
@@ -64,10 +51,13 @@ class FrictionSolver:
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
         tolerance: float = 1e-3,
-    ) -> FrictionResult:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Slide (n, 2) surfaces to the right and back, and turn them (n,) about the pad's centre from right to back.
 
         They touch with pressures (n, size, size), where these are above 0, and have coefficients of friction mu (n,).
+        Returned are tractions on the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the
+        RMS error over the contact of the movement, which should vanish where cells stick, and oppose the traction where
+        they slip, as a share of the surface's movement.
         """
         count = len(pressure_mpa)
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
@@ -88,7 +78,7 @@ class FrictionSolver:
             for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
                 part[place] = found[:, axis].numpy()
             residual[poses] = error.numpy()
-        return FrictionResult(traction_mpa, residual)
+        return traction_mpa, residual
 
     def _projected_gradients(
         self, limit: torch.Tensor, moved: torch.Tensor, tolerance: float

@@ -133,7 +133,7 @@ class GrippedPad:
             pressure[which], depth[which] = self._pressed(cover, cells_mm[which], share[which], depth[which])
         pressed_mm = depth.astype(np.float32)
         on_pad_mpa = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
-        sideways_mpa = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction).traction_mpa
+        sideways_mpa, _ = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction)
         loads = np.concatenate([sideways_mpa, on_pad_mpa[:, None]], axis=1)
         across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
         moments = loads[:, 1] * across[None, :] - loads[:, 0] * across[:, None]

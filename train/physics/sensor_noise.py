@@ -17,7 +17,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.surfaces.depth_image import Pose
 
@@ -158,12 +158,6 @@ def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nui
     off = _cut_normal(rng, (len(poses), 3))
     off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
     return [Pose(*true) for true in (np.array(poses) + off).tolist()]
-
-
-def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """Draw the rest level of one sensor, (3, rows, cols) in raw counts, different for each axis and taxel."""
-    level = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
-    return (level + rng.standard_normal(geometry.scan_shape) * 300.0).astype(np.float32)
 
 
 def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ slits and slivers finer than half a millimetre, is left out.
 Source: Wu and Liu 2024, Fig. 1c (two plates of nine surfaces).
 """
 
+from functools import lru_cache
 from math import cos, pi, radians, sin
 from typing import Final, Literal, cast
 
@@ -19,6 +20,7 @@ from shapely import LinearRing, LineString, Polygon, affinity, set_precision, un
 from shapely.geometry.base import BaseGeometry
 
 from train.errors import SurfaceError
+from train.surfaces.depth_image import Relief
 from train.surfaces.meshes import MESH, load_mesh, mesh_file
 
 PLATE_MM: Final = 20.0
@@ -82,6 +84,12 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
     plate = trimesh.creation.box([PLATE_MM, PLATE_MM, _PLATE_THICKNESS_MM])
     plate.apply_translation([0, 0, -FIGURE_HEIGHT_MM - _PLATE_THICKNESS_MM / 2])
     return cast(trimesh.Trimesh, trimesh.util.concatenate([*raised, plate]))
+
+
+@lru_cache(maxsize=64)
+def relief(name: str) -> Relief:
+    """Return a surface of `surface_mesh` to be drawn from above."""
+    return Relief(name, surface_mesh(name))
 
 
 def figure(name: str) -> BaseGeometry:

@@ -21,12 +21,12 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, Verdict, press_or_recall, relief
+from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, Verdict, press_or_recall
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
 from train.surfaces.depth_image import depth_image
-from train.surfaces.named_surfaces import LETTERS
+from train.surfaces.named_surfaces import LETTERS, relief
 
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)
