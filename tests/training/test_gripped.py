@@ -170,14 +170,6 @@ def test_a_press_that_takes_too_much_force_goes_less_deep():
     assert light.indentation_mm[0] == pytest.approx(0.1) and light.force_n[0, 2] < MOST_FORCE_N
 
 
-@pytest.mark.parametrize("depth_mm", [0.0, -0.1, 0.51, float("nan")])
-def test_a_press_beyond_what_is_linear_is_refused(pad, depth_mm):
-    with pytest.raises(PressError, match=f"indentation of {depth_mm:g} mm, expected above 0 to 0.5 mm"):
-        pad.press(
-            face(pad).repeat(2, 0), np.array([0.2, depth_mm]), np.zeros((2, 2)), np.zeros(2), np.ones(2), [BARE] * 2
-        )
-
-
 def test_nothing_under_the_pad_is_refused(pad):
     with pytest.raises(PressError, match="nothing lies under the pad"):
         press(pad, np.full_like(face(pad), NOWHERE_MM))

@@ -48,12 +48,6 @@ def test_the_plateau_is_each_taps_own_indentation_and_around_it_is_the_response(
     assert not patterns[3].any(), "nothing touches"
 
 
-@pytest.mark.parametrize("beta_mm", [0.0, float("nan")])
-def test_a_reach_that_is_no_length_is_refused(beta_mm):
-    with pytest.raises(ValueError, match="positive length"):
-        tpsf_pattern(np.ones((1, 4, 4), dtype=bool), np.ones(1), PIXEL_MM, beta_mm)
-
-
 def test_the_default_kernel_is_the_layers():
     reliefs = [relief(name) for name in SURFACES]
     poses = random_poses(np.random.default_rng(0), 36)

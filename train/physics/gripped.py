@@ -45,7 +45,7 @@ _Kind = TypeVar("_Kind", bound=np.generic)
 
 
 class PressError(TrainError, ValueError):
-    """Press outside the range in which the pad's layer is linear."""
+    """Press onto nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class GrippedPad:
 
         Args:
             heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
-            indentation_mm: (n,), of the highest part from first contact, above 0, in [mm].
+            indentation_mm: (n,), of the highest part from first contact, above 0 to MAX_INDENTATION_MM.
             slide_mm: (n, 2), movement of the shape to the right and down the rows after contact, in [mm].
             twist_rad: (n,), turn about the pad's centre from x towards y.
             friction: (n,), Coulomb's coefficient.
@@ -118,14 +118,8 @@ class GrippedPad:
             scale: pattern pixels per taxel pitch.
 
         Raises:
-            PressError: an indentation is outside the layer's linear range, or nothing lies under the pad.
+            PressError: nothing lies under the pad.
         """
-        within = (indentation_mm > 0) & (indentation_mm <= MAX_INDENTATION_MM)
-        if not within.all():
-            raise PressError(
-                f"indentation of {indentation_mm[~within][0]:g} mm, expected above 0 to {MAX_INDENTATION_MM} mm: "
-                "beyond a tenth of its thickness the pad is not linear; press less deep"
-            )
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
         pressure = np.zeros(cells_mm.shape, dtype=np.float32)

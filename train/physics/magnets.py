@@ -30,15 +30,6 @@ class Magnet:
     height_mm: float = 2.5  # of the magnet's centre above the board
     chip_height_mm: float = 0.5  # of the sensitive spot above the board, under the magnet's centre
 
-    def __post_init__(self) -> None:
-        if not (self.diameter_mm > 0 and self.thickness_mm > 0 and self.remanence_t > 0):
-            raise ValueError(f"diameter, thickness and remanence must be positive, got {self}")
-        if not self.clearance_mm > 0:
-            raise ValueError(
-                f"the magnet touches its chip: height {self.height_mm} mm less half its thickness "
-                f"is not above the chip at {self.chip_height_mm} mm"
-            )
-
     @property
     def gap_mm(self) -> float:
         """Distance from the magnet's centre to the chip at rest, in [mm]."""

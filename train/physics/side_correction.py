@@ -36,10 +36,6 @@ class FreeSides:
 
     amplitude: float = 1.0
 
-    def __post_init__(self) -> None:
-        if not self.amplitude >= 0:
-            raise ValueError(f"amplitude is {self.amplitude}, expected 0 or more: below 0 a pad could push back")
-
     def profiles(self, layer: Layer, cells_mm: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return shares of the added compliance across and along a pair of sides, for cells (size,) from the centre.
 

@@ -40,11 +40,6 @@ class Skin:
 
     def __init__(self, pad: Pad, size: int, cell_mm: float) -> None:
         geometry, layer, magnet = pad.geometry(), pad.layer, pad.magnet
-        if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
-            raise ValueError(
-                f"a magnet {magnet.thickness_mm} mm thick at {magnet.height_mm} mm does not fit into a layer of "
-                f"{layer.thickness_mm} mm"
-            )
         self._grid = (geometry, layer, size, cell_mm, magnet)
         taxels = geometry.taxel_count
         self._magnets = MagnetArray(geometry, magnet, pad.rest(taxels), pad.moments(taxels))
