@@ -36,7 +36,7 @@ _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
 
 
-def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
+def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
     Raises:
@@ -67,7 +67,7 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
     if not any(len(part) for part in parts):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
     made = replace(join_presses(parts), config=facts)
-    made.save(path, compressed=compressed)
+    made.save(path)
     shutil.rmtree(folder)
     return made
 
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
         with _quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
-            made = make_presses(world, options.out, options.jobs, compressed=options.compress)
+            made = make_presses(world, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
         return 1
@@ -166,7 +166,6 @@ def _parser() -> argparse.ArgumentParser:
     models = ", ".join(pad.name for pad in PADS)
     add("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
     add("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
-    add("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser
 
 
