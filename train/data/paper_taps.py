@@ -1,8 +1,7 @@
 """The paper's protocol in the simulated world: its figures, whole taps from first contact to full force, one pad.
 
 A sequence is K taps of one figure by the nominal pad, each turned by a step from the one before; the newest is the
-target. Every figure has 36: nine places and four turns, of which one place is for validation and one for the test.
-Each tap has FRAMES frames, so that readings and truth are available at any lower force: frame i lies at
+target. Each tap has FRAMES frames, so that readings and truth are available at any lower force: frame i lies at
 (i + 1) / FRAMES of the press, readings at 0 are zero, and values between frames are interpolated linearly.
 
 Networks of the paper are trained on presses of the same pad and schedule:

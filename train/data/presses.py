@@ -117,7 +117,7 @@ class PressSet:
 
     def only_turned(self) -> "PressSet":
         """Return the sequences whose taps are all at one place, as the paper's schedule turns the pad."""
-        return self.pick(np.flatnonzero(~self.poses[..., :2].any(axis=(1, 2))))
+        return self.pick(~self.poses[..., :2].any(axis=(1, 2)))
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""
@@ -170,7 +170,9 @@ def load_presses(path: Path) -> PressSet:
         facts: Any = json.loads(str(about["facts"]))
         names = [name for name in _AXES if name != "poses" or int(about["version"]) > _NO_POSES]
         arrays = dict(read_npz(path, names, _MOST_BYTES))
-        arrays.setdefault("poses", _turned(arrays["angle_deg"]))
+        if "poses" not in arrays:
+            turns_deg = arrays["angle_deg"][:, :1] - arrays["angle_deg"]
+            arrays["poses"] = np.stack([*np.zeros((2, *turns_deg.shape), np.float32), turns_deg], axis=2)
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
         check_axes(_AXES, arrays)
@@ -185,13 +187,6 @@ def load_presses(path: Path) -> PressSet:
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded
-
-
-def _turned(angle_deg: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the poses (n, K, 3) of taps at one place, turned by angles (n, K) as seen from above."""
-    poses = np.zeros((*angle_deg.shape, 3), dtype=np.float32)
-    poses[..., 2] = angle_deg[:, :1] - angle_deg
-    return poses
 
 
 def join_presses(parts: Sequence[PressSet]) -> PressSet:

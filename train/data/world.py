@@ -91,16 +91,11 @@ class World:
             del facts["scale"]  # what was made before there was a choice keeps its name
         if self.pad == USPA44.name:
             del facts["pad"]
-        meshes = {name: _mesh_sha256(name) for name in self.families if name.startswith(MESH)}
-        return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
-
-
-def _mesh_sha256(name: str) -> str:
-    """Return the hash of a user's file, because the content under a name may change."""
-    try:
-        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
-    except OSError as error:
-        raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
+        meshes = [name for name in self.families if name.startswith(MESH)]
+        if meshes:  # the content under a name may change
+            hashes = {name: hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest() for name in meshes}
+            facts |= {"meshes": hashes, "most_draws": MOST_DRAWS}
+        return facts
 
 
 @one_thread()

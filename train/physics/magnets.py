@@ -83,13 +83,13 @@ class MagnetArray:
         geometry: SensorGeometry,
         magnet: Magnet,
         rest: NDArray[np.floating] | None = None,
-        moments: NDArray[np.floating] | None = None,
+        moments: NDArray[np.floating] | float = 1.0,
     ) -> None:
         self.magnet = magnet
         self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm
         nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)))
         self._rest = (nowhere if rest is None else rest).astype(np.float32)
-        self._moments = None if moments is None else moments.astype(np.float32)
+        self._moments = np.asarray(moments, dtype=np.float32)
         self._check_clear(magnet.clearance_mm - float(self._rest[:, _DOWN].max()))
         centres_mm = geometry.taxel_centres_mm().T
         # (2, chips, magnets): from each magnet to each chip, at rest.
@@ -121,6 +121,4 @@ class MagnetArray:
         gap_mm = down.dtype.type(self.magnet.gap_mm)
         away_mm = (self._apart_mm[0] - right, self._apart_mm[1] - back, down - gap_mm)
         flux = dipole_mt(self.magnet, away_mm, (lean_x * upright, lean_y * upright, upright))
-        if self._moments is not None:
-            flux = tuple(part * self._moments for part in flux)
-        return np.stack([part.sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)
+        return np.stack([(part * self._moments).sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)
