@@ -15,6 +15,7 @@ from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
+from train.physics.sensor_noise import log_uniform
 from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS, schedule_of
@@ -145,8 +146,7 @@ def press_shapes(
     depth_mm = depths_mm.ravel()
     dragged = rng.random(n * taps) > _STILL
     way = rng.uniform(0, 2 * np.pi, n * taps)
-    low, high = np.log(_SLIDE_MM)
-    far = np.exp(rng.uniform(low, high, n * taps)) * dragged
+    far = log_uniform(rng, *_SLIDE_MM, (n * taps,)) * dragged
     twist = rng.normal(0, _TWIST_RAD, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
     done = gripped.press(
         np.concatenate([one.heights_mm for one in tapped]),

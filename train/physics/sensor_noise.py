@@ -106,8 +106,8 @@ def apply_nuisances(
     if nuisances.hysteresis:
         rng = stream("hysteresis")
         lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
-        lag[1] = _log_uniform(rng, *_RELAXATION_S, (n,))
-    duration_s = _log_uniform(stream("tap_s"), *TAP_S, (n, taps)) if tap_s is None else np.asarray(tap_s)
+        lag[1] = log_uniform(rng, *_RELAXATION_S, (n,))
+    duration_s = log_uniform(stream("tap_s"), *TAP_S, (n, taps)) if tap_s is None else np.asarray(tap_s)
     weights = frame_weights(frame, frames, np.broadcast_to(duration_s, (n, taps)) / frames, *lag)
     flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
     counts = (weights @ flat).reshape(n, taps, -1, *scan)
@@ -202,7 +202,8 @@ def frame_weights(
     return np.diff(ramp, n=2).astype(np.float32)
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Draw numbers whose logarithms are uniform."""
     return np.exp(rng.uniform(np.log(low), np.log(high), shape))
 
 
