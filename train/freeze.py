@@ -67,7 +67,7 @@ def freeze(
         earlier=readings[:, 1:, -1].astype(np.int16),
         tap=np.repeat(index, FRAMES).astype(np.int16),
         indentation_mm=(flat.indentation_mm[:, 0, -1:] * moments).ravel().astype(np.float32),
-        force_n=flat.force_at(index, moments).ravel().astype(np.float32),
+        force_n=(flat.force_n[:, 0, -1:] * moments).ravel().astype(np.float32),
         unit_patterns=flat.unit_patterns.astype(np.float16),
         touched=flat.touching,
         surface=flat.surfaces,

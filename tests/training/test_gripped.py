@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_bridge.pad_geometry import USPA44
+from train.errors import SurfaceError
 from train.families.catalogue import heights_of
 from train.families.shape import NOWHERE_MM
 from train.physics.contact import BARE, Cover
@@ -18,7 +19,6 @@ from train.physics.gripped import (
     SCALE,
     TRACTION_SCALE,
     GrippedPad,
-    PressError,
 )
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample, resample_touching
@@ -171,7 +171,7 @@ def test_a_press_that_takes_too_much_force_goes_less_deep():
 
 
 def test_nothing_under_the_pad_is_refused(pad):
-    with pytest.raises(PressError, match="nothing lies under the pad"):
+    with pytest.raises(SurfaceError, match="nothing lies under the pad"):
         press(pad, np.full_like(face(pad), NOWHERE_MM))
 
 

@@ -27,7 +27,7 @@ from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
-from train.families.catalogue import FIGURES, SHARES
+from train.families.catalogue import SHARES
 from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
@@ -131,9 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _world(options: argparse.Namespace) -> World:
     families = dict(SHARES)
-    if options.families == "figures":
-        families = {name: SHARES[name] for name in FIGURES}
-    elif options.families == "even":
+    if options.families == "even":
         families = dict.fromkeys(SHARES, 1.0)
     elif options.families != "all":
         names = [name for name in options.families.split(",") if name != "none"]
@@ -156,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)")
     add("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     families = f"names with commas: {', '.join(SHARES)}, or of figures of the paper (all)"
-    add("--families", default="all", help=f"all; even (equally many of each); figures; none; or {families}")
+    add("--families", default="all", help=f"all; even (equally many of each); none; or {families}")
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)")
     add("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")

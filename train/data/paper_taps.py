@@ -79,10 +79,6 @@ class PaperTaps:
         """Return the shares (B, K) of presses at which they reach their set forces in [N]; 1 if a press ends before."""
         return np.minimum(np.asarray(force_n, dtype=np.float64) / self.force_n[index, :, -1], 1.0)
 
-    def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
-        return self.force_n[index, 0, -1:] * share
-
     def patterns_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
         depth_mm = (self.indentation_mm[index, 0, -1] * share).astype(np.float32)

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from train.errors import TrainError
+from train.errors import SurfaceError
 from train.physics.contact import BARE, REACH, ContactSolver, Cover
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
@@ -42,10 +42,6 @@ _STEEP: Final = 2.0
 """Depth in indentations from which a shape counts as steep: its edge then follows from the pressure alone."""
 
 _Kind = TypeVar("_Kind", bound=np.generic)
-
-
-class PressError(TrainError, ValueError):
-    """Press onto nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +114,7 @@ class GrippedPad:
             scale: pattern pixels per taxel pitch.
 
         Raises:
-            PressError: nothing lies under the pad.
+            SurfaceError: nothing lies under the pad.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
@@ -175,12 +171,12 @@ class GrippedPad:
         """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
 
         Raises:
-            PressError: nothing lies under the pad.
+            SurfaceError: nothing lies under the pad.
         """
         if self._beside.any():
             heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)
         if not (heights_mm.max(axis=(1, 2)) > -100).all():
-            raise PressError("nothing lies under the pad: expected a shape that reaches it")
+            raise SurfaceError("nothing lies under the pad: expected a shape that reaches it")
         depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm + self._uneven_mm
         depth_mm -= depth_mm.min(axis=(1, 2), keepdims=True)
         parts_mm, share = _carrying(depth_mm, self.size)

@@ -115,15 +115,8 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 """Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each."""
 
-INPUTS: Final = (
-    "thickness_mm",
-    "shear_modulus_mpa",
-    "poisson",
-    "in_plane_share",
-    "magnet_height_mm",
-    "counts_per_newton",
-)
-"""Constants that a network takes as optional inputs."""
+INPUTS: Final = tuple(RANGES)[:6]
+"""Constants that a network takes as optional inputs: all but the pitch and the free sides."""
 
 KNOWN: Final = 2 * len(INPUTS) + 1
 """Number of pad inputs of a network: values, a flag for each of them, and the certainty of the gains."""

@@ -74,7 +74,7 @@ def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisan
     whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), sequences.scale)
     return Scans(
         windows=np.concatenate([newest[:, None], np.broadcast_to(earlier, (len(newest), *earlier.shape))], axis=1),
-        force_n=sequences.force_at(index, share)[0],
+        force_n=sequences.force_n[number, 0, -1] * share[0],
         volume_mm3=whole_mm3 * course.share,  # flat contacts: in proportion to the indentation
     )
 
