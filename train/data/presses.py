@@ -117,7 +117,7 @@ class PressSet:
 
     def only_turned(self) -> "PressSet":
         """Return the sequences whose taps are all at one place, as the paper's schedule turns the pad."""
-        return self.pick(~self.poses[..., :2].any(axis=(1, 2)))
+        return self.pick(np.flatnonzero(~self.poses[..., :2].any(axis=(1, 2))))
 
     def sha256(self) -> str:
         """Return the hash over all data and the configuration, independent of the file."""

@@ -29,7 +29,7 @@ class FrictionSolver:
     """Solver of poses on a square grid over one pad, with the arguments of `train.physics.contact.ContactSolver`."""
 
     def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
-        def compliance(q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
+        def compliance(q_x: NDArray[np.floating], q_y: NDArray[np.floating]) -> NDArray[np.float64]:
             xx, yy, xy = surface_tensor(layer, q_x, q_y)
             # The highest wave is its own mirror image, so an odd transfer is zero there.
             xy[len(xy) // 2] = xy[:, -1] = 0.0

@@ -226,7 +226,8 @@ class GrippedPad:
         pixels = 2 * self._pattern_cells
         rim = self.size - self._pattern_cells
         middle = (slice(None), slice(rim, rim + pixels), slice(rim, rim + pixels))
-        fine_mm, fine_share = (part[middle] for part in _carrying(depth_mm, 2 * self.size))
+        fine_mm, fine_share = _carrying(depth_mm, 2 * self.size)
+        fine_mm, fine_share = fine_mm[middle], fine_share[middle]
         indented_mm = pressed_mm[:, None, None]
         close_mm = np.empty_like(pressure_mpa)
         for cover, which in _which_of(covers):
