@@ -81,24 +81,6 @@ class TestLayer:
             if height_mm == 0:
                 assert np.allclose([inside.along, inside.across, inside.sunk], 0, atol=1e-9 * along[0])
 
-    def test_inside_obeys_equilibrium(self):
-        layer, q, step = Layer(poisson=0.45), np.array([0.5]), 1e-3
-        u, across, down = np.array(
-            [
-                [part[0] for part in (field.along, field.across, field.sunk)]
-                for field in (inner_tangential(layer, q, 2.0 + shift) for shift in (-step, 0.0, step))
-            ]
-        ).T
-        # u_x = u, u_z = -i down times exp(i q x): Navier's equations along x and z, and across.
-        slope_u, slope_down = (u[2] - u[0]) / (2 * step), (down[2] - down[0]) / (2 * step)
-        bend_u, bend_down, bend_across = ((f[2] - 2 * f[1] + f[0]) / step**2 for f in (u, down, across))
-        stiff = 1 / (1 - 2 * layer.poisson)
-        along_x = bend_u - q[0] ** 2 * u[1] + stiff * q[0] * (slope_down - q[0] * u[1])
-        along_z = -bend_down + q[0] ** 2 * down[1] + stiff * (q[0] * slope_u - bend_down)
-        assert abs(along_x) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
-        assert abs(along_z) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
-        assert bend_across == pytest.approx(q[0] ** 2 * across[1], rel=1e-4)
-
 
 class TestFriction:
     def test_a_stuck_disc_on_a_thick_layer_is_as_stiff_as_mindlins(self, thick):
