@@ -31,10 +31,9 @@ from export.graphs.writing import Writer
 from export.quantisation.int8 import calibration_batch, convolutions, quantised
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
-from train.data.generation_config import SEED
 from train.data.paper_taps import paper_taps
 from train.data.press_batches import COUNTS_PER_UNIT
-from train.data.presses import PressSet, join_presses, load_presses
+from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets

@@ -17,21 +17,22 @@ from shapely.geometry.base import BaseGeometry
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from train.data.generation_config import SEED
 from train.data.paper_taps import between_frames, tap
-from train.families.catalogue import heights_of
+from train.data.presses import SEED
+from train.physics.contact import BARE
 from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL
 from train.physics.resample import resample
-from train.physics.sensor_noise import Nuisances, apply_nuisances, draw_rest, jitter_poses
+from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, figure
-from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, TEST_POSITION, over_surface, position_mm
+from train.surfaces.poses import ANGLE_STEP_DEG, HALF_PITCH_MM, PLACES_MM, over_surface
 
 SURFACE: Final = "glyph:1"
 """A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""
 FOREIGN: Final = "small circle"
+_PLACE_MM: Final = PLACES_MM["test"]
 ANGLE_DEG: Final = 30.0
 """Angle of the last scored tap; each tap before is a step back, each later one a step on."""
 TAPS: Final = 4
@@ -46,6 +47,7 @@ MAGNET_MM: Final = (150.0, 45.0)
 """Distance at which it begins and ends, and at which it stays, in [mm]."""
 MAGNET_COUNTS: Final = 900.0
 """Its largest count there, of any taxel and axis: half of that of the tap."""
+_REST_COUNTS: Final = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
 FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
@@ -78,15 +80,16 @@ def demo_recording() -> dict[str, NDArray]:
     """
     pad = GrippedPad(NOMINAL)
     angles_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1 - TAPS, 1)]
-    taps = _tap(pad, [SURFACE] * TAPS, angles_deg)
+    taps = tap(pad, [SURFACE] * TAPS, [Pose(*_PLACE_MM, angle) for angle in angles_deg], FORCE_N)
     pressed = _read(taps, angles_deg)
     later_deg = [ANGLE_DEG + step * ANGLE_STEP_DEG for step in range(1, TAPS + 1)]
-    later = _read(_tap(pad, [FOREIGN, SURFACE, SURFACE, SURFACE], later_deg), later_deg)
+    surfaces, poses = [FOREIGN, SURFACE, SURFACE, SURFACE], [Pose(*_PLACE_MM, angle) for angle in later_deg]
+    later = _read(tap(pad, surfaces, poses, FORCE_N), later_deg)
     magnet = _magnet()
     magnet[MAGNET_FRAMES + MAGNET_ALONE_FRAMES :][:TAP_FRAMES] += later[2]
     rng = np.random.default_rng([SEED, 2])
     still = _noise(rng, REST_FRAMES).round()
-    rest = draw_rest(rng, USPA44).round()
+    rest = (_REST_COUNTS + rng.standard_normal(USPA44.scan_shape) * 300.0).astype(np.float32).round()
     magnet += _noise(rng, len(magnet))
     slid, way, letter = _slide(pad)
     after = _noise(rng, STILL_FRAMES).round()
@@ -98,9 +101,9 @@ def demo_recording() -> dict[str, NDArray]:
     begins = np.cumsum([0, *lengths])
     scene[begins[-3] - GAP_FRAMES : begins[-3]] = -1
     end_mm = taps.indentation_mm[:, -1]
-    share, tap = np.zeros(len(counts)), np.zeros(len(counts), dtype=int)
+    share, number = np.zeros(len(counts)), np.zeros(len(counts), dtype=int)
     scored = slice(REST_FRAMES, REST_FRAMES + TAPS * TAP_FRAMES)
-    share[scored], tap[scored] = np.tile(_course(), TAPS), np.repeat(np.arange(TAPS), TAP_FRAMES)
+    share[scored], number[scored] = np.tile(_course(), TAPS), np.repeat(np.arange(TAPS), TAP_FRAMES)
     tapped = [_stated(0, 0, angles_deg[0] - angle) for angle in (*angles_deg, *later_deg[:3])]
     return {
         "format": np.array(NPZ_FORMAT),
@@ -110,8 +113,8 @@ def demo_recording() -> dict[str, NDArray]:
         "scan": np.arange(len(share)),
         "time_ns": (np.arange(len(share)) * 1e9 / RATE_HZ).astype(np.int64),
         "counts": counts.astype(np.int32),
-        "tap": np.where(share > 0, tap, -1),
-        "indentation_mm": (share * end_mm[tap]).astype(np.float32),
+        "tap": np.where(share > 0, number, -1),
+        "indentation_mm": (share * end_mm[number]).astype(np.float32),
         "unit_patterns": _unit_patterns(taps),
         "surface": np.array(SURFACE),
         "angles_deg": np.array(angles_deg),
@@ -152,10 +155,10 @@ def _poses(
 
 def _options(pad: GrippedPad, rest: NDArray[np.float32]) -> dict[str, NDArray]:
     """Return the taps that may be proposed; the pad is where the robot states, but for the usual error."""
-    first = Pose(*position_mm(TEST_POSITION), ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
+    first = Pose(*_PLACE_MM, ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
     wanted = [over_surface(first, float(x_mm), float(y_mm), 0.0) for x_mm, y_mm in OPTIONS_MM]
     poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted, Nuisances())
-    taps = tap(pad, SURFACE, poses, FORCE_N)
+    taps = tap(pad, [SURFACE] * len(poses), poses, FORCE_N)
     course = _course()[:-GAP_FRAMES]
     counts = between_frames(taps.counts, np.tile(course, (len(poses), 1)))
     tap_s = len(course) / RATE_HZ
@@ -222,20 +225,15 @@ def _pressed(
         if len(meets):
             turn = np.radians(place[start + meets, 2])
             drag = -_DRAG_MM * np.stack([np.cos(turn), -np.sin(turn)], axis=1)  # in the pad's axes
-            still, even = np.zeros(len(meets)), np.full(len(meets), friction)
-            counts[start + meets] = pad.press(heights[meets], deep_mm[start + meets], drag, still, even).counts
+            still, even, bare = np.zeros(len(meets)), np.full(len(meets), friction), [BARE] * len(meets)
+            pressed = pad.press(heights[meets], deep_mm[start + meets], drag, still, even, bare)
+            counts[start + meets] = pressed.counts
     return counts
 
 
 def _unit_patterns(taps: Taps) -> NDArray[np.float16]:
     """Return the truth per indentation, (n, H, W)."""
     return resample(taps.unit_patterns, FINE_SCALE, SCALE).astype(np.float16)
-
-
-def _tap(pad: GrippedPad, surfaces: list[str], angles_deg: Sequence[float]) -> Taps:
-    poses = [Pose(*position_mm(TEST_POSITION), angle) for angle in angles_deg]
-    heights = [heights_of(surface, pose, pad) for surface, pose in zip(surfaces, poses, strict=True)]
-    return pad.tap(np.stack(heights), FORCE_N)
 
 
 def _course() -> NDArray[np.float64]:

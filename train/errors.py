@@ -6,7 +6,7 @@ class TrainError(Exception):
 
 
 class SurfaceError(TrainError, ValueError):
-    """Unknown name of a surface."""
+    """Unknown name of a surface, or a surface that does not lie under the pad."""
 
 
 class MeshError(TrainError, ValueError):

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from train.data.frozen_presses import freeze_presses
-from train.data.generation_config import SEED
 from train.data.paper_taps import paper_taps
-from train.data.presses import PressSet, join_presses, load_presses
+from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network

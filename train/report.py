@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.bench.provenance import provenance
-from train.data.generation_config import SEED
+from train.data.presses import SEED
 
 Cell = str | int | float | None
 Row = dict[str, Cell]

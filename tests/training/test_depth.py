@@ -4,7 +4,7 @@ import trimesh
 from scipy.spatial import Delaunay
 
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
-from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, SURFACES, surface_mesh
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, SURFACES, relief, surface_mesh
 
 SIZE, CELL_MM = 42, 0.47
 CENTRE = Pose(0, 0, 0)
@@ -12,10 +12,6 @@ CENTRE = Pose(0, 0, 0)
 
 def along_mm(size=SIZE, cell_mm=CELL_MM):
     return (np.arange(size) - (size - 1) / 2) * cell_mm
-
-
-def relief(name):
-    return Relief(name, surface_mesh(name))
 
 
 def ball(radius_mm):
@@ -136,16 +132,3 @@ def test_a_letter_stands_upright_as_seen_through_the_pad():
     letter = image("F", CENTRE)
     assert letter[:20].sum() > letter[21:].sum()
     assert letter[:, :20].sum() > letter[:, 21:].sum()
-
-
-def test_moving_the_pad_right_moves_the_figure_left():
-    centre = np.argwhere(image("small circle", Pose(3, 0, 0))).mean(axis=0) - 20
-    assert centre == pytest.approx([0, -6], abs=0.1)
-    centre = np.argwhere(image("small circle", Pose(0, 3, 0))).mean(axis=0) - 20
-    assert centre == pytest.approx([6, 0], abs=0.1)  # up on the surface is towards lower rows, so it moves down
-
-
-def test_turning_the_pad_a_quarter_turns_the_figure_back():
-    upright, turned = image("L", CENTRE), image("L", Pose(0, 0, 90))
-    # Seen from above the pad turns counterclockwise, so the figure turns clockwise.
-    assert (np.rot90(upright, -1) == turned).mean() > 0.99

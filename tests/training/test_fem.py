@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
@@ -30,35 +31,9 @@ def test_nodes_lie_on_the_patterns_pixels_and_reach_the_rim(scale):
     assert np.diff(pad.nodes_mm).max() < 1.5 * pad.cell_mm
 
 
-def energy(rubber, gradient):
-    """Energy of the shape alone per volume, of gradients F (3, 3, ...)."""
-    right = np.einsum("ki...,kj...->ij...", gradient, gradient)
-    volume = np.linalg.det(np.moveaxis(gradient, (0, 1), (-2, -1)))
-    i1 = np.einsum("ii...->...", right)
-    i2 = (i1**2 - np.einsum("ij...,ij...->...", right, right)) / 2
-    return rubber.c1_mpa * (i1 * volume ** (-2 / 3) - 3) + rubber.c2_mpa * (i2 * volume ** (-4 / 3) - 3)
-
-
-def slope(function, gradient, step=1e-6):
-    """Central differences of function(F) by F, the tensor's axes last but one before the points."""
-    pieces = []
-    for k in range(9):
-        nudge = np.zeros((3, 3, 1))
-        nudge[k // 3, k % 3] = step
-        pieces.append((function(gradient + nudge) - function(gradient - nudge)) / (2 * step))
-    return np.moveaxis(np.stack(pieces), 0, -2).reshape(*pieces[0].shape[:-1], 3, 3, -1)
-
-
-@pytest.mark.parametrize("rubber", [MooneyRivlin(0.05, 0.02, 6.0), MooneyRivlin(0.0, 0.06, 6.0)])
-def test_stress_is_the_slope_of_the_energy_and_stiffness_that_of_the_stress(rubber):
-    gradient = np.eye(3)[:, :, None] + 0.3 * np.random.default_rng(0).uniform(-1, 1, (3, 3, 5))
-    assert np.allclose(rubber.stress(gradient), slope(lambda given: energy(rubber, given), gradient), atol=1e-9)
-    assert np.allclose(rubber.stiffness(gradient), slope(rubber.stress, gradient), atol=1e-8)
-
-
 def test_the_rubber_is_the_layer_at_small_strain():
     rubber = MooneyRivlin.of_layer(Layer(shear_modulus_mpa=0.12, poisson=0.49))
-    stiffness = rubber.stiffness(np.eye(3))
+    stiffness = torch.func.hessian(rubber.energy)(torch.eye(3, dtype=torch.float64))
     assert [stiffness[0, 1, 0, 1], stiffness[0, 1, 1, 0]] == pytest.approx([0.12, 0.12])
     assert stiffness[0, 0, 0, 0] == pytest.approx(4 / 3 * 0.12)
     assert rubber.bulk_mpa / 0.12 == pytest.approx(49.67, abs=0.01)
@@ -74,7 +49,9 @@ def test_a_plate_on_a_thin_slab_presses_as_in_closed_form_at_large_strain():
     middle = pad.size // 2
 
     def stored(stretch):
-        return energy(rubber, np.diag([1, 1, stretch])) + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
+        first, second = 2 + stretch**2, 1 + 2 * stretch**2
+        shape = rubber.c1_mpa * first * stretch ** (-2 / 3) + rubber.c2_mpa * second * stretch ** (-4 / 3)
+        return shape + rubber.bulk_mpa / 2 * (stretch - 1) ** 2
 
     for step_mm, push_n in zip(steps_mm, presses.push_n, strict=True):
         stretch = 1 - step_mm

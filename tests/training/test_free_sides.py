@@ -94,8 +94,3 @@ def test_magnets_go_outwards_and_mirror_each_other():
     assert np.allclose(moved[:, [0, 2, 3]], turned[:, [1, 2, 4]])
     one = moved[7, 0, 30, 40]  # the second row's last magnet, a load below it to the right
     assert one > moved[7, 0, 41, 40] > 0
-
-
-def test_a_negative_amplitude_is_refused():
-    with pytest.raises(ValueError, match=r"amplitude is -0\.1, expected 0 or more"):
-        FreeSides(-0.1)

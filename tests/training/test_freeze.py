@@ -11,15 +11,14 @@ from edge.evaluation.metrics import judge
 from edge.inference.bundled import BUNDLE_DIR
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
-from train.data.contact_kinds import KINDS, fit_kinds
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, paper_taps
+from train.data.presses import SEED
 from train.data.world import World, solve_pad
 from train.demo import demo_recording
-from train.freeze import TEST_FORCE_N, drawn, fit_classical, fit_taxels, freeze, main
+from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
-from train.physics.sensor_noise import Nuisances
-from train.surfaces.poses import HALF_PITCH_MM
+from train.physics.sensor_noise import NAMES, Nuisances
+from train.surfaces.poses import HALF_PITCH_MM, PLACES_MM
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +33,13 @@ def figures_alone(count: int) -> World:
 @pytest.fixture(scope="module")
 def frozen(sequences):
     return freeze(sequences, Nuisances(), SEED)
+
+
+def test_sequences_are_the_papers_targets_each_tap_turned_back_one_more_step(sequences):
+    assert sequences.surfaces.tolist() == ["O"] * 4 + ["small circle"] * 4
+    turns_deg = [[newest, newest - 5, newest - 10] for newest in (0, 30, 60, 90)] * 2
+    assert sequences.poses[..., 2] == pytest.approx(np.array(turns_deg), abs=2.01)
+    assert sequences.poses[..., :2] == pytest.approx(np.full((8, 3, 2), PLACES_MM["test"]), abs=0.401)
 
 
 def test_frames_rise_to_the_set_force_and_share_their_earlier_taps(frozen):
@@ -63,9 +69,8 @@ def test_one_seed_freezes_the_same_and_another_reads_by_other_sensors(sequences,
 
 def test_frames_of_a_tap_are_read_by_one_sensor(sequences):
     """Gains stay from frame to frame: without other nuisances each taxel's readings are in one proportion."""
-    clean, gained = (
-        freeze(sequences, n, SEED) for n in (Nuisances.none(), replace(Nuisances.none(), gain_spread=0.075))
-    )
+    quiet = Nuisances().without(*NAMES)
+    clean, gained = (freeze(sequences, n, SEED) for n in (quiet, replace(quiet, gain_spread=0.075)))
     strong = np.abs(clean.newest[:FRAMES]).min(axis=0) > 100
     ratio = gained.newest[:FRAMES, strong] / clean.newest[:FRAMES, strong]
     assert np.abs(ratio - ratio.mean(axis=0)).max() < 0.02 and ratio.mean(axis=0).std() > 0.03

@@ -14,32 +14,21 @@ def box(extents=BOX_MM, at=(20.0, -7.0, 11.0)):
 
 
 def ascii_stl(mesh, name="part"):
-    lines = [f"solid {name}"]
-    for normal, corners in zip(mesh.face_normals, mesh.triangles, strict=True):
-        lines += ["facet normal {} {} {}".format(*normal), "outer loop"]
-        lines += ["vertex {!r} {!r} {!r}".format(*map(float, corner)) for corner in corners]
-        lines += ["endloop", "endfacet"]
-    return "\n".join([*lines, f"endsolid {name}", ""]).encode("latin-1")
+    return mesh.export(file_type="stl_ascii").replace("solid ", f"solid {name}").encode("latin-1")
 
 
 def binary_stl(triangles):
-    """80 bytes of header, a count, and 50 bytes a triangle: normal, three corners, two spare bytes."""
-    record = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
-    record["corners"] = triangles
-    return bytes(80) + np.uint32(len(triangles)).tobytes() + record.tobytes()
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    return trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False).export(file_type="stl")
 
 
 def obj(mesh, head=""):
-    corners = "".join("v {!r} {!r} {!r}\n".format(*map(float, corner)) for corner in mesh.vertices)
-    return (head + corners + "".join("f {} {} {}\n".format(*(face + 1)) for face in mesh.faces)).encode("latin-1")
+    return (head + mesh.export(file_type="obj", header=None)).encode("latin-1")
 
 
 def ply(mesh, comment=""):
-    head = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex {len(mesh.vertices)}\n"
-    head += "property double x\nproperty double y\nproperty double z\n"
-    head += f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    body = "".join("{!r} {!r} {!r}\n".format(*map(float, corner)) for corner in mesh.vertices)
-    return (head + body + "".join("3 {} {} {}\n".format(*face) for face in mesh.faces)).encode("latin-1")
+    head, _, body = mesh.export(file_type="ply", encoding="ascii").partition(b"element vertex")
+    return head + f"comment {comment}\nelement vertex".encode("latin-1") + body
 
 
 FILES = {
@@ -181,7 +170,7 @@ def test_bytes_changed_at_random_never_raise_anything_else(tmp_path, name):
 def test_points_are_no_mesh(tmp_path):
     cloud = box()
     cloud.update_faces(np.zeros(12, dtype=bool))
-    for name, content in (("cloud.ply", ply(cloud)), ("cloud.obj", obj(cloud))):
+    for name, content in (("cloud.ply", ply(trimesh.PointCloud(cloud.vertices))), ("cloud.obj", obj(cloud))):
         refused(saved(tmp_path, name, content), "8 points but no triangles")
 
 

@@ -14,10 +14,10 @@ from firmware_bridge.pad_geometry import USPA44, USPA46
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.zeroing.baseline import Baseline
 from train.data.frozen_presses import freeze_presses
+from train.data.paper_taps import tap
 from train.data.presses import PressSet, join_presses
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.families.catalogue import heights_of
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
@@ -105,7 +105,7 @@ def test_a_model_of_one_pad_is_refused_by_the_other(model):
 def test_nothing_touches_beyond_the_pad_and_a_half_turn_is_a_half_turn():
     pad = GrippedPad(replace(NOMINAL, model="uSPa46"))
     poses = (Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 180.0))
-    taps = pad.tap(np.stack([heights_of("large square", pose, pad) for pose in poses]), 2.0)
+    taps = tap(pad, ["large square"] * 2, poses, 2.0)
     assert taps.unit_patterns.shape == (2, 80, 120) and taps.counts.shape[2:] == (3, 4, 6)
     once, turned = taps.counts[:, -1]
     signs = np.array([-1, -1, 1])[:, None, None]

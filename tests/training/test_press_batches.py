@@ -10,9 +10,9 @@ from press_samples import make_press_set
 from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
 from train.data.press_batches import COUNTS_PER_UNIT, Batch, PressBatches, read_presses
 from train.physics.pad_draws import INPUTS
-from train.physics.sensor_noise import Nuisances
+from train.physics.sensor_noise import NAMES, Nuisances
 
-QUIET = Nuisances.none()
+QUIET = Nuisances().without(*NAMES)
 GAINS_ALONE = replace(QUIET, gain_spread=0.1)
 
 

@@ -6,7 +6,18 @@ import pytest
 from train.data.presses import PressSet, load_presses
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.surfaces.poses import HALF_PITCH_MM, MAX_TAPS, NEAR_DEG, NEAR_MM, REACH_MM, SCHEDULES
+from train.surfaces.poses import (
+    HALF_PITCH_MM,
+    HELD_OUT_RADIUS_MM,
+    MAX_TAPS,
+    NEAR_DEG,
+    NEAR_MM,
+    PLACES_MM,
+    REACH_MM,
+    SCHEDULES,
+    SURFACE_REACH_MM,
+    random_poses,
+)
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
@@ -63,3 +74,15 @@ def test_shifted_poses_are_part_of_the_hash(tmp_path):
     np.savez(tmp_path / "new.npz", **changed)
     with pytest.raises(DatasetError, match="is damaged"):
         load_presses(tmp_path / "new.npz")
+
+
+def test_random_poses_are_seeded_wide_and_away_from_the_held_out_positions():
+    drawn = random_poses(np.random.default_rng(1), 3000)
+    x_mm, y_mm, angle_deg = np.array([(p.x_mm, p.y_mm, p.angle_deg) for p in drawn]).T
+    for place_mm in PLACES_MM.values():
+        distance_mm = np.hypot(x_mm - place_mm[0], y_mm - place_mm[1])
+        assert HELD_OUT_RADIUS_MM < distance_mm.min() < HELD_OUT_RADIUS_MM + 0.1
+    for along in (x_mm, y_mm):
+        assert 0.97 * SURFACE_REACH_MM < np.abs(along).max() <= SURFACE_REACH_MM
+    assert np.allclose(np.histogram(angle_deg, 12, (0, 360))[0], 250, atol=70)
+    assert random_poses(np.random.default_rng(1), 3000) == drawn != random_poses(np.random.default_rng(2), 3000)

@@ -33,11 +33,11 @@ def radius_mm(size=SIZE, cell_mm=CELL_MM, centre_mm=(0.0, 0.0)):
 
 def push(solver, pressure, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, tolerance=1e-5):
     """One pose."""
-    result = solver.solve(
+    (traction,), (residual,) = solver.solve(
         pressure[None], np.array([slide_mm]), np.array([twist_rad]), np.array([friction]), tolerance=tolerance
     )
-    assert result.residual[0] < 1.01 * tolerance
-    traction = result.traction_mpa[0].astype(float)
+    assert residual < 1.01 * tolerance
+    traction = traction.astype(float)
     area, along = solver.cell_mm**2, cells_mm(solver.size, solver.cell_mm)
     moment = (along * traction[1] - along[:, None] * traction[0]).sum() * area
     stick = (pressure > 0) & (np.hypot(*traction) < (1 - 1e-4) * friction * pressure)
@@ -80,24 +80,6 @@ class TestLayer:
                 assert np.abs(part).max() <= along[0] * (1 + 1e-9)
             if height_mm == 0:
                 assert np.allclose([inside.along, inside.across, inside.sunk], 0, atol=1e-9 * along[0])
-
-    def test_inside_obeys_equilibrium(self):
-        layer, q, step = Layer(poisson=0.45), np.array([0.5]), 1e-3
-        u, across, down = np.array(
-            [
-                [part[0] for part in (field.along, field.across, field.sunk)]
-                for field in (inner_tangential(layer, q, 2.0 + shift) for shift in (-step, 0.0, step))
-            ]
-        ).T
-        # u_x = u, u_z = -i down times exp(i q x): Navier's equations along x and z, and across.
-        slope_u, slope_down = (u[2] - u[0]) / (2 * step), (down[2] - down[0]) / (2 * step)
-        bend_u, bend_down, bend_across = ((f[2] - 2 * f[1] + f[0]) / step**2 for f in (u, down, across))
-        stiff = 1 / (1 - 2 * layer.poisson)
-        along_x = bend_u - q[0] ** 2 * u[1] + stiff * q[0] * (slope_down - q[0] * u[1])
-        along_z = -bend_down + q[0] ** 2 * down[1] + stiff * (q[0] * slope_u - bend_down)
-        assert abs(along_x) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
-        assert abs(along_z) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
-        assert bend_across == pytest.approx(q[0] ** 2 * across[1], rel=1e-4)
 
 
 class TestFriction:
@@ -186,24 +168,16 @@ class TestFriction:
         pressure[3] = 0.0
         slide, twist, friction = rng.normal(0, 0.2, (12, 2)), rng.normal(0, 0.02, 12), rng.uniform(0.2, 1, 12)
         friction[4] = 0.0
-        fast = FrictionSolver(Layer(), SIZE, CELL_MM).solve(pressure, slide, twist, friction)
+        fast_mpa, residual = FrictionSolver(Layer(), SIZE, CELL_MM).solve(pressure, slide, twist, friction)
         exact = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64)
-        assert fast.residual.max() < 1e-3
-        assert not fast.traction_mpa[3:5].any()
+        assert residual.max() < 1e-3
+        assert not fast_mpa[3:5].any()
         for pose in set(range(12)) - {3, 4}:
             whole = np.maximum(pressure[pose], 1e-9)  # in contact everywhere, so that its box is the whole pad
             one = push(exact, whole, slide[pose], twist[pose], friction[pose])
-            force_n = fast.traction_mpa[pose].sum(axis=(1, 2)) * CELL_MM**2
+            force_n = fast_mpa[pose].sum(axis=(1, 2)) * CELL_MM**2
             # Measured 0.2 % at most.
             assert np.linalg.norm(one.force_n - force_n) < 0.01 * np.linalg.norm(one.force_n)
-
-    def test_what_does_not_fit_is_refused(self):
-        solver = FrictionSolver(Layer(), SIZE, CELL_MM)
-        pressure = np.ones((2, SIZE, SIZE))
-        with pytest.raises(ValueError, match=r"friction is -1\.0, expected 0 or more"):
-            solver.solve(pressure, np.zeros((2, 2)), np.zeros(2), np.array([1.0, -1.0]))
-        with pytest.raises(ValueError, match="a slide is not finite"):
-            solver.solve(pressure, np.full((2, 2), np.nan), np.zeros(2), np.ones(2))
 
 
 class TestMagnets:
@@ -257,43 +231,3 @@ class TestMagnets:
         back = right[:, :, ::-1].copy()
         turned = (skin.frames(pressure, back) - alone)[0, 0]
         assert np.allclose(turned[1], changed[0].T, atol=0.05)
-
-
-@pytest.mark.parametrize(("thickness_mm", "poisson"), [(3.0, 0.4)])
-def test_a_patch_pushed_along_moves_a_block_of_finite_elements_as_the_layer(thickness_mm, poisson):
-    felupe = pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
-    from scipy.sparse.linalg import cg
-
-    # Free sides give way: a block of eight thicknesses does not feel them, one of five did by 8 % in its middle plane.
-    layer, step_mm, across, high = Layer(thickness_mm, poisson=poisson), thickness_mm / 6, 49, 9
-    nodes_mm = (np.arange(across) - (across - 1) / 2) * step_mm
-    mesh = felupe.Grid(nodes_mm, nodes_mm, np.linspace(0, thickness_mm, high))
-    field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
-    elastic = felupe.LinearElastic(E=2 * layer.shear_modulus_mpa * (1 + poisson), nu=poisson)
-    stiffness = felupe.SolidBody(elastic, field).assemble.matrix().tocsr()
-    patch = np.exp(-(((nodes_mm[None, :] - 0.4) ** 2 + nodes_mm[:, None] ** 2) / 1.6**2)) * 1e-3  # [MPa]
-    push_n = np.zeros((high, across, across, 3))
-    push_n[-1, :, :, 0] = patch * step_mm**2
-    free = np.arange(across**2 * 3, stiffness.shape[0])
-    moved_mm = np.zeros(push_n.size)
-    solution, unfinished = cg(stiffness[free][:, free], push_n.ravel()[free], rtol=1e-7, maxiter=3000)
-    assert not unfinished
-    moved_mm[free] = solution
-    moved_mm = moved_mm.reshape(high, across, across, 3)
-
-    wide = 4 * across
-    wave = np.fft.fft2(patch, s=(wide, wide))
-    q_x, q_y = 2 * np.pi * np.fft.fftfreq(wide, step_mm)[None, :], 2 * np.pi * np.fft.fftfreq(wide, step_mm)[:, None]
-    q = np.hypot(q_x, q_y)
-    inside = (np.abs(nodes_mm) < 5)[:, None] & (np.abs(nodes_mm) < 5)
-    for layer_of_nodes in (high - 1, high // 2):
-        response = inner_tangential(layer, q, thickness_mm * layer_of_nodes / (high - 1))
-        extra = np.divide(response.along - response.across, q**2, out=np.zeros_like(q), where=q > 0)
-        sunk = np.divide(response.sunk, q, out=np.zeros_like(q), where=q > 0)
-        transfers = (response.across + extra * q_x**2, extra * q_x * q_y, -1j * sunk * q_x)
-        expected = [np.fft.ifft2(transfer * wave).real[:across, :across] for transfer in transfers]
-        found = np.moveaxis(moved_mm[layer_of_nodes], -1, 0)
-        errors = [np.abs(f - e)[inside].max() / np.abs(expected[0]).max() for f, e in zip(found, expected, strict=True)]
-        # Measured .9 to 1.2 % of the greatest displacement along, .1 to .6 % across and down.
-        assert errors[0] < 0.02
-        assert max(errors[1:]) < 0.01

@@ -9,7 +9,7 @@ from press_samples import make_press_set
 
 from edge.evaluation.metrics import psnr_db
 from train.data.frozen_presses import freeze_presses
-from train.data.generation_config import SEED
+from train.data.presses import SEED
 from train.errors import CheckpointError
 from train.fit import given_taps, main
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network

@@ -229,7 +229,7 @@ def test_a_set_of_which_nothing_is_felt_is_said(tmp_path, monkeypatch):
 
 def test_the_command_says_what_it_made(tmp_path, capsys):
     path = tmp_path / "out" / "presses.npz"
-    assert main([str(path), "--families", "flat,soft", "--count", "4", "--jobs", "1", "--compress"]) == 0
+    assert main([str(path), "--families", "flat,soft", "--count", "4", "--jobs", "1"]) == 0
     made = load_presses(path)
     assert capsys.readouterr().out.startswith(f"{path}: {len(made)} sequences, ")
     assert set(made.family.tolist()) == {"flat", "soft"}

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.scans.pad_constants import Pad
-from train.data.generation_config import SEED
 from train.data.press_batches import read_presses
-from train.data.presses import PressSet, load_presses
+from train.data.presses import SEED, PressSet, load_presses
 from train.errors import TrainError
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.pad_draws import input_scale, known_numbers

@@ -27,7 +27,7 @@ from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
-from train.families.catalogue import FIGURES, SHARES
+from train.families.catalogue import SHARES
 from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
@@ -36,7 +36,7 @@ _INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
 
 
-def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool = False) -> PressSet:
+def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
     Raises:
@@ -67,7 +67,7 @@ def make_presses(world: World, path: Path, jobs: int = -1, *, compressed: bool =
     if not any(len(part) for part in parts):
         raise DatasetError(f"every press of {path} came out lighter than {LEAST_FORCE_N} N: ask for more of them")
     made = replace(join_presses(parts), config=facts)
-    made.save(path, compressed=compressed)
+    made.save(path)
     shutil.rmtree(folder)
     return made
 
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
         with _quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
-            made = make_presses(world, options.out, options.jobs, compressed=options.compress)
+            made = make_presses(world, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
         return 1
@@ -131,9 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _world(options: argparse.Namespace) -> World:
     families = dict(SHARES)
-    if options.families == "figures":
-        families = {name: SHARES[name] for name in FIGURES}
-    elif options.families == "even":
+    if options.families == "even":
         families = dict.fromkeys(SHARES, 1.0)
     elif options.families != "all":
         names = [name for name in options.families.split(",") if name != "none"]
@@ -156,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--begun", type=float, default=0.5, help="share of sequences whose newest press has only begun (0.5)")
     add("--per-pad", type=int, default=24, help="sequences of each pad (24)")
     families = f"names with commas: {', '.join(SHARES)}, or of figures of the paper (all)"
-    add("--families", default="all", help=f"all; even (equally many of each); figures; none; or {families}")
+    add("--families", default="all", help=f"all; even (equally many of each); none; or {families}")
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm: 25.4 for inches, 1000 for metres (1)")
     add("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
@@ -166,7 +164,6 @@ def _parser() -> argparse.ArgumentParser:
     models = ", ".join(pad.name for pad in PADS)
     add("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
     add("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
-    add("--compress", action="store_true", help="write a smaller file, more slowly")
     return parser
 
 

@@ -1,8 +1,7 @@
 """The paper's protocol in the simulated world: its figures, whole taps from first contact to full force, one pad.
 
 A sequence is K taps of one figure by the nominal pad, each turned by a step from the one before; the newest is the
-target. Every figure has 36: nine places and four turns, of which one place is for validation and one for the test.
-Each tap has FRAMES frames, so that readings and truth are available at any lower force: frame i lies at
+target. Each tap has FRAMES frames, so that readings and truth are available at any lower force: frame i lies at
 (i + 1) / FRAMES of the press, readings at 0 are zero, and values between frames are interpolated linearly.
 
 Networks of the paper are trained on presses of the same pad and schedule:
@@ -20,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edge.terminal.progress_bar import tracked
-from train.data.generation_config import SEED, one_thread
-from train.errors import DatasetError
+from train.data.presses import SEED, one_thread
 from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
@@ -29,7 +27,7 @@ from train.physics.resample import resample, resample_touching
 from train.physics.sensor_noise import Nuisances, Seed, jitter_poses, read_windows
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
-from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, Split, paper_taps_of
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split
 
 FORCE_N: Final = 9.2
 """Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
@@ -61,13 +59,7 @@ class PaperTaps:
         return self.counts.shape[1]
 
     def newest(self, taps: int) -> "PaperTaps":
-        """Return the sequences with only their newest `taps` taps.
-
-        Raises:
-            DatasetError: the sequences have fewer taps.
-        """
-        if not 1 <= taps <= self.taps:
-            raise DatasetError(f"{taps} taps asked for, but these sequences have {self.taps}")
+        """Return the sequences with only their newest `taps` taps."""
         return replace(self, **{name: getattr(self, name)[:, :taps] for name in _PER_TAP})
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PaperTaps":
@@ -87,10 +79,6 @@ class PaperTaps:
         """Return the shares (B, K) of presses at which they reach their set forces in [N]; 1 if a press ends before."""
         return np.minimum(np.asarray(force_n, dtype=np.float64) / self.force_n[index, :, -1], 1.0)
 
-    def force_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the force of the newest tap, (B, m) in [N], at shares (B, m) of its press."""
-        return self.force_n[index, 0, -1:] * share
-
     def patterns_at(self, index: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return the truth of the newest tap, (B, H, W) in [mm], at shares (B,) of its press."""
         depth_mm = (self.indentation_mm[index, 0, -1] * share).astype(np.float32)
@@ -103,16 +91,18 @@ def paper_taps(
 ) -> PaperTaps:
     """Tap each flat surface at the places of a split, in four turns; poses and truth are off by a robot's error."""
     pad = GrippedPad(NOMINAL)
-    names, sent = paper_taps_of(split, surfaces, taps, angle_step_deg)
+    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    turns_deg = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    sent = [Pose(*PLACES_MM[split], turn_deg) for _ in surfaces for turn_deg in turns_deg]
     poses: list[Pose] = []
     while part := sent[len(poses) :][: _AT_ONCE * taps]:
         rng = np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)])
         poses += jitter_poses(rng, part, Nuisances())
     numbers = tracked(range(len(names)), "tapping", "sequence")
-    solved = [tap(pad, names[at], poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
+    solved = [tap(pad, [names[at]] * taps, poses[at * taps : (at + 1) * taps], FORCE_N) for at in numbers]
     return PaperTaps(
         surfaces=np.array(names),
-        poses=np.array([(pose.x_mm, pose.y_mm, pose.angle_deg) for pose in poses]).reshape(-1, taps, 3),
+        poses=np.array(poses).reshape(-1, taps, 3),
         counts=np.stack([one.counts for one in solved]),
         force_n=np.stack([one.force_n for one in solved]),
         indentation_mm=np.stack([one.indentation_mm for one in solved]),
@@ -121,9 +111,10 @@ def paper_taps(
     )
 
 
-def tap(pad: GrippedPad, surface: str, poses: Sequence[Pose], force_n: float) -> Taps:
-    """Return whole taps of a flat surface from poses over it."""
-    return pad.tap(np.stack([heights_of(surface, pose, pad) for pose in poses]), force_n)
+def tap(pad: GrippedPad, surfaces: Sequence[str], poses: Sequence[Pose], force_n: float) -> Taps:
+    """Return whole taps of flat surfaces, each from a pose over it."""
+    heights_mm = [heights_of(surface, pose, pad) for surface, pose in zip(surfaces, poses, strict=True)]
+    return pad.tap(np.stack(heights_mm), force_n)
 
 
 def windows(

@@ -14,7 +14,7 @@ from torch import Tensor
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.physics.pad_draws import known_numbers
-from train.physics.sensor_noise import Nuisances, read_windows
+from train.physics.sensor_noise import Nuisances, log_uniform, read_windows
 
 COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)
 """Counts of x, y, z that make one unit of network input."""
@@ -88,14 +88,8 @@ _SURE: Final = 0.1
 class PressBatches:
     """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
 
-    Windows of one tap are drawn from sequences with fewer taps where these exist, because they are many more.
-
-    Args:
-        presses: some of them with all K taps.
-        given: share of windows with 1, 2, ... K taps; older taps are dropped.
-        batch: windows in a batch.
-        seed: of all draws.
-        nuisances: of the sensors.
+    `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped. Windows of one tap are drawn
+    from sequences with fewer taps where these exist, because they are many more.
 
     Raises:
         DatasetError: there are no presses of K taps.
@@ -117,13 +111,13 @@ class PressBatches:
         self._given, self._seed, self._nuisances = np.array(given), seed, nuisances
         batch = min(batch, len(presses))
         self._single = 0 if whole.all() else round(given[0] * batch)
-        counts = ((np.flatnonzero(~whole), self._single), (np.flatnonzero(whole), batch - self._single))
-        self._parts = [_Part(rows, count, [seed, 0, number]) for number, (rows, count) in enumerate(counts) if count]
+        self._parts = ((np.flatnonzero(~whole), self._single), (np.flatnonzero(whole), batch - self._single))
 
     def __call__(self, number: int) -> Batch:
         """Return the batch of a number."""
         rng = np.random.default_rng([self._seed, 1, number])
-        index = np.concatenate([part(number) for part in self._parts])
+        parts = [(rows, count, [self._seed, 0, at]) for at, (rows, count) in enumerate(self._parts) if count]
+        index = np.concatenate([_rows_of_batch(number, *part) for part in parts])
         picked = self._presses.pick(index)
         readings, certainty = read_by_many(rng, picked, self._nuisances)
         taps = len(self._given)
@@ -154,20 +148,11 @@ def _batch(
     )
 
 
-class _Part:
-    """Rows for one part of every batch: each row once in each epoch, except for those that do not fill a batch."""
-
-    def __init__(self, rows: NDArray[np.int64], count: int, seed: list[int]) -> None:
-        self._rows, self._count, self._seed = rows, min(count, len(rows)), seed
-        self._epoch, self._order = -1, rows
-
-    def __call__(self, number: int) -> NDArray[np.int64]:
-        """Return the rows of the batch of a number, (count,)."""
-        epoch, place = divmod(number, len(self._rows) // self._count)
-        if epoch != self._epoch:
-            self._order = np.random.default_rng([*self._seed, epoch]).permutation(self._rows)
-            self._epoch = epoch
-        return self._order[place * self._count :][: self._count]
+def _rows_of_batch(number: int, rows: NDArray[np.int64], count: int, seed: list[int]) -> NDArray[np.int64]:
+    """Return some of the rows: each once in each epoch, except for those that do not fill a batch."""
+    count = min(count, len(rows))
+    epoch, place = divmod(number, len(rows) // count)
+    return np.random.default_rng([*seed, epoch]).permutation(rows)[place * count :][:count]
 
 
 def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[np.float32]:
@@ -255,14 +240,12 @@ def stated_poses(
 ) -> NDArray[np.float32]:
     """Return true poses (n, K, 3) as a robot states them, (n, K, 5): off by errors, whose sizes come last.
 
-    Args:
-        rng: draws the errors.
-        poses: of the taps in the newest one's axes, newest first.
-        errors: standard deviations in [mm] and [deg], stated and kept to; None to draw them as in training.
+    Standard deviations `errors` in [mm] and [deg] are stated and kept to; without them they are drawn as in training.
     """
     shape = (*poses.shape[:2], 1)
     if errors is None:
-        size = np.concatenate([_spread(rng, bounds, len(poses)) for bounds in (_ERRORS_MM, _ERRORS_DEG)], axis=2)
+        one = (len(poses), 1, 1)
+        size = np.concatenate([log_uniform(rng, *bounds, one) for bounds in (_ERRORS_MM, _ERRORS_DEG)], axis=2)
     else:
         size = np.broadcast_to(np.array(errors), (len(poses), 1, 2))
     size = np.repeat(size, shape[1], axis=1)
@@ -273,11 +256,6 @@ def stated_poses(
     stated = np.concatenate([poses + off, size], axis=2)
     stated[:, 0] = 0
     return stated.astype(np.float32)
-
-
-def _spread(rng: np.random.Generator, bounds: tuple[float, float], count: int) -> NDArray[np.float64]:
-    low, high = np.log(bounds)
-    return np.exp(rng.uniform(low, high, (count, 1, 1)))
 
 
 def _some_of(rng: np.random.Generator, presses: PressSet, taps: int) -> PressSet:

@@ -1,14 +1,20 @@
-"""Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash."""
+"""Presses to train and evaluate on, with the constants of each pad, as one npz file with a hash.
+
+A set is made again with the same bytes from its seed, on one thread.
+"""
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
@@ -16,6 +22,8 @@ from firmware_bridge.recording.npz_recording import read_npz
 from train.errors import DatasetError
 from train.physics.resample import resample, resample_touching
 
+SEED: Final = 20240228
+"""Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
@@ -39,6 +47,18 @@ _AXES: Final = {
     "indentation_mm": ("float32", "n"),
 }
 """Type and axes of each array; a letter is the same length everywhere."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limit torch and BLAS to one thread each: a sum split over threads differs in its last bits."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +170,9 @@ def load_presses(path: Path) -> PressSet:
         facts: Any = json.loads(str(about["facts"]))
         names = [name for name in _AXES if name != "poses" or int(about["version"]) > _NO_POSES]
         arrays = dict(read_npz(path, names, _MOST_BYTES))
-        arrays.setdefault("poses", _turned(arrays["angle_deg"]))
+        if "poses" not in arrays:
+            turns_deg = arrays["angle_deg"][:, :1] - arrays["angle_deg"]
+            arrays["poses"] = np.stack([*np.zeros((2, *turns_deg.shape), np.float32), turns_deg], axis=2)
         width = arrays["patterns"].shape[-1]
         arrays["touching"] = np.unpackbits(arrays["touching"], axis=-1, count=width).astype(bool)
         check_axes(_AXES, arrays)
@@ -165,13 +187,6 @@ def load_presses(path: Path) -> PressSet:
     if (found := loaded.sha256()) != hashed:
         raise DatasetError(f"{path} is damaged: its sha256 is {found}, it states {hashed[:64]}: make it again")
     return loaded
-
-
-def _turned(angle_deg: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the poses (n, K, 3) of taps at one place, turned by angles (n, K) as seen from above."""
-    poses = np.zeros((*angle_deg.shape, 3), dtype=np.float32)
-    poses[..., 2] = angle_deg[:, :1] - angle_deg
-    return poses
 
 
 def join_presses(parts: Sequence[PressSet]) -> PressSet:

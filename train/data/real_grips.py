@@ -13,6 +13,7 @@ from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
+from train.physics.sensor_noise import neighbours
 
 REST_SCANS: Final = 20
 """Scans at the end of a recording, where one of the grips has been released."""
@@ -95,6 +96,5 @@ def recorded_sets(folder: Path) -> list[ScanSet]:
 
 def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the mean of each taxel's edge neighbours, (n, taxels): bilinear at its place, with fewer at the rim."""
-    row, col = np.divmod(np.arange(_TAXELS), USPA44.cols)
-    beside = (np.abs(row[:, None] - row) + np.abs(col[:, None] - col)) == 1
+    beside = neighbours(USPA44.rows, USPA44.cols) > 0
     return z @ (beside / beside.sum(axis=0))

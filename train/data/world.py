@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44
-from train.data.generation_config import one_thread
-from train.data.presses import VERSION, PressSet, join_presses
+from train.data.presses import VERSION, PressSet, join_presses, one_thread
 from train.errors import DatasetError
 from train.families.catalogue import SHARES, Tapped, draw_shape
 from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad
 from train.physics.pad_draws import INPUTS, RANGES, Pad, constants, draw_pad
+from train.physics.sensor_noise import log_uniform
 from train.surfaces.meshes import MESH, mesh_file
 from train.surfaces.named_surfaces import SURFACES, surface_mesh
 from train.surfaces.poses import MAX_TAPS, schedule_of
@@ -92,16 +92,11 @@ class World:
             del facts["scale"]  # what was made before there was a choice keeps its name
         if self.pad == USPA44.name:
             del facts["pad"]
-        meshes = {name: _mesh_sha256(name) for name in self.families if name.startswith(MESH)}
-        return facts | ({"meshes": meshes, "most_draws": MOST_DRAWS} if meshes else {})
-
-
-def _mesh_sha256(name: str) -> str:
-    """Return the hash of a user's file, because the content under a name may change."""
-    try:
-        return hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest()
-    except OSError as error:
-        raise DatasetError(f"{name} cannot be read: {error.strerror or error}") from error
+        meshes = [name for name in self.families if name.startswith(MESH)]
+        if meshes:  # the content under a name may change
+            hashes = {name: hashlib.sha256(mesh_file(name)[0].read_bytes()).hexdigest() for name in meshes}
+            facts |= {"meshes": hashes, "most_draws": MOST_DRAWS}
+        return facts
 
 
 @one_thread()
@@ -151,8 +146,7 @@ def press_shapes(
     depth_mm = depths_mm.ravel()
     dragged = rng.random(n * taps) > _STILL
     way = rng.uniform(0, 2 * np.pi, n * taps)
-    low, high = np.log(_SLIDE_MM)
-    far = np.exp(rng.uniform(low, high, n * taps)) * dragged
+    far = log_uniform(rng, *_SLIDE_MM, (n * taps,)) * dragged
     twist = rng.normal(0, _TWIST_RAD, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
     done = gripped.press(
         np.concatenate([one.heights_mm for one in tapped]),
@@ -163,7 +157,7 @@ def press_shapes(
         [one.cover for one in tapped for _ in range(taps)],
         scale=scale,
     )
-    newest = slice(0, None, taps)
+    newest = {name: getattr(done, name)[::taps] for name in ("touching", "force_n", "twist_nmm", "indentation_mm")}
     return PressSet(
         family=family,
         pad=np.full(n, number, dtype=np.int64),
@@ -171,10 +165,7 @@ def press_shapes(
         counts=done.counts.reshape(n, taps, *done.counts.shape[1:]),
         angle_deg=np.array([one.angle_deg for one in tapped], dtype=np.float32),
         poses=np.array([one.poses for one in tapped], dtype=np.float32),
-        patterns=done.patterns[newest].astype(np.float16),
-        touching=done.touching[newest],
-        traction_kpa=done.traction_kpa[newest].astype(np.float16),
-        force_n=done.force_n[newest],
-        twist_nmm=done.twist_nmm[newest],
-        indentation_mm=done.indentation_mm[newest],
+        patterns=done.patterns[::taps].astype(np.float16),
+        traction_kpa=done.traction_kpa[::taps].astype(np.float16),
+        **newest,
     )

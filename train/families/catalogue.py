@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -12,9 +11,9 @@ from train.errors import MeshError, SurfaceError
 from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
 from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad
-from train.surfaces.depth_image import Pose, Relief, depth_image
+from train.surfaces.depth_image import Pose, depth_image
 from train.surfaces.meshes import MESH
-from train.surfaces.named_surfaces import SURFACES, surface_mesh
+from train.surfaces.named_surfaces import SURFACES, relief
 from train.surfaces.poses import over_surface, random_poses
 
 FIGURES: Final = ("paper", "glyph", "polygon")
@@ -57,29 +56,18 @@ _MOST_TRIES: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Tapped:
-    """One shape under K taps.
+    """One shape under K taps, newest first."""
 
-    Attributes:
-        heights_mm: (K, m, m) at the pad's places, newest tap first.
-        cover: compliant cover of the shape or the pad.
-        poses: (K, 3) of the pad in the newest tap's axes, see `firmware_bridge.poses`.
-        angle_deg: (K,), turn of the pad seen from above, for the earth's field.
-    """
-
-    heights_mm: NDArray[np.float32]
-    cover: Cover
-    poses: NDArray[np.float64]
-    angle_deg: NDArray[np.float64]
+    heights_mm: NDArray[np.float32]  # (K, m, m) at the pad's places
+    cover: Cover  # of the shape or the pad
+    poses: NDArray[np.float64]  # (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg]
+    angle_deg: NDArray[np.float64]  # (K,), turn of the pad seen from above, for the earth's field
 
 
 def draw_shape(rng: np.random.Generator, family: str, pad: GrippedPad, poses: NDArray[np.float64]) -> Tapped:
-    """Draw one shape of a family, tapped from poses.
+    """Draw one shape of a family, and where it lies, tapped from poses (K, 3) in the newest tap's axes.
 
-    Args:
-        rng: draws the shape and where it lies.
-        family: a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
-        pad: the pad that taps.
-        poses: (K, 3) of the pad in the newest tap's axes: x, y in [mm], turn in [deg].
+    A family is a key of SHARES, a figure of the paper, or `mesh:PATH`, a user's surface.
     """
     if family in FIGURES or family in SURFACES or family.startswith(MESH):
         return _draw_figure(rng, family, pad, poses)
@@ -169,9 +157,4 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
 
 def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
     """Return the heights (m, m) of a surface at the places of a pad at a pose over it."""
-    return -depth_image(_relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
-
-
-@lru_cache(maxsize=64)
-def _relief(name: str) -> Relief:
-    return Relief(name, surface_mesh(name))
+    return -depth_image(relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)

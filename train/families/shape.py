@@ -34,20 +34,12 @@ def drawn(rng: np.random.Generator, shape: Shape) -> Height:
 
 @dataclass(frozen=True, slots=True)
 class Lie:
-    """Position, turn and tilt of a shape under the pad.
-
-    Attributes:
-        x_mm: place of the shape's origin, to the right of the pad's centre.
-        y_mm: place of the shape's origin, below the pad's centre, down the rows.
-        angle_deg: turn of the shape.
-        slope_x: rise of the shape along the pad's x, in [mm/mm].
-        slope_y: rise of the shape along the pad's y, in [mm/mm].
-    """
+    """Position, turn and tilt of a shape under the pad: x to the right of its centre, y down the rows."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0
     angle_deg: float = 0.0
-    slope_x: float = 0.0
+    slope_x: float = 0.0  # rise along the pad's x, in [mm/mm]
     slope_y: float = 0.0
 
     def seen(self, height: Height, x_mm: Lengths, y_mm: Lengths) -> Lengths:

@@ -11,8 +11,8 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.intervals import doubt
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps
+from train.data.presses import SEED
 from train.freeze import freeze
 from train.physics.sensor_noise import Nuisances
 

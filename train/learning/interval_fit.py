@@ -23,9 +23,8 @@ from edge.evaluation import metrics
 from edge.inference.intervals import REGIONS, regions
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import freeze_presses
-from train.data.generation_config import SEED
 from train.data.press_batches import PosedBatches, PressBatches, network_input, stated_poses
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet
 from train.networks.compact import CompactNet
 from train.networks.interval_correction import IntervalCorrection
 

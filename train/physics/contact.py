@@ -21,17 +21,11 @@ from train.physics.side_correction import FreeSides, SideGive
 
 @dataclass(frozen=True, slots=True)
 class Cover:
-    """Compliance of the object, and a cloth or glove between it and the pad.
+    """Compliance of the object, and a cloth or glove between it and the pad."""
 
-    Attributes:
-        soft_mpa: shear modulus of a soft object, thick and incompressible; 0 for a rigid one.
-        cloth_mm: thickness of the cloth; 0 for none.
-        cloth_mpa: its modulus under even pressure.
-    """
-
-    soft_mpa: float = 0.0
-    cloth_mm: float = 0.0
-    cloth_mpa: float = 1.0
+    soft_mpa: float = 0.0  # shear modulus of a soft object, thick and incompressible; 0 for a rigid one
+    cloth_mm: float = 0.0  # thickness of the cloth; 0 for none
+    cloth_mpa: float = 1.0  # its modulus under even pressure
 
     def compliance(self, layer: Layer, q_per_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the joint compliance of pad and cover at wave numbers, in [mm/MPa]."""
@@ -74,18 +68,11 @@ The pad bulges next to a contact, by at most 0.39 of the indentation over the 18
 
 @dataclass(frozen=True, slots=True)
 class ContactResult:
-    """Solution of a batch of poses.
+    """Solution of a batch of poses."""
 
-    Attributes:
-        pressure_mpa: (n, size, size), in [MPa].
-        steps: conjugate-gradient steps of the slowest pose.
-        residual: (n,) root mean square gap where pressure acts or surfaces overlap, as a share of the indentation.
-        solver: solver of the poses.
-    """
-
-    pressure_mpa: NDArray[np.float32]
-    steps: int
-    residual: NDArray[np.float32]
+    pressure_mpa: NDArray[np.float32]  # (n, size, size)
+    steps: int  # of the slowest pose's conjugate gradients
+    residual: NDArray[np.float32]  # (n,), RMS gap where pressure acts or surfaces overlap, over the indentation
     solver: "ContactSolver"
 
     @property
@@ -100,16 +87,7 @@ class ContactResult:
 
 
 class ContactSolver:
-    """Solver of poses on a square grid over one pad.
-
-    Args:
-        layer: the pad.
-        size: cells along a side.
-        cell_mm: cell size, in [mm].
-        dtype: torch.float32 or torch.float64.
-        cover: of the surface or the pad.
-        sides: the pad's free sides; None for an infinite layer.
-    """
+    """Solver of poses on a square grid over one pad, `size` cells a side; without `sides` the layer is infinite."""
 
     def __init__(
         self,
@@ -143,20 +121,17 @@ class ContactSolver:
         tolerance: float = 1e-3,
         covered: NDArray[np.floating] | None = None,
     ) -> ContactResult:
-        """Press surfaces into the pad, with depth images as input.
+        """Press surfaces into the pad until the residual is below the tolerance.
 
         For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
 
         Args:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
-            tolerance: residual at which a pose is done.
+            tolerance: largest residual.
             covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
         """
-        shapes = {depth_mm.shape[1:], depth_mm.shape[1:] if covered is None else covered.shape[1:]}
-        if shapes != {(self.size, self.size)}:
-            raise ValueError(f"depth images and covered shares of {shapes}, expected (n, {self.size}, {self.size})")
         indentation = np.broadcast_to(np.asarray(indentation_mm, dtype=np.float64), len(depth_mm))
         if not (indentation > 0).all():
             raise ValueError(f"indentation is {indentation.min()} mm, expected a positive depth")

@@ -14,17 +14,11 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """Material and thickness of the pad.
+    """Material and thickness of the pad."""
 
-    Attributes:
-        thickness_mm: h.
-        shear_modulus_mpa: G.
-        poisson: nu, below 0.5.
-    """
-
-    thickness_mm: float = 4.5
-    shear_modulus_mpa: float = 0.12
-    poisson: float = 0.45
+    thickness_mm: float = 4.5  # h
+    shear_modulus_mpa: float = 0.12  # G
+    poisson: float = 0.45  # nu, below 0.5
     """Effective value, because a 20 mm pad is free at its sides: at 0.49 z and force would not be proportional."""
 
     def __post_init__(self) -> None:
@@ -42,10 +36,6 @@ def surface_compliance(layer: Layer, q_per_mm: Array) -> Array:
 
     S = [(3-4nu) sinh 2a - 2a] / [(3-4nu) cosh 2a + 2a^2 + 5 - 12nu + 8nu^2], a = qh. At q = 0 the limit
     u = p h (1-2nu) / (2 G (1-nu)).
-
-    Args:
-        layer: the pad.
-        q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
     """
     nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
     a = q_per_mm * thickness
@@ -89,14 +79,9 @@ def surface_tensor(layer: Layer, q_x: NDArray[np.floating], q_y: NDArray[np.floa
 
 
 def inner_displacement(layer: Layer, q_per_mm: Array, height_mm: float) -> tuple[Array, Array]:
-    """Return the displacement inside the layer per surface pressure: (W, U), in [mm/MPa].
+    """Return the displacement at a height above the board per surface pressure: (W, U), in [mm/MPa].
 
     W is positive downwards; the in-plane part is u_x = i U exp(i q x), along the wave.
-
-    Args:
-        layer: the pad.
-        q_per_mm: wave numbers, any shape, >= 0, in [1/mm].
-        height_mm: height above the board, 0 to thickness, in [mm].
     """
     up, along = _inside(layer, q_per_mm, height_mm, normal_mpa=-1.0, shear_mpa=0.0)
     return -up, along

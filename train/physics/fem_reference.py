@@ -13,24 +13,26 @@ Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from torch import Tensor
 
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
-from train.surfaces.depth_image import Pose, Relief, depth_image
-from train.surfaces.named_surfaces import surface_mesh
+from train.surfaces.depth_image import Pose, depth_image
+from train.surfaces.named_surfaces import relief
 
 try:
     import felupe
@@ -54,9 +56,6 @@ _MAX_NEWTON: Final = 12
 _MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
 """Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
-
-Tensors = NDArray[np.floating]
-"""Tensors (3, 3, ...) as in finite-element codes: the tensor's axes first, the points last."""
 
 
 class NoEquilibriumError(TrainError, ArithmeticError):
@@ -92,7 +91,7 @@ def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floatin
         "edition": _EDITION,
         "surface": surface,
         "mesh": mesh,
-        "pose": asdict(CENTRE),
+        "pose": CENTRE._asdict(),
         "indentation_mm": np.round(indentation_mm, 6).tolist(),
         "layer": asdict(LAYER),
         "c2_share": C2_SHARE,
@@ -112,11 +111,6 @@ def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floatin
         return Verdict(*(kept[name].astype(np.float32) for name in ("patterns_mm", "force_n", "run_s")))
 
 
-def relief(surface: str) -> Relief:
-    """Return a named surface as a relief."""
-    return Relief(surface, surface_mesh(surface))
-
-
 class FemPresses(NamedTuple):
     """Equilibria of one press at its steps (s,): force down and displacement of each node (s, size, size)."""
 
@@ -132,12 +126,9 @@ class FemPresses(NamedTuple):
 
 
 class FemPad:
-    """Pad bonded to its board, with free sides.
+    """Pad bonded to its board, with free sides, its material that of the layer at small strain.
 
-    Args:
-        scale: nodes per taxel pitch: they lie on the pixels of the pattern at this scale, and on the pad's rim.
-        cells_high: elements over the thickness.
-        layer: thickness, and the material at small strain.
+    Nodes lie on the pixels of the pattern at a scale, and on the pad's rim.
     """
 
     def __init__(self, scale: int, cells_high: int, layer: Layer = LAYER) -> None:
@@ -152,12 +143,10 @@ class FemPad:
         self._region = felupe.RegionHexahedron(mesh)
 
     def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
-        """Press a surface in, each step starting from the last one's equilibrium.
+        """Press a surface in at rising indentations (s,), each step starting from the last one's equilibrium.
 
-        Args:
-            depth_mm: (size, size), depth of the surface below its highest point over each node, in [mm]; the
-                image of size x size cells of cell_mm fits, because its rim is the pad's up to a fraction of a cell.
-            indentation_mm: (s,), rising, in [mm].
+        Depths (size, size) are below its highest point over each node; the image of size x size cells of cell_mm fits,
+        because its rim is the pad's up to a fraction of a cell.
 
         Raises:
             NoEquilibriumError: the elements do not converge.
@@ -179,8 +168,10 @@ class _Press:
 
     def __init__(self, region: Any, rubber: "MooneyRivlin", size: int) -> None:
         self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
+        stress = torch.func.grad(rubber.energy)
+        stiffness = torch.func.jacfwd(stress)
         material = felupe.Material(
-            stress=lambda x: [rubber.stress(x[0]), x[-1]], elasticity=lambda x: [rubber.stiffness(x[0])]
+            stress=lambda x: [_at_points(stress, x[0]), x[-1]], elasticity=lambda x: [_at_points(stiffness, x[0])]
         )
         # The mixed elements add the volumetric part.
         self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
@@ -282,48 +273,16 @@ class MooneyRivlin(NamedTuple):
         bulk = shear * 2 * (1 + nu) / (3 * (1 - 2 * nu))
         return cls((1 - C2_SHARE) * shear / 2, C2_SHARE * shear / 2, bulk)
 
-    def stress(self, gradient: Tensors) -> Tensors:
-        """Return the first Piola-Kirchhoff stress d psi / dF, (3, 3, ...) in [MPa]."""
-        volume, inverse = _volume_and_inverse(gradient)
-        first, second = (
-            weight * volume**-power * (slope - power * invariant * inverse)
-            for weight, power, invariant, slope in self._terms(gradient)
-        )
-        return first + second
-
-    def stiffness(self, gradient: Tensors) -> Tensors:
-        """Return the stiffness d^2 psi / dF dF, (3, 3, 3, 3, ...) in [MPa], with dJ/dF = J F^-T."""
-        volume, inverse = _volume_and_inverse(gradient)
-        one = np.eye(3).reshape(3, 3, *(1,) * (gradient.ndim - 2))
-        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
-        left = np.einsum("im...,km...->ik...", gradient, gradient)
-        curve1 = 2 * np.einsum("ik...,jl...->ijkl...", one, one)
-        curve2 = 4 * _outer(gradient, gradient) + np.einsum("ii...->...", right) * curve1
-        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", one, right)
-        curve2 -= 2 * np.einsum("ik...,lj...->ijkl...", left, one)
-        curve2 -= 2 * np.einsum("il...,kj...->ijkl...", gradient, gradient)
-        pair, parts = _outer(inverse, inverse), []
-        for (weight, power, invariant, slope), curve in zip(self._terms(gradient), (curve1, curve2), strict=True):
-            mixed = _outer(slope, inverse)
-            by_volume = power * invariant * (power * pair + np.swapaxes(pair, 1, 3))
-            by_both = power * (mixed + np.moveaxis(mixed, (0, 1), (2, 3)))
-            parts.append(weight * volume**-power * (curve - by_both + by_volume))
-        return parts[0] + parts[1]
-
-    def _terms(self, gradient: Tensors) -> Iterator[tuple[float, float, Tensors, Tensors]]:
-        """Yield the weight of I1 and I2, their power of 1/J, their value, and their derivative by F."""
-        right = np.einsum("ki...,kj...->ij...", gradient, gradient)
-        i1 = np.einsum("ii...->...", right)
-        yield self.c1_mpa, 2 / 3, i1, 2 * gradient
-        i2 = (i1**2 - np.einsum("ij...,ij...->...", right, right)) / 2
-        yield self.c2_mpa, 4 / 3, i2, 2 * (i1 * gradient - np.einsum("ik...,kj...->ij...", gradient, right))
+    def energy(self, gradient: Tensor) -> Tensor:
+        """Return psi in [MPa] at one point with a gradient F (3, 3)."""
+        right, volume = gradient.mT @ gradient, torch.linalg.cross(gradient[0], gradient[1]) @ gradient[2]
+        first = right.trace()
+        second = (first**2 - (right**2).sum()) / 2
+        return self.c1_mpa * (first * volume ** (-2 / 3) - 3) + self.c2_mpa * (second * volume ** (-4 / 3) - 3)
 
 
-def _volume_and_inverse(gradient: Tensors) -> tuple[Tensors, Tensors]:
-    """Return J and F^-T."""
-    turned = np.moveaxis(gradient, (0, 1), (-1, -2))
-    return np.linalg.det(turned), np.moveaxis(np.linalg.inv(turned), (-2, -1), (0, 1))
-
-
-def _outer(a: Tensors, b: Tensors) -> Tensors:
-    return np.einsum("ij...,kl...->ijkl...", a, b)
+def _at_points(function: Callable[[Tensor], Tensor], gradient: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return a tensor of each point's F, with the points last as in felupe, of gradients (3, 3, ...)."""
+    flat = torch.from_numpy(gradient.reshape(3, 3, -1))
+    found = torch.func.vmap(function, in_dims=-1, out_dims=-1)(flat).numpy()
+    return found.reshape(*found.shape[:-1], *gradient.shape[2:])

@@ -11,7 +11,6 @@ pressure alone spreads the surface, and the effect of traction on pressure is le
 layer of nu = .5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -26,23 +25,11 @@ _REMEMBERED: Final = 4
 """Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrictionResult:
-    """Tractions on the pad to the right and back, (n, 2, size, size), in [MPa].
-
-    `residual` is the root mean square error (n,) over the contact of the movement, which should vanish where cells
-    stick, and oppose the traction where they slip, as a share of the surface's movement.
-    """
-
-    traction_mpa: NDArray[np.float32]
-    residual: NDArray[np.float32]
-
-
 class FrictionSolver:
     """Solver of poses on a square grid over one pad, with the arguments of `train.physics.contact.ContactSolver`."""
 
     def __init__(self, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32) -> None:
-        def compliance(q_x: NDArray[np.float64], q_y: NDArray[np.float64]) -> NDArray[np.float64]:
+        def compliance(q_x: NDArray[np.floating], q_y: NDArray[np.floating]) -> NDArray[np.float64]:
             xx, yy, xy = surface_tensor(layer, q_x, q_y)
             # The highest wave is its own mirror image, so an odd transfer is zero there.
             xy[len(xy) // 2] = xy[:, -1] = 0.0
@@ -64,22 +51,15 @@ class FrictionSolver:
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
         tolerance: float = 1e-3,
-    ) -> FrictionResult:
-        """Slide and turn surfaces that touch with these pressures.
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Slide (n, 2) surfaces to the right and back, and turn them (n,) about the pad's centre from right to back.
 
-        Args:
-            pressure_mpa: (n, size, size), in contact where it is above 0, in [MPa].
-            slide_mm: (n, 2), of the surface to the right and back, in [mm].
-            twist_rad: (n,), of the surface about the pad's centre, from right to back.
-            friction: (n,), coefficients mu, >= 0.
-            tolerance: residual at which a pose is done.
+        They touch with pressures (n, size, size), where these are above 0, and have coefficients of friction mu (n,).
+        Returned are tractions on the pad to the right and back, (n, 2, size, size) in [MPa], and residuals (n,): the
+        RMS error over the contact of the movement, which should vanish where cells stick, and oppose the traction where
+        they slip, as a share of the surface's movement.
         """
         count = len(pressure_mpa)
-        if not (np.asarray(friction) >= 0).all():
-            raise ValueError(f"friction is {np.min(friction)}, expected 0 or more")
-        for name, given in (("pressure", pressure_mpa), ("slide", slide_mm), ("twist", twist_rad)):
-            if not np.isfinite(given).all():
-                raise ValueError(f"a {name} is not finite, expected numbers")
         along_mm = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
         turn = twist_rad[:, None, None] * along_mm
         moved_mm = (
@@ -98,7 +78,7 @@ class FrictionSolver:
             for part, axis in zip(traction_mpa.swapaxes(0, 1), range(2), strict=True):
                 part[place] = found[:, axis].numpy()
             residual[poses] = error.numpy()
-        return FrictionResult(traction_mpa, residual)
+        return traction_mpa, residual
 
     def _projected_gradients(
         self, limit: torch.Tensor, moved: torch.Tensor, tolerance: float

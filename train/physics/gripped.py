@@ -5,20 +5,19 @@ depth and covered share. A press is one moment; the paper's taps are followed fr
 (`GrippedPad.tap`). Friction is solved after the pressure, which it leaves unchanged (Goodman 1962).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from train.errors import TrainError
-from train.physics.contact import BARE, ContactSolver, Cover
+from train.errors import SurfaceError
+from train.physics.contact import BARE, REACH, ContactSolver, Cover
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.resample import resample, resample_touching
 from train.physics.taxel_response import Skin, on_pad
-from train.physics.touched import carrying, pressed_in, which_of
 from train.physics.tpsf import heights_pattern
 from train.surfaces.depth_image import NOTHING_MM
 
@@ -37,54 +36,36 @@ TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
 _CELLS_PER_PITCH: Final = 10
 _MOST_TRIES: Final = 6
+_WALL_MM: Final = 0.1
+"""Depth below a cell's highest part from which a part of it carries no load, in [mm]."""
+_STEEP: Final = 2.0
+"""Depth in indentations from which a shape counts as steep: its edge then follows from the pressure alone."""
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 
-class PressError(TrainError, ValueError):
-    """Press outside the range in which the pad's layer is linear."""
-
-
 @dataclass(frozen=True, slots=True)
 class Presses:
-    """n presses onto one pad.
+    """n presses onto one pad; forces and tractions along x to the right, y down the rows, z into the pad."""
 
-    Attributes:
-        counts: (n, 3, rows, cols), zeroed and clean.
-        patterns: (n, H, W), SCALE pixels per pitch unless asked otherwise, in [mm].
-        touching: (n, H, W), contact area on the pad.
-        traction_kpa: (n, 3, h, w) at TRACTION_SCALE, x to the right, y down the rows, z into the pad, in [kPa].
-        force_n: (n, 3), in [N].
-        twist_nmm: (n,), about the pad's centre from x towards y, in [N mm].
-        indentation_mm: (n,), in [mm].
-    """
-
-    counts: NDArray[np.float32]
-    patterns: NDArray[np.float32]
-    touching: NDArray[np.bool_]
-    traction_kpa: NDArray[np.float32]
-    force_n: NDArray[np.float32]
-    twist_nmm: NDArray[np.float32]
-    indentation_mm: NDArray[np.float32]
+    counts: NDArray[np.float32]  # (n, 3, rows, cols), zeroed and clean
+    patterns: NDArray[np.float32]  # (n, H, W), SCALE pixels per pitch unless asked otherwise, in [mm]
+    touching: NDArray[np.bool_]  # (n, H, W), contact area on the pad
+    traction_kpa: NDArray[np.float32]  # (n, 3, h, w) at TRACTION_SCALE
+    force_n: NDArray[np.float32]  # (n, 3)
+    twist_nmm: NDArray[np.float32]  # (n,), about the pad's centre from x towards y
+    indentation_mm: NDArray[np.float32]  # (n,)
 
 
 @dataclass(frozen=True, slots=True)
 class Taps:
-    """n whole taps of flat figures, FRAMES frames each, in even steps of the indentation.
+    """n whole taps of flat figures, FRAMES frames each, in even steps of the indentation."""
 
-    Attributes:
-        counts: (n, FRAMES, 3, rows, cols), zeroed and clean.
-        force_n: (n, FRAMES), normal, in [N].
-        indentation_mm: (n, FRAMES), in [mm].
-        unit_patterns: (n, H, W) at FINE_SCALE, deformation per indentation.
-        touching: (n, H, W) at FINE_SCALE, contact area on the pad.
-    """
-
-    counts: NDArray[np.float32]
-    force_n: NDArray[np.float32]
-    indentation_mm: NDArray[np.float32]
-    unit_patterns: NDArray[np.float32]
-    touching: NDArray[np.bool_]
+    counts: NDArray[np.float32]  # (n, FRAMES, 3, rows, cols), zeroed and clean
+    force_n: NDArray[np.float32]  # (n, FRAMES), normal
+    indentation_mm: NDArray[np.float32]  # (n, FRAMES)
+    unit_patterns: NDArray[np.float32]  # (n, H, W) at FINE_SCALE, deformation per indentation
+    touching: NDArray[np.bool_]  # (n, H, W) at FINE_SCALE, contact area on the pad
 
 
 class GrippedPad:
@@ -118,42 +99,31 @@ class GrippedPad:
         slide_mm: NDArray[np.floating],
         twist_rad: NDArray[np.floating],
         friction: NDArray[np.floating],
-        covers: Sequence[Cover] | None = None,
-        most_force_n: float = MOST_FORCE_N,
+        covers: Sequence[Cover],
         scale: int = SCALE,
     ) -> Presses:
-        """Press shapes onto the pad; a press that would exceed the largest force is made less deep.
+        """Press shapes onto the pad; a press that would exceed MOST_FORCE_N is made less deep.
 
         Args:
             heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
-            indentation_mm: (n,), of the highest part from first contact, above 0, in [mm].
+            indentation_mm: (n,), of the highest part from first contact, above 0 to MAX_INDENTATION_MM.
             slide_mm: (n, 2), movement of the shape to the right and down the rows after contact, in [mm].
             twist_rad: (n,), turn about the pad's centre from x towards y.
             friction: (n,), Coulomb's coefficient.
-            covers: one for each press; all bare if None.
-            most_force_n: largest normal force, in [N].
+            covers: one for each press.
             scale: pattern pixels per taxel pitch.
 
         Raises:
-            PressError: an indentation is outside the layer's linear range, or nothing lies under the pad.
+            SurfaceError: nothing lies under the pad.
         """
-        within = (indentation_mm > 0) & (indentation_mm <= MAX_INDENTATION_MM)
-        if not within.all():
-            raise PressError(
-                f"indentation of {indentation_mm[~within][0]:g} mm, expected above 0 to {MAX_INDENTATION_MM} mm: "
-                "beyond a tenth of its thickness the pad is not linear; press less deep"
-            )
-        covers = [BARE] * len(heights_mm) if covers is None else covers
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
         pressure = np.zeros(cells_mm.shape, dtype=np.float32)
-        for cover, which in which_of(covers):
-            pressure[which], depth[which] = self._pressed(
-                cover, cells_mm[which], share[which], depth[which], most_force_n
-            )
+        for cover, which in _which_of(covers):
+            pressure[which], depth[which] = self._pressed(cover, cells_mm[which], share[which], depth[which])
         pressed_mm = depth.astype(np.float32)
         on_pad_mpa = np.stack([cover.passed_on(one, self.cell_mm) for cover, one in zip(covers, pressure, strict=True)])
-        sideways_mpa = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction).traction_mpa
+        sideways_mpa, _ = self._friction.solve(on_pad_mpa, slide_mm, twist_rad, friction)
         loads = np.concatenate([sideways_mpa, on_pad_mpa[:, None]], axis=1)
         across = (np.arange(self.size) - (self.size - 1) / 2) * self.cell_mm
         moments = loads[:, 1] * across[None, :] - loads[:, 0] * across[:, None]
@@ -168,18 +138,15 @@ class GrippedPad:
             indentation_mm=pressed_mm,
         )
 
-    def tap(self, heights_mm: NDArray[np.float32], force_n: NDArray[np.floating] | float) -> Taps:
+    def tap(self, heights_mm: NDArray[np.float32], force_n: float) -> Taps:
         """Press flat figures straight down until the set force or MAX_INDENTATION_MM, whichever comes first.
 
-        On a flat figure the pressure is in proportion to the indentation: one solution serves all frames of a tap.
-
-        Args:
-            heights_mm: (n, m, m) as in `press`, of figures on a plate that the pad does not reach.
-            force_n: set force, one for all or (n,), in [N].
+        Heights (n, m, m) are as in `press`; the pad does not reach the plate under a figure. The pressure is then in
+        proportion to the indentation: one solution serves all frames of a tap.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         most_mm = np.full(len(heights_mm), MAX_INDENTATION_MM)
-        pressure, _ = self._pressed(BARE, cells_mm, share, most_mm.copy(), np.inf)
+        pressure, _ = self._pressed(BARE, cells_mm, share, most_mm, np.inf)
         most_n = pressure.sum(axis=(1, 2)) * self.cell_mm**2
         end = np.minimum(force_n / most_n, 1.0)[:, None] * (np.arange(FRAMES) + 1) / FRAMES
         covers, pressed_mm = [BARE] * len(heights_mm), most_mm.astype(np.float32)
@@ -204,15 +171,15 @@ class GrippedPad:
         """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
 
         Raises:
-            PressError: nothing lies under the pad.
+            SurfaceError: nothing lies under the pad.
         """
         if self._beside.any():
             heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)
         if not (heights_mm.max(axis=(1, 2)) > -100).all():
-            raise PressError("nothing lies under the pad: expected a shape that reaches it")
+            raise SurfaceError("nothing lies under the pad: expected a shape that reaches it")
         depth_mm = heights_mm.max(axis=(1, 2), keepdims=True) - heights_mm + self._uneven_mm
         depth_mm -= depth_mm.min(axis=(1, 2), keepdims=True)
-        parts_mm, share = carrying(depth_mm, self.size)
+        parts_mm, share = _carrying(depth_mm, self.size)
         return depth_mm, parts_mm.astype(np.float32), share
 
     def _pressed(
@@ -221,7 +188,7 @@ class GrippedPad:
         cells_mm: NDArray[np.float32],
         share: NDArray[np.float32],
         indentation_mm: NDArray[np.float64],
-        most_force_n: float,
+        most_force_n: float = MOST_FORCE_N,
     ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
         """Return pressures on the shape, and the indentations at which no force exceeds the limit."""
         solver = self._solver(cover)
@@ -245,14 +212,39 @@ class GrippedPad:
         covers: Sequence[Cover],
         depth_mm: NDArray[np.float32],
         cells_mm: NDArray[np.float32],
-        pressure: NDArray[np.float32],
+        pressure_mpa: NDArray[np.float32],
         on_pad_mpa: NDArray[np.float32],
         pressed_mm: NDArray[np.float32],
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Return patterns and contact areas at FINE_SCALE, of loads as in `pressed_in`."""
-        fine_mm, touching = pressed_in(
-            self._solver, covers, depth_mm, cells_mm, pressure, on_pad_mpa, pressed_mm, self._pattern_cells
-        )
+        """Return patterns and contact areas at FINE_SCALE, which is pixels of half a cell.
+
+        A cell's own deflection under its pressure on the shape, less its gap, is positive inside a contact and negative
+        outside; the contact's edge is where it passes through zero between the cells' centres. In contact with a rigid
+        shape the pad follows the shape; under a soft one its place follows from its own layer's deflection by the
+        pressure on the pad.
+        """
+        pixels = 2 * self._pattern_cells
+        rim = self.size - self._pattern_cells
+        middle = (slice(None), slice(rim, rim + pixels), slice(rim, rim + pixels))
+        fine_mm, fine_share = _carrying(depth_mm, 2 * self.size)
+        fine_mm, fine_share = fine_mm[middle], fine_share[middle]
+        indented_mm = pressed_mm[:, None, None]
+        close_mm = np.empty_like(pressure_mpa)
+        for cover, which in _which_of(covers):
+            solver = self._solver(cover)
+            gap_mm = solver.displacement_mm(pressure_mpa[which]) - (indented_mm[which] - cells_mm[which])
+            close_mm[which] = pressure_mpa[which] * np.float32(solver.cell_compliance_mm_per_mpa) - gap_mm
+        close_mm = np.where(cells_mm > _STEEP * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
+        to_pixels = _between(self.size, pixels)
+        touching = (to_pixels @ close_mm @ to_pixels.T > 0) & (fine_mm < REACH * indented_mm)
+        # The press always reaches the highest part, whichever cells that lies between.
+        bottom = fine_mm <= fine_mm.min(axis=(1, 2), keepdims=True) + 1e-4
+        touching = (touching | bottom) & _mostly(fine_share)
+        touching |= bottom & ~touching.any(axis=(1, 2), keepdims=True)  # a tip thinner than half a pixel
+        covered = np.array([cover != BARE for cover in covers])
+        if covered.any():
+            sunk_mm = to_pixels @ self._solver(BARE).displacement_mm(on_pad_mpa[covered]) @ to_pixels.T
+            fine_mm[covered] = np.clip(indented_mm[covered] - sunk_mm, 0, indented_mm[covered])
         patterns = heights_pattern(fine_mm, touching, pressed_mm, self.cell_mm / 2)
         return self._cut(patterns, FINE_SCALE), self._cut(touching, FINE_SCALE)
 
@@ -269,3 +261,36 @@ class GrippedPad:
             pad = self.pad
             self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.sides)
         return self._solvers[cover]
+
+
+def _carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the depth of each cell's carrying part, and its share of the cell, both (n, cells, cells).
+
+    Depths (n, m, m) are below the highest part; m is a multiple of `cells`, which is their number along a side.
+    """
+    samples = depth_mm.shape[1] // cells
+    parts = depth_mm.reshape(len(depth_mm), cells, samples, cells, samples)
+    carries = parts < parts.min(axis=(2, 4), keepdims=True) + _WALL_MM
+    count = carries.sum(axis=(2, 4))
+    return np.where(carries, parts, 0).sum(axis=(2, 4)) / count, (count / samples**2).astype(np.float32)
+
+
+def _which_of(covers: Sequence[Cover]) -> Iterable[tuple[Cover, NDArray[np.int64]]]:
+    """Yield each cover once, with the numbers of the presses that have it."""
+    for cover in dict.fromkeys(covers):
+        yield cover, np.array([number for number, one in enumerate(covers) if one == cover])
+
+
+def _mostly(share: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the pixels whose carrying part is more than half, and every other one of those with exactly half.
+
+    The mean place of an edge is then correct; with all of these it would lie a quarter of a pixel further out.
+    """
+    rows, cols = np.indices(share.shape[1:])
+    return np.where((rows + cols) % 2, share > 0.5, share >= 0.5)
+
+
+def _between(size: int, pixels: int) -> NDArray[np.float32]:
+    """Return weights (pixels, size) of linear interpolation from cells to pixels of half a cell, both centred."""
+    place = ((np.arange(pixels) - (pixels - 1) / 2) / 2 + (size - 1) / 2)[:, None]
+    return np.maximum(1 - np.abs(place - np.arange(size)), 0).astype(np.float32)

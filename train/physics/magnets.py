@@ -22,28 +22,13 @@ _DIPOLE_CLEARANCE: Final = 0.75
 
 @dataclass(frozen=True, slots=True)
 class Magnet:
-    """Small axial cylinder in the pad and the chip under it; no data sheet states their sizes.
-
-    Attributes:
-        remanence_t: of the material; 1.2 is common neodymium.
-        height_mm: of the magnet's centre above the board.
-        chip_height_mm: of the sensitive spot above the board, under the magnet's centre.
-    """
+    """Small axial cylinder in the pad and the chip under it; no data sheet states their sizes."""
 
     diameter_mm: float = 1.0
     thickness_mm: float = 0.5
-    remanence_t: float = 1.2
-    height_mm: float = 2.5
-    chip_height_mm: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not (self.diameter_mm > 0 and self.thickness_mm > 0 and self.remanence_t > 0):
-            raise ValueError(f"diameter, thickness and remanence must be positive, got {self}")
-        if not self.clearance_mm > 0:
-            raise ValueError(
-                f"the magnet touches its chip: height {self.height_mm} mm less half its thickness "
-                f"is not above the chip at {self.chip_height_mm} mm"
-            )
+    remanence_t: float = 1.2  # common neodymium
+    height_mm: float = 2.5  # of the magnet's centre above the board
+    chip_height_mm: float = 0.5  # of the sensitive spot above the board, under the magnet's centre
 
     @property
     def gap_mm(self) -> float:
@@ -89,11 +74,8 @@ def dipole_mt(magnet: Magnet, away_mm: Vectors, axis: Vectors) -> Vectors:
 class MagnetArray:
     """One magnet over one chip per taxel.
 
-    Args:
-        geometry: the taxels.
-        magnet: the same in every taxel.
-        rest: place and lean of each magnet at rest, as a movement, (taxels, 5); None for no deviation.
-        moments: of each magnet as a share of the nominal one, (taxels,); None for nominal moments.
+    `rest` is the place and lean of each magnet at rest, as a movement (taxels, 5), `moments` (taxels,) a share of the
+    nominal one's.
     """
 
     def __init__(
@@ -101,13 +83,13 @@ class MagnetArray:
         geometry: SensorGeometry,
         magnet: Magnet,
         rest: NDArray[np.floating] | None = None,
-        moments: NDArray[np.floating] | None = None,
+        moments: NDArray[np.floating] | float = 1.0,
     ) -> None:
         self.magnet = magnet
         self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm
         nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)))
         self._rest = (nowhere if rest is None else rest).astype(np.float32)
-        self._moments = None if moments is None else moments.astype(np.float32)
+        self._moments = np.asarray(moments, dtype=np.float32)
         self._check_clear(magnet.clearance_mm - float(self._rest[:, _DOWN].max()))
         centres_mm = geometry.taxel_centres_mm().T
         # (2, chips, magnets): from each magnet to each chip, at rest.
@@ -139,6 +121,4 @@ class MagnetArray:
         gap_mm = down.dtype.type(self.magnet.gap_mm)
         away_mm = (self._apart_mm[0] - right, self._apart_mm[1] - back, down - gap_mm)
         flux = dipole_mt(self.magnet, away_mm, (lean_x * upright, lean_y * upright, upright))
-        if self._moments is not None:
-            flux = tuple(part * self._moments for part in flux)
-        return np.stack([part.sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)
+        return np.stack([(part * self._moments).sum(axis=-1) for part in flux], axis=-1, dtype=movement.dtype)

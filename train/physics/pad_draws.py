@@ -30,34 +30,21 @@ _MOMENT: Final = 0.015
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pad:
-    """The constants of one simulated sensor.
-
-    Attributes:
-        thickness_mm: of the soft layer.
-        shear_modulus_mpa: of its material.
-        poisson: effective Poisson ratio.
-        in_plane_share: factor on the in-plane movement that pressure alone gives the magnets, which in reality
-            friction holds: grips have an in-plane to normal ratio of .18 to .26, without the factor it would be .57.
-        magnet_height_mm: of the magnets' centres above the board.
-        counts_per_newton: summed z under an even load.
-        pitch_mm: distance of neighbouring taxels, of another model in proportion to its own.
-        free_sides: compliance of the pad's free sides, 0 for an infinite layer, 1 for the finite elements' pad.
-        uneven_mm: RMS of the pad's own unevenness.
-        seed: of the unevenness and of the differences between magnets; None for a perfect pad.
-        model: name of its grid, see firmware_bridge.pad_geometry.PADS.
-    """
+    """The constants of one simulated sensor; those of its soft layer and magnets come first."""
 
     thickness_mm: float = 4.5
     shear_modulus_mpa: float = 0.12
     poisson: float = 0.45
     in_plane_share: float = 0.4
+    """Factor on the in-plane movement that pressure alone gives the magnets, which in reality friction holds: grips
+    have an in-plane to normal ratio of .18 to .26, without the factor it would be .57."""
     magnet_height_mm: float = 2.5
-    counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z
-    pitch_mm: float = USPA44.pitch_mm
-    free_sides: float = 0.0
-    uneven_mm: float = 0.0
-    seed: int | None = None
-    model: str = USPA44.name
+    counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z  # summed z under an even load
+    pitch_mm: float = USPA44.pitch_mm  # of another model in proportion to its own
+    free_sides: float = 0.0  # compliance, 0 for an infinite layer, 1 for the finite elements' pad
+    uneven_mm: float = 0.0  # RMS of its face
+    seed: int | None = None  # of the unevenness and of the differences between magnets; None for a perfect pad
+    model: str = USPA44.name  # of firmware_bridge.pad_geometry.PADS
 
     @property
     def grid(self) -> SensorGeometry:
@@ -128,15 +115,8 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 }
 """Bounds of the constants that are drawn uniformly; docs/train.md has the reason for each."""
 
-INPUTS: Final = (
-    "thickness_mm",
-    "shear_modulus_mpa",
-    "poisson",
-    "in_plane_share",
-    "magnet_height_mm",
-    "counts_per_newton",
-)
-"""Constants that a network takes as optional inputs."""
+INPUTS: Final = tuple(RANGES)[:6]
+"""Constants that a network takes as optional inputs: all but the pitch and the free sides."""
 
 KNOWN: Final = 2 * len(INPUTS) + 1
 """Number of pad inputs of a network: values, a flag for each of them, and the certainty of the gains."""

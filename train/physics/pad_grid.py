@@ -28,12 +28,7 @@ Place = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 class PadGrid:
     """Grid of `size` cells a side of `cell_mm` over a pad, and what its kernels make of loads.
 
-    Args:
-        layer: the pad.
-        size: cells along a side.
-        cell_mm: cell size, in [mm].
-        dtype: torch.float32 or torch.float64.
-        compliance: displacement per load in [mm/MPa], (m, k) or (kernels, m, k), at `waves` (1, k) and (m, 1).
+    `compliance` is the displacement per load in [mm/MPa], (m, k) or (kernels, m, k), at `waves` (1, k) and (m, 1).
     """
 
     def __init__(
@@ -42,7 +37,7 @@ class PadGrid:
         size: int,
         cell_mm: float,
         dtype: torch.dtype,
-        compliance: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+        compliance: Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.float64]],
     ) -> None:
         period = 2 * max(size, ceil(_DIES_WITHIN / 2 * layer.thickness_mm / cell_mm))
         self._kernels = np.fft.irfft2(compliance(*waves(period, cell_mm)), s=(period, period))
@@ -81,9 +76,7 @@ class PadGrid:
             yield presses[alike], (presses[alike, None, None], rows[:, :, None], columns[:, None, :])
 
 
-def waves(period: int, cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def waves(period: int, cell_mm: float) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Return wave numbers to the right (1, period / 2 + 1) and back (period, 1), in [1/mm]."""
     right, back = np.fft.rfftfreq(period, cell_mm), np.fft.fftfreq(period, cell_mm)
-    return 2 * np.pi * np.asarray(right, dtype=np.float64)[None], 2 * np.pi * np.asarray(back, dtype=np.float64)[
-        :, None
-    ]
+    return 2 * np.pi * right[None], 2 * np.pi * back[:, None]

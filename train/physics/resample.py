@@ -16,9 +16,6 @@ def resample(
     """Resample maps (n, H, W) from one number of pixels per pitch to another: (n, H', W'), in the same unit.
 
     Towards a finer scale a pixel is repeated: no detail is added. Of a mask, the share of each pixel that is set.
-
-    Raises:
-        ValueError: the scales do not give a whole number of pixels.
     """
     maps = np.asarray(patterns, dtype=np.float32)
     if from_scale == to_scale:
@@ -36,14 +33,7 @@ def resample_touching(touching: NDArray[np.bool_], from_scale: float, to_scale: 
 @lru_cache
 def _shares(length: int, from_scale: float, to_scale: float) -> NDArray[np.float32]:
     """Return the share of each old pixel in each new one along a line, (new, old); rows sum to 1."""
-    if not (from_scale > 0 and to_scale > 0):
-        raise ValueError(f"scales {from_scale} and {to_scale}, expected positive numbers of pixels per pitch")
-    ratio = to_scale / from_scale
-    count = round(length * ratio)
-    if abs(count - length * ratio) > 1e-6 * length or count == 0:
-        raise ValueError(
-            f"{length} pixels at x{from_scale:g} are {length * ratio:g} at x{to_scale:g}, expected a whole number"
-        )
+    count = round(length * to_scale / from_scale)
     new = np.arange(count + 1) / count
     old = np.arange(length + 1) / length
     overlap = np.minimum(new[1:, None], old[None, 1:]) - np.maximum(new[:-1, None], old[None, :-1])

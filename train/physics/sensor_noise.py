@@ -8,18 +8,17 @@ Of the lag: with c the elastic reading, a reading is (1 - share) c + share q wit
 standard linear solid, a spring parallel to one Maxwell element.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from math import inf, isfinite
+from math import inf
 from typing import Final, Self
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
-from train.errors import TrainError
 from train.surfaces.depth_image import Pose
 
 Seed = int | Sequence[int] | np.random.SeedSequence
@@ -30,10 +29,6 @@ TAP_S: Final = (0.2, 2.5)
 """Bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15."""
 _RELAXATION_S: Final = (0.2, 5.0)
 _OFF: Final = {"saturation_counts": (inf, inf, inf)}
-
-
-class NuisanceError(TrainError, ValueError):
-    """Invalid nuisances, or readings that they cannot act on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,28 +65,8 @@ class Nuisances:
     saturation_counts: tuple[float, float, float] = LARGEST_COUNTS
     dead_taxels: float = 0.0
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "saturation_counts", tuple(self.saturation_counts))  # a list, if it comes from JSON
-        if len(self.saturation_counts) != len(AXES) or not all(limit > 0 for limit in self.saturation_counts):
-            raise NuisanceError(
-                f"saturation_counts is {self.saturation_counts}, expected three numbers above 0 for x, y, z; inf is off"
-            )
-        largest = {"hysteresis": 1.0, "cross_talk": 1.0, "dead_taxels": 1.0, "gain_spread": 0.5}  # no negative gain
-        for name in set(NAMES) - {"saturation_counts"}:
-            value, most = getattr(self, name), largest.get(name, inf)
-            if not (isfinite(value) and 0 <= value <= most):
-                raise NuisanceError(f"{name} is {value}, expected 0 (off) to {most:g}, finite")
-
-    @classmethod
-    def none(cls) -> Self:
-        """Return the nuisances with all switched off: readings are only rounded."""
-        return cls().without(*NAMES)
-
     def without(self, *names: str) -> Self:
         """Return these nuisances with the named ones off."""
-        for name in names:
-            if name not in NAMES:
-                raise NuisanceError(f"no nuisance is called {name!r}: expected one of {', '.join(NAMES)}")
         return replace(self, **{name: _OFF.get(name, 0.0) for name in names})
 
 
@@ -105,22 +80,60 @@ def apply_nuisances(
     seed: Seed,
     tap_s: ArrayLike | None = None,
     angle_deg: ArrayLike = 0.0,
+    frame: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
-    """Return the readings of n sensors in every frame of their K taps.
+    """Return the readings of n sensors in their K taps, (n, K, m, 3, rows, cols) in whole zeroed counts.
 
     Args:
         clean: (n, K, F, 3, rows, cols) zeroed counts, newest tap first; frames evenly spaced in time, the first one
             a step after the pad was free.
         nuisances: of these sensors.
         seed: every nuisance draws from an independent stream of it, so switching one off changes no other.
-        tap_s: durations, broadcast to (n, K), in [s]; None draws them between the bounds of TAP_S.
+        tap_s: durations, broadcast to (n, K), above 0, in [s]; None draws them between the bounds of TAP_S.
         angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.surfaces.depth_image.Pose.
-
-    Returns:
-        Whole zeroed counts, shape of `clean`.
+        frame: moments (n, K, m) of the readings, in frames since the pad was free; None for every frame.
     """
-    frame = np.broadcast_to(np.arange(1.0, clean.shape[2] + 1), clean.shape[:3])
-    return _read(clean, frame, nuisances, seed, tap_s, angle_deg)
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    n, taps, frames, *scan = clean.shape
+    if frame is None:
+        frame = np.broadcast_to(np.arange(1.0, frames + 1), (n, taps, frames))
+
+    def stream(name: str) -> np.random.Generator:
+        key = (*root.spawn_key, crc32(name.encode()))
+        return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
+
+    lag = np.zeros((2, n))
+    if nuisances.hysteresis:
+        rng = stream("hysteresis")
+        lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
+        lag[1] = log_uniform(rng, *_RELAXATION_S, (n,))
+    duration_s = log_uniform(stream("tap_s"), *TAP_S, (n, taps)) if tap_s is None else np.asarray(tap_s)
+    weights = frame_weights(frame, frames, np.broadcast_to(duration_s, (n, taps)) / frames, *lag)
+    flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
+    counts = (weights @ flat).reshape(n, taps, -1, *scan)
+
+    if nuisances.cross_talk:
+        largest = stream("cross_talk").random((n, 1, 1, 1, 1), dtype=np.float32) * np.float32(nuisances.cross_talk)
+        flat = counts.reshape(n, taps, -1, len(AXES), scan[1] * scan[2])
+        counts = (flat + largest * (flat @ neighbours(scan[1], scan[2]))).reshape(counts.shape)
+    if nuisances.gain_spread:
+        counts *= 1 + np.float32(nuisances.gain_spread) * _cut_normal(stream("gain_spread"), (n, 1, 1, *scan))
+    if nuisances.thermal_drift_counts:
+        drift = nuisances.thermal_drift_counts * _draw_drift(stream("thermal_drift_counts"), n, scan)
+        counts += drift[:, None, None]
+    if nuisances.earth_field_counts:
+        turn = np.broadcast_to(np.radians(np.asarray(angle_deg, dtype=np.float64)), (n, taps))
+        earth = nuisances.earth_field_counts * _draw_earth(stream("earth_field_counts"), turn)
+        counts += earth[:, :, None, :, None, None]
+    if nuisances.noise_counts:
+        noise = stream("noise_counts").standard_normal((*frame.shape, *scan), dtype=np.float32)
+        counts += np.float32(nuisances.noise_counts) * noise
+    limit = np.array(nuisances.saturation_counts, dtype=np.float32)[:, None, None]
+    np.clip(counts, -limit, limit, out=counts)
+    if nuisances.dead_taxels:
+        dead = stream("dead_taxels").random((n, 1, 1, 1, *scan[1:])) < nuisances.dead_taxels
+        counts = np.where(dead, np.float32(0), counts)
+    return np.rint(counts)
 
 
 def read_windows(
@@ -136,77 +149,15 @@ def read_windows(
     `share`, broadcast to (n, K), is the completed share of each press, 0 to 1; readings are interpolated linearly
     between frames. The other arguments are those of `apply_nuisances`.
     """
-    shares = _per_tap("share", share, clean)
-    if not ((shares >= 0) & (shares <= 1)).all():
-        raise NuisanceError(f"shares of a press are {shares.min():g} to {shares.max():g}, expected 0 to 1")
-    return _read(clean, shares[..., None] * clean.shape[2], nuisances, seed, tap_s, angle_deg)[:, :, 0]
+    frame = np.broadcast_to(np.asarray(share, dtype=np.float64), clean.shape[:2])[..., None] * clean.shape[2]
+    return apply_nuisances(clean, nuisances, seed, tap_s, angle_deg, frame)[:, :, 0]
 
 
 def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nuisances) -> list[Pose]:
     """Return the true poses of a sensor that was commanded to these poses."""
     off = _cut_normal(rng, (len(poses), 3))
     off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
-    return [
-        Pose(pose.x_mm + float(x_mm), pose.y_mm + float(y_mm), pose.angle_deg + float(turn_deg))
-        for pose, (x_mm, y_mm, turn_deg) in zip(poses, off, strict=True)
-    ]
-
-
-def draw_rest(rng: np.random.Generator, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """Draw the rest level of one sensor, (3, rows, cols) in raw counts, different for each axis and taxel."""
-    level = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
-    return (level + rng.standard_normal(geometry.scan_shape) * 300.0).astype(np.float32)
-
-
-def _read(
-    clean: NDArray[np.float32],
-    frame: NDArray[np.float64],
-    nuisances: Nuisances,
-    seed: Seed,
-    tap_s: ArrayLike | None,
-    angle_deg: ArrayLike,
-) -> NDArray[np.float32]:
-    """Return readings (n, K, m, 3, rows, cols) at the moments `frame` (n, K, m), in frames since the pad was free."""
-    if clean.ndim != 6 or clean.shape[3] != len(AXES):
-        raise NuisanceError(f"readings have shape {clean.shape}, expected (n, K, F, {len(AXES)}, rows, cols)")
-    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-    n, taps, frames, *scan = clean.shape
-
-    def stream(name: str) -> np.random.Generator:
-        key = (*root.spawn_key, crc32(name.encode()))
-        return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
-
-    lag = np.zeros((2, n))
-    if nuisances.hysteresis:
-        rng = stream("hysteresis")
-        lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
-        lag[1] = _log_uniform(rng, *_RELAXATION_S, (n,))
-    weights = frame_weights(frame, frames, _durations_s(tap_s, clean, stream) / frames, *lag)
-    flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
-    counts = (weights @ flat).reshape(n, taps, -1, *scan)
-
-    if nuisances.cross_talk:
-        largest = stream("cross_talk").random((n, 1, 1, 1, 1), dtype=np.float32) * np.float32(nuisances.cross_talk)
-        flat = counts.reshape(n, taps, -1, len(AXES), scan[1] * scan[2])
-        counts = (flat + largest * (flat @ neighbours(scan[1], scan[2]))).reshape(counts.shape)
-    if nuisances.gain_spread:
-        counts *= 1 + np.float32(nuisances.gain_spread) * _cut_normal(stream("gain_spread"), (n, 1, 1, *scan))
-    if nuisances.thermal_drift_counts:
-        drift = nuisances.thermal_drift_counts * _draw_drift(stream("thermal_drift_counts"), n, scan)
-        counts += drift[:, None, None]
-    if nuisances.earth_field_counts:
-        turn = np.radians(_per_tap("angle_deg", angle_deg, clean))
-        earth = nuisances.earth_field_counts * _draw_earth(stream("earth_field_counts"), turn)
-        counts += earth[:, :, None, :, None, None]
-    if nuisances.noise_counts:
-        noise = stream("noise_counts").standard_normal((*frame.shape, *scan), dtype=np.float32)
-        counts += np.float32(nuisances.noise_counts) * noise
-    limit = np.array(nuisances.saturation_counts, dtype=np.float32)[:, None, None]
-    np.clip(counts, -limit, limit, out=counts)
-    if nuisances.dead_taxels:
-        dead = stream("dead_taxels").random((n, 1, 1, 1, *scan[1:])) < nuisances.dead_taxels
-        counts = np.where(dead, np.float32(0), counts)
-    return np.rint(counts)
+    return [Pose(*true) for true in (np.array(poses) + off).tolist()]
 
 
 def _draw_drift(rng: np.random.Generator, n: int, scan: Sequence[int]) -> NDArray[np.float32]:
@@ -238,20 +189,11 @@ def frame_weights(
     share: NDArray[np.float64],
     relaxation_s: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the weight of each frame of a press in a reading at any moment of it, in closed form.
+    """Return the weight (n, K, m, frames) of each frame of a press in readings at moments `frame`, in closed form.
 
-    Readings are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second
-    difference of the responses to ramps, and that of the lagging share is t - tau (1 - exp(-t / tau)).
-
-    Args:
-        frame: moments of n sensors' K taps, (n, K, m), in frames since the pad was free.
-        frames: of a press; the first one is a step after the pad was free.
-        step_s: time from frame to frame, (n, K), in [s].
-        share: lagging share, (n,).
-        relaxation_s: (n,), above 0 where a share lags, in [s].
-
-    Returns:
-        (n, K, m, frames).
+    Moments (n, K, m) are in frames since the pad was free, one step of `step_s` (n, K) before the first frame. Readings
+    are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second difference of
+    the responses to ramps, and that of the lagging share (n,) is t - tau (1 - exp(-t / tau)), tau the relaxation (n,).
     """
     ramp = np.maximum(frame[..., None] - np.arange(frames + 2), 0)
     if share.any():
@@ -260,7 +202,8 @@ def frame_weights(
     return np.diff(ramp, n=2).astype(np.float32)
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def log_uniform(rng: np.random.Generator, low: float, high: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Draw numbers whose logarithms are uniform."""
     return np.exp(rng.uniform(np.log(low), np.log(high), shape))
 
 
@@ -272,22 +215,3 @@ def neighbours(rows: int, cols: int) -> NDArray[np.float32]:
     """Return the share of a taxel's outflow that reaches another, (taxels, taxels): a quarter over each edge."""
     row, col = np.divmod(np.arange(rows * cols), cols)
     return ((abs(row[:, None] - row) + abs(col[:, None] - col)) == 1).astype(np.float32) / 4
-
-
-def _durations_s(
-    tap_s: ArrayLike | None, clean: NDArray, stream: Callable[[str], np.random.Generator]
-) -> NDArray[np.float64]:
-    if tap_s is None:
-        return _log_uniform(stream("tap_s"), *TAP_S, clean.shape[:2])
-    durations_s = _per_tap("tap_s", tap_s, clean)
-    if not ((durations_s > 0) & np.isfinite(durations_s)).all():
-        raise NuisanceError(f"taps last {durations_s.min():g} to {durations_s.max():g} s, expected more than 0, finite")
-    return durations_s
-
-
-def _per_tap(name: str, values: ArrayLike, clean: NDArray) -> NDArray[np.float64]:
-    given = np.asarray(values, dtype=np.float64)
-    try:
-        return np.broadcast_to(given, clean.shape[:2])
-    except ValueError:
-        raise NuisanceError(f"{name} has shape {given.shape}, expected one for each tap, {clean.shape[:2]}") from None

@@ -36,20 +36,11 @@ class FreeSides:
 
     amplitude: float = 1.0
 
-    def __post_init__(self) -> None:
-        if not self.amplitude >= 0:
-            raise ValueError(f"amplitude is {self.amplitude}, expected 0 or more: below 0 a pad could push back")
-
     def profiles(self, layer: Layer, cells_mm: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return shares of the added compliance across and along a pair of sides.
+        """Return shares of the added compliance across and along a pair of sides, for cells (size,) from the centre.
 
-        Args:
-            layer: the pad.
-            cells_mm: (size,), places of the cells from the centre.
-
-        Returns:
-            across (terms, 2, size), lower side first, and along (terms, size, size) in [mm/N]: a force at (x', y') adds
-            across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
+        They are across (terms, 2, size), lower side first, and along (terms, size, size) in [mm/N]: a force at (x', y')
+        adds across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
         """
         scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
         apart_mm = cells_mm[:, None] - cells_mm
@@ -62,10 +53,7 @@ class FreeSides:
     ) -> NDArray[np.float64]:
         """Return the MOVEMENT of the magnets that the sides add, (taxels, 5, size, size) in [mm/N] and [1/N].
 
-        Args:
-            layer: the pad.
-            cells_mm: (size,), places of the loaded cells from the centre, along x as along y.
-            magnets_mm: (taxels, 2), x and y.
+        Loaded cells are at places (size,) from the centre along x as along y, magnets at x and y (taxels, 2).
         """
         scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
 
@@ -94,9 +82,8 @@ class FreeSides:
 class SideGive:
     """Compliance of the surface on boxes of a grid: a few small matrix products in a step of the contact solver.
 
-    Args:
-        across: (n, terms, 2, width) and (n, terms, 2, height), the profiles at the boxes' columns and rows.
-        along: (terms, height, height) and (terms, width, width), in [mm/MPa].
+    The profiles of `FreeSides` are (n, terms, 2, width) and (n, terms, 2, height) across at the boxes' columns and
+    rows, (terms, height, height) and (terms, width, width) along, in [mm/MPa].
     """
 
     def __init__(self, across: tuple[torch.Tensor, torch.Tensor], along: tuple[torch.Tensor, torch.Tensor]) -> None:

@@ -40,11 +40,6 @@ class Skin:
 
     def __init__(self, pad: Pad, size: int, cell_mm: float) -> None:
         geometry, layer, magnet = pad.geometry(), pad.layer, pad.magnet
-        if magnet.height_mm + magnet.thickness_mm / 2 > layer.thickness_mm:
-            raise ValueError(
-                f"a magnet {magnet.thickness_mm} mm thick at {magnet.height_mm} mm does not fit into a layer of "
-                f"{layer.thickness_mm} mm"
-            )
         self._grid = (geometry, layer, size, cell_mm, magnet)
         taxels = geometry.taxel_count
         self._magnets = MagnetArray(geometry, magnet, pad.rest(taxels), pad.moments(taxels))
@@ -69,11 +64,9 @@ class Skin:
     def movement(
         self, pressure_mpa: NDArray[np.floating], traction_mpa: NDArray[np.floating] | None = None
     ) -> NDArray[np.floating]:
-        """Return the movement of the magnets under loads on the pad: (..., taxels, 5), train.physics.magnets.MOVEMENT.
+        """Return the MOVEMENT of the magnets, (..., taxels, 5), under loads on the pad.
 
-        Args:
-            pressure_mpa: (..., size, size), in [MPa].
-            traction_mpa: on the pad's surface, to the right and back, (..., 2, size, size), in [MPa]; none if None.
+        Pressure is (..., size, size), traction (..., 2, size, size) to the right and back.
         """
         taxels, parts, cells = self._response.shape
         moved = pressure_mpa.reshape(-1, cells) @ self._response.reshape(-1, cells).T

@@ -26,16 +26,10 @@ EDGE_BETA_MM: Final = 0.6
 def tpsf_pattern(
     touching: NDArray[np.bool_], indentation_mm: NDArray[np.floating], pixel_mm: float, beta_mm: float = BETA_MM
 ) -> NDArray[np.float32]:
-    """Return the surface deformation of flat contacts, (n, H, W) in [mm].
+    """Return the surface deformation of flat contacts, (n, H, W) in [mm], of areas (n, H, W) and indentations (n,).
 
     The kernel's intensity alpha follows from the rigid flat contact: in it, the pad is pressed in by the indentation,
-    so the plateau equals it.
-
-    Args:
-        touching: (n, H, W), the area that the surface touches.
-        indentation_mm: (n,).
-        pixel_mm: pixel size.
-        beta_mm: reach of the kernel, > 0.
+    so the plateau equals it. Its reach is beta.
     """
     area = torch.from_numpy(np.ascontiguousarray(touching))
     response = spread(area.float(), torch.tensor([beta_mm], dtype=torch.float32), pixel_mm)
@@ -54,15 +48,11 @@ def heights_pattern(
 ) -> NDArray[np.float32]:
     """Return the surface deformation under rigid surfaces of any shape, (n, H, W) in [mm].
 
+    Depths (n, H, W) are below the highest point, whose indentation is (n,); `touching` (n, H, W) is the contact area.
+
     The planes divide the indentation into equal slices; only planes with touching pixels are computed. A plane at a
     share s of the indentation has an alpha that would lift the whole contact to that height, and a beta between
     EDGE_BETA_MM, at s = 0, and BETA_MM, at s = 1.
-
-    Args:
-        depth_mm: (n, H, W), depth of each pixel below the highest point, in [mm].
-        touching: (n, H, W), the area that the surface touches.
-        indentation_mm: (n,), of the highest point, in [mm].
-        pixel_mm: pixel size, in [mm].
     """
     area = torch.from_numpy(np.ascontiguousarray(touching))
     total_mm = torch.as_tensor(np.asarray(indentation_mm, dtype=np.float32))[:, None, None]
@@ -88,8 +78,6 @@ def spread(maps: Tensor, beta_mm: Tensor, pixel_mm: float) -> Tensor:
 
     The Gaussian is a product of two curves, and takes two products of matrices.
     """
-    if not bool((beta_mm > 0).all()):
-        raise ValueError(f"beta is {float(beta_mm.min())} mm, expected a positive length")
     height, width = maps.shape[1:]
     down = _curve(height, beta_mm, pixel_mm)
     right = down if width == height else _curve(width, beta_mm, pixel_mm)

@@ -4,9 +4,8 @@ A pose turns the surface's triangles into the pad's axes; those whose bounding b
 straight onto the requested grid, so that every pixel's depth is exact at the pixel's centre.
 """
 
-from dataclasses import dataclass
 from math import cos, radians, sin
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import trimesh
@@ -20,8 +19,7 @@ _ROUNDING_PX: Final = 1e-9
 """Tolerance in [px], so that no pixel on the common edge of two triangles is missed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
+class Pose(NamedTuple):
     """Pose of a tap: its centre over the surface in [mm] and its turn about z in [deg]."""
 
     x_mm: float

@@ -44,17 +44,14 @@ def size_of(name: str) -> str:
     return f"{path.name}: {_sides(load_mesh(path, unit_mm).extents)}, {unit}"
 
 
-def load_mesh(path: str | Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
+def load_mesh(path: Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     """Read an STL, OBJ or PLY file as a closed surface in [mm]: z up as it stands, top at z = 0, centred on x = y = 0.
 
-    Args:
-        path: the file; several bodies in it are taken together.
-        unit_mm: length of the file's unit, > 0, in [mm]; 1000 for metres, 25.4 for inches.
+    Several bodies in it are taken together.
 
     Raises:
         MeshError: the file is absent, broken, empty, open, flat, or of an impossible size.
     """
-    path = Path(path)
     if not (isfinite(unit_mm) and unit_mm > 0):
         raise MeshError(f"--unit-mm is {unit_mm:g}; it must be a length above 0, such as 1000 for a file in metres")
     corners, faces = _read(path)

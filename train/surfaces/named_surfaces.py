@@ -9,6 +9,7 @@ slits and slivers finer than half a millimetre, is left out.
 Source: Wu and Liu 2024, Fig. 1c (two plates of nine surfaces).
 """
 
+from functools import lru_cache
 from math import cos, pi, radians, sin
 from typing import Final, Literal, cast
 
@@ -19,6 +20,7 @@ from shapely import LinearRing, LineString, Polygon, affinity, set_precision, un
 from shapely.geometry.base import BaseGeometry
 
 from train.errors import SurfaceError
+from train.surfaces.depth_image import Relief
 from train.surfaces.meshes import MESH, load_mesh, mesh_file
 
 PLATE_MM: Final = 20.0
@@ -62,19 +64,14 @@ _STROKES: Final[dict[str, list[Points]]] = {
 _CORNERS: Final = {"circle": 96, "square": 4, "triangle": 3}
 
 LETTERS: Final = tuple(_STROKES)
+"""Names of the nine surfaces on the first of the paper's contact plates."""
 SHAPES: Final = tuple(f"{form} {shape}" for shape in _CORNERS for form in ("hollow", "large", "small"))
-
-PLATES: Final = (LETTERS, SHAPES)
-"""Names of the surfaces on the paper's two contact plates, nine each."""
 SURFACES: Final = LETTERS + SHAPES
-"""Names of the 18 surfaces."""
+"""Names of the 18 surfaces, nine on each plate."""
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:
-    """Return the mesh of one surface, figure and base plate as closed bodies side by side, centred on x = y = 0.
-
-    Args:
-        name: that of a figure, see `figure`; a user's file as `mesh_name` names it, without a plate.
+    """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0.
 
     Raises:
         SurfaceError: no surface of that name.
@@ -87,6 +84,12 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
     plate = trimesh.creation.box([PLATE_MM, PLATE_MM, _PLATE_THICKNESS_MM])
     plate.apply_translation([0, 0, -FIGURE_HEIGHT_MM - _PLATE_THICKNESS_MM / 2])
     return cast(trimesh.Trimesh, trimesh.util.concatenate([*raised, plate]))
+
+
+@lru_cache(maxsize=64)
+def relief(name: str) -> Relief:
+    """Return a surface of `surface_mesh` to be drawn from above."""
+    return Relief(name, surface_mesh(name))
 
 
 def figure(name: str) -> BaseGeometry:

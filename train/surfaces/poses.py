@@ -1,14 +1,14 @@
 """Poses of the taps on a surface: the paper's schedule, poses drawn at random, and schedules of further taps.
 
-The paper taps each surface at nine positions, turned nine ways: record = position * 9 + rotation. A target is a tap
-whose pattern is reconstructed; the taps before it are made at the same place, each turned back by one more angle
-step. Targets are split by position: one for the test and one for validation, 72 targets each, the same for every K.
+The paper taps each surface at nine positions, turned nine ways. A target is a tap whose pattern is reconstructed; the
+taps before it are made at the same place, each turned back by one more angle step. Targets are split by position: one
+for the test and one for validation, 72 targets each, the same for every K.
 
 A schedule says where the pad was in earlier taps, in the newest one's axes, newest tap first: x, y in [mm] and a turn
 in [deg], as in `firmware_bridge.poses`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Final, Literal
 
 import numpy as np
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import USPA44
 from train.surfaces.depth_image import Pose
 
+Split = Literal["validation", "test"]
+PLACES_MM: Final[Mapping[Split, tuple[float, float]]] = {"test": (-2.5, 2.5), "validation": (0.0, 2.5)}
+"""Place of each split's targets: the first two of the paper's positions, a grid of 3 x 3 around the centre."""
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
-POSITION_STEP_MM: Final = 2.5
-TEST_POSITION: Final = 0
-VALIDATION_POSITION: Final = 1
 HELD_OUT_RADIUS_MM: Final = 1.0
 """Distance that random poses keep from the two held-out positions, in [mm]; see docs/decisions.md."""
 SURFACE_REACH_MM: Final = 3.5
@@ -35,33 +35,13 @@ NEAR_MM: Final = 3.0
 NEAR_DEG: Final = 45.0
 """Bounds of most random poses."""
 
-Split = Literal["validation", "test"]
 Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
 """Function from draws and a number of taps, K, to their poses (K, 3)."""
 
 
-def position_mm(index: int) -> tuple[float, float]:
-    """Return x and y in [mm] of one of the nine positions of the 3 x 3 grid."""
-    return ((index % 3 - 1) * POSITION_STEP_MM, (1 - index // 3) * POSITION_STEP_MM)
-
-
-def paper_taps_of(
-    split: Split, surfaces: Sequence[str], taps: int = MAX_TAPS, angle_step_deg: float = ANGLE_STEP_DEG
-) -> tuple[list[str], list[Pose]]:
-    """Return the names of a split's targets, each surface in four turns, and the poses of their taps, newest first."""
-    if not 1 <= taps <= MAX_TAPS:
-        raise ValueError(f"{taps} taps in a sequence: expected 1 to {MAX_TAPS}")
-    if not 0 <= angle_step_deg <= 180:
-        raise ValueError(f"angle step of {angle_step_deg} deg: expected 0 to 180")
-    place = position_mm(TEST_POSITION if split == "test" else VALIDATION_POSITION)
-    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
-    turns = [angle - angle_step_deg * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
-    return names, [Pose(*place, turn_deg) for _ in surfaces for turn_deg in turns]
-
-
 def random_poses(rng: np.random.Generator, count: int) -> list[Pose]:
     """Draw places and angles away from the held-out positions."""
-    held_out_mm = np.array([position_mm(TEST_POSITION), position_mm(VALIDATION_POSITION)])
+    held_out_mm = np.array([*PLACES_MM.values()])
     poses: list[Pose] = []
     while len(poses) < count:
         x_mm, y_mm = rng.uniform(-SURFACE_REACH_MM, SURFACE_REACH_MM, 2)

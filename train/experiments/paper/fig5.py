@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from firmware_bridge.pad_geometry import USPA44
+from train.data.paper_taps import tap
 from train.experiments.support.workbench import Workbench
-from train.families.catalogue import heights_of
 from train.networks.tpsf_net import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.gripped import FINE_SCALE, FRAMES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
@@ -35,8 +35,7 @@ def run(bench: Workbench, folder: Path) -> Path:
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
     places = random_poses(np.random.default_rng(5), len(names))
-    heights = [heights_of(name, pose, pad) for name, pose in zip(names, places, strict=True)]
-    taps = pad.tap(np.stack(heights), 5.0)
+    taps = tap(pad, names, places, 5.0)
     held_out = np.arange(len(names)) // len(SURFACES) % 3 == 0
     counts, depth = _scans(taps, ~held_out)
     net = PsfNet()

@@ -20,12 +20,12 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.support.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall, relief
+from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
 from train.surfaces.depth_image import depth_image
-from train.surfaces.named_surfaces import PLATES
+from train.surfaces.named_surfaces import LETTERS, relief
 
 STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)
@@ -67,7 +67,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     The full run takes about half an hour on one core, nearly all of it for the finite elements.
     """
-    surfaces, meshes, steps = (PLATES[0][:2], _QUICK_MESHES, 2) if bench.quick else (PLATES[0], MESHES, STEPS)
+    surfaces, meshes, steps = (LETTERS[:2], _QUICK_MESHES, 2) if bench.quick else (LETTERS, MESHES, STEPS)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     verdicts = {
         mesh: [

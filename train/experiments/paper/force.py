@@ -24,10 +24,9 @@ from edge.perception.contact_options import ON_COUNTS
 from edge.perception.tap_tracker import TapTracker
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
-from train.data.generation_config import SEED
 from train.data.paper_taps import PaperTaps, between_frames, windows
 from train.data.press_batches import read_presses
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet
 from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
 from train.experiments.support.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
@@ -172,7 +171,7 @@ def pressed(sequences: PaperTaps, number: int, course: Course, nuisances: Nuisan
     whole_mm3 = volume_mm3(sequences.patterns_at(index, end[:, 0]), USPA44.pixel_pitch_mm(sequences.scale))
     return Scans(
         windows=np.concatenate([newest[:, None], np.broadcast_to(earlier, (len(newest), *earlier.shape))], axis=1),
-        force_n=sequences.force_at(index, share)[0],
+        force_n=sequences.force_n[number, 0, -1] * share[0],
         volume_mm3=whole_mm3 * course.share,  # flat contacts: in proportion to the indentation
     )
 

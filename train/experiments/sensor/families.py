@@ -18,9 +18,8 @@ from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regio
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.generation_config import SEED
 from train.data.press_batches import COUNTS_PER_UNIT, read_presses
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses
 from train.experiments.support.workbench import Figures, Workbench

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import freeze_presses
-from train.data.generation_config import SEED, one_thread
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet, one_thread
 from train.data.world import press_shapes
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses
 from train.experiments.support.workbench import Workbench

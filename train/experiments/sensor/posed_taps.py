@@ -17,9 +17,8 @@ from edge.perception.pattern_check import NOT_OF_IT, PatternCheck
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.generation_config import SEED
 from train.data.press_batches import stated_poses
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
 from train.experiments.support.workbench import Workbench

@@ -20,7 +20,7 @@ from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.generation_config import SEED
+from train.data.presses import SEED
 from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
 from train.data.world import World
 from train.errors import CheckpointError

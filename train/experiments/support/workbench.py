@@ -17,10 +17,9 @@ from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.generation_config import SEED, one_thread
 from train.data.make_presses import make_presses
 from train.data.paper_taps import PaperTaps, paper_taps
-from train.data.presses import PressSet
+from train.data.presses import SEED, PressSet, one_thread
 from train.data.world import World
 from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network, infer, load_network
