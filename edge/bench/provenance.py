@@ -7,6 +7,7 @@ changed: a model, a set, or one of the few sources that its maker names. It is a
 """
 
 import argparse
+import ast
 import hashlib
 import json
 import os
@@ -122,9 +123,25 @@ def _cpu() -> str:
 
 
 def file_hash(path: Path) -> str:
-    """Return a hash of a file's bytes, or of all Python files below a folder."""
+    """Return a hash of a file, or of all Python files below a folder; of Python it is that of the code alone."""
     files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(map(_content, files))).hexdigest()[:12]
+
+
+def _content(file: Path) -> bytes:
+    """Return the bytes of a file; of Python without comments, docstrings and imports, by which no figure changes."""
+    if file.suffix != ".py":
+        return file.read_bytes()
+    tree = ast.parse(file.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            body[:] = [one for one in body if not _is_aside(one)] or [ast.Pass()]
+    return ast.unparse(tree).encode()
+
+
+def _is_aside(node: ast.AST) -> bool:
+    is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_text or isinstance(node, (ast.Import, ast.ImportFrom))
 
 
 def _below_root(path: Path) -> str:

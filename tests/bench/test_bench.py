@@ -204,6 +204,22 @@ def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs(made):
 
 
 @pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        ('"""Other."""\nimport b\n\n\ndef f():  # why\n    return 1\n', True),
+        ('"""A."""\nimport a\n\n\ndef f():\n    return 2\n', False),
+    ],
+)
+def test_a_source_has_changed_where_its_code_has(tmp_path, other, same):
+    for name, text in (
+        ("a.py", '"""A."""\nimport a\n\n\ndef f():\n    """Return 1."""\n    return 1\n'),
+        ("b.py", other),
+    ):
+        (tmp_path / name).write_text(text)
+    assert (file_hash(tmp_path / "a.py") == file_hash(tmp_path / "b.py")) is same
+
+
+@pytest.mark.parametrize(
     "page", ["# no head\n", "# a\n\n```toml\ncommand = \n```\n", '# a\n\n```toml\ncommand = "x"\n```\n']
 )
 def test_a_head_that_lacks_or_is_damaged_is_none(page):
