@@ -206,7 +206,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 def _write(
     folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
 ) -> None:
-    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing"))]
+    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("contenders", "timing"))]
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:
