@@ -29,10 +29,8 @@ from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split
 
-FORCE_N: Final = 9.2
-"""Force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them."""
-_AT_ONCE: Final = 48
-"""Sequences whose pose errors are drawn at once: so the bundled frozen set has its poses."""
+FORCE_N: Final = 9.2  # force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them
+_AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bundled frozen set has its poses
 _PER_TAP: Final = ("poses", "counts", "force_n", "indentation_mm")
 _ARRAYS: Final = ("surfaces", *_PER_TAP, "unit_patterns", "touching")
 

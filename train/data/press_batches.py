@@ -16,10 +16,8 @@ from train.errors import DatasetError
 from train.physics.pad_draws import known_numbers
 from train.physics.sensor_noise import Nuisances, log_uniform, read_windows
 
-COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)
-"""Counts of x, y, z that make one unit of network input."""
-_MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])
-"""Signs of a pose's x, y, turn and errors in a mirror image."""
+COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)  # counts of x, y, z that make one unit of network input
+_MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])  # signs of a pose's x, y, turn and errors in a mirror image
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +79,7 @@ The first two are new sensors, the second kind wider than most; in the others ca
 of the spread, which the certainty of the gains states.
 """
 _NEW_SENSORS: Final = Nuisances(dead_taxels=0.02)
-_SURE: Final = 0.1
-"""Standard deviation of a constant used as input, over its spread: error that calibration leaves."""
+_SURE: Final = 0.1  # standard deviation of a constant used as input, over its spread: error that calibration leaves
 
 
 class PressBatches:
@@ -195,10 +192,8 @@ _SINGLE: Final = 0.7
 _AS_MADE: Final = 0.5
 """Share of batches that keep a sequence's newest taps; in the others any of its earlier taps are left out."""
 _ERRORS_MM: Final = (0.05, 1.5)
-_ERRORS_DEG: Final = (0.3, 6.0)
-"""Bounds of the stated errors of a window's poses, drawn evenly by their logarithms."""
-_ASTRAY: Final = 0.04
-"""Share of earlier taps that are farther off than stated: by several of the largest stated errors."""
+_ERRORS_DEG: Final = (0.3, 6.0)  # bounds of the stated errors of a window's poses, drawn evenly by their logarithms
+_ASTRAY: Final = 0.04  # share of earlier taps that are farther off than stated: by several of the largest stated errors
 _ASTRAY_MM: Final = 2.0
 _ASTRAY_DEG: Final = 8.0
 

@@ -27,11 +27,9 @@ SEED: Final = 20240228
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
-_NO_POSES: Final = 2
-"""Version without poses, which is still loaded: its taps were turned at one place."""
+_NO_POSES: Final = 2  # version without poses, which is still loaded: its taps were turned at one place
 _MOST_BYTES: Final = 1 << 33
-_MOST_FACTS_BYTES: Final = 1 << 22
-"""Largest configuration read, in bytes; real ones take a few kB."""
+_MOST_FACTS_BYTES: Final = 1 << 22  # largest configuration read, in bytes; real ones take a few kB
 _AXES: Final = {
     "family": ("U", "n"),
     "pad": ("int64", "n"),

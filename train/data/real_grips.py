@@ -15,8 +15,7 @@ from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deform
 from train.errors import DatasetError
 from train.physics.sensor_noise import neighbours
 
-REST_SCANS: Final = 20
-"""Scans at the end of a recording, where one of the grips has been released."""
+REST_SCANS: Final = 20  # scans at the end of a recording, where one of the grips has been released
 _TAXELS: Final = USPA44.taxel_count
 _Z: Final = AXES.index("z")
 

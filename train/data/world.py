@@ -26,14 +26,11 @@ LEAST_FORCE_N: Final = 0.1
 """Least force of a press that is kept: about twice the force at which a contact is detected above the noise."""
 MOST_DRAWS: Final = 40
 """Most draws of a press of a user's mesh: of a sloping finger one in seven is kept, so that all are found."""
-_STILL: Final = 0.35
-"""Share of presses without any drag; half of the others are twisted as well."""
+_STILL: Final = 0.35  # share of presses without any drag; half of the others are twisted as well
 _SLIDE_MM: Final = (0.02, 0.6)
 _TWIST_RAD: Final = 0.03
-_LEAST_BEGUN: Final = 0.2
-"""Least depth of a newest tap that has only begun, over that of the earlier ones."""
-_FRICTION: Final = (0.2, 1.2)
-"""Bounds of Coulomb's coefficient: polished steel to rubber on silicone."""
+_LEAST_BEGUN: Final = 0.2  # least depth of a newest tap that has only begun, over that of the earlier ones
+_FRICTION: Final = (0.2, 1.2)  # bounds of Coulomb's coefficient: polished steel to rubber on silicone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,8 +16,7 @@ from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, relief
 from train.surfaces.poses import over_surface, random_poses
 
-FIGURES: Final = ("paper", "glyph", "polygon")
-"""Families of flat figures on a plate: the paper's 18, and random ones."""
+FIGURES: Final = ("paper", "glyph", "polygon")  # families of flat figures on a plate: the paper's 18, and random ones
 
 SHARES: Final[Mapping[str, float]] = {
     "paper": 20,

@@ -11,17 +11,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Lengths = NDArray[np.float32]
-"""Lengths at places on a grid, in [mm]."""
+Lengths = NDArray[np.float32]  # lengths at places on a grid, in [mm]
 Height = Callable[[Lengths, Lengths], Lengths]
 """Height in [mm] at x and y in [mm], NOWHERE_MM off the shape; higher parts touch the pad first."""
 Shape = Callable[[np.random.Generator, Lengths, Lengths], Lengths]
 """Height at x and y of the shape that a generator draws; the draws do not depend on the places."""
 
-NOWHERE_MM: Final = -1e3
-"""Height where there is no shape, out of any press's reach."""
-SLOPE: Final = float(np.tan(np.radians(3.0)))
-"""Largest tilt of a face against the pad: three degrees."""
+NOWHERE_MM: Final = -1e3  # height where there is no shape, out of any press's reach
+SLOPE: Final = float(np.tan(np.radians(3.0)))  # largest tilt of a face against the pad: three degrees
 
 
 def drawn(rng: np.random.Generator, shape: Shape) -> Height:

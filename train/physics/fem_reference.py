@@ -40,18 +40,14 @@ except ModuleNotFoundError as error:
     message = f"the FEM reference needs felupe (GPL): {how_to_install('fem')}"
     raise ModuleNotFoundError(message, name="felupe") from error
 
-SCALE: Final = 10
-"""Patterns are compared at 40 x 40, as in the paper."""
-CENTRE: Final = Pose(0.0, 0.0, 0.0)
-"""Position 5, rotation 0 of the paper."""
+SCALE: Final = 10  # patterns are compared at 40 x 40, as in the paper
+CENTRE: Final = Pose(0.0, 0.0, 0.0)  # position 5, rotation 0 of the paper
 LAYER: Final = replace(Layer(), poisson=0.495)
 """Layer of rubber: the solver's own Poisson's ratio is lower to account for free sides, which the elements have."""
 C2_SHARE: Final = 0.2
 """Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
-_EDITION: Final = 1
-"""Edition of kept results; raise it when the results of the elements change."""
-_RESIDUAL: Final = 1e-6
-"""Out-of-balance forces at which a step is done, as a share of the reactions."""
+_EDITION: Final = 1  # edition of kept results; raise it when the results of the elements change
+_RESIDUAL: Final = 1e-6  # out-of-balance forces at which a step is done, as a share of the reactions
 _MAX_NEWTON: Final = 12
 _MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
@@ -72,8 +68,7 @@ class Mesh(NamedTuple):
         return f"{self.scale} nodes a pitch, {self.cells_high} high"
 
 
-FINEST: Final = Mesh(10, 8)
-"""Mesh whose nodes are the pixels of the 40 x 40 pattern."""
+FINEST: Final = Mesh(10, 8)  # mesh whose nodes are the pixels of the 40 x 40 pattern
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,23 +21,17 @@ from train.physics.taxel_response import Skin, on_pad
 from train.physics.tpsf import heights_pattern
 from train.surfaces.depth_image import NOTHING_MM
 
-MAX_INDENTATION_MM: Final = 0.5
-"""Largest indentation, in [mm]: beyond a tenth of its thickness the layer is not linear."""
-FRAMES: Final = 16
-"""Frames of a whole tap; frame i is at (i + 1) / FRAMES of its last indentation."""
-FINE_SCALE: Final = 20
-"""Pattern pixels per pitch at which truth is computed."""
-SAMPLES: Final = 4
-"""Places along a cell's side at which a shape is sampled."""
-MOST_FORCE_N: Final = 40.0
-"""Largest force on the pad, in [N]."""
+MAX_INDENTATION_MM: Final = 0.5  # largest indentation, in [mm]: beyond a tenth of its thickness the layer is not linear
+FRAMES: Final = 16  # frames of a whole tap; frame i is at (i + 1) / FRAMES of its last indentation
+FINE_SCALE: Final = 20  # pattern pixels per pitch at which truth is computed
+SAMPLES: Final = 4  # places along a cell's side at which a shape is sampled
+MOST_FORCE_N: Final = 40.0  # largest force on the pad, in [N]
 SCALE: Final = 10
 TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
 _CELLS_PER_PITCH: Final = 10
 _MOST_TRIES: Final = 6
-_WALL_MM: Final = 0.1
-"""Depth below a cell's highest part from which a part of it carries no load, in [mm]."""
+_WALL_MM: Final = 0.1  # depth below a cell's highest part from which a part of it carries no load, in [mm]
 _STEEP: Final = 2.0
 """Depth in indentations from which a shape counts as steep: its edge then follows from the pressure alone."""
 

@@ -11,11 +11,9 @@ from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 from train.physics.side_correction import FreeSides
 
-NEWTONS_PER_COUNT_Z: Final = 0.00085
-"""By the data sheet, for the sum of z."""
+NEWTONS_PER_COUNT_Z: Final = 0.00085  # by the data sheet, for the sum of z
 
-_UNEVEN_MM: Final = 0.015
-"""Largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]."""
+_UNEVEN_MM: Final = 0.015  # largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]
 _UNEVEN_WAVES: Final = 8
 _TILT_RAD: Final = 0.05
 """Standard deviation of a magnet's lean: three degrees, for a part of a millimetre placed by a machine."""
@@ -24,8 +22,7 @@ _SEAT_MM: Final = 0.02
 
 With the moment it makes a gain of .04, and with the chips' .075 the 15 % either way that is seen on devices.
 """
-_MOMENT: Final = 0.015
-"""Standard deviation of one magnet's moment, relative to the nominal one, within one batch."""
+_MOMENT: Final = 0.015  # standard deviation of one magnet's moment, relative to the nominal one, within one batch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,8 +97,7 @@ class Pad:
         return down
 
 
-NOMINAL: Final = Pad()
-"""Pad of the first frozen set."""
+NOMINAL: Final = Pad()  # pad of the first frozen set
 
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "thickness_mm": (3.6, 5.4),

@@ -25,8 +25,7 @@ Seed = int | Sequence[int] | np.random.SeedSequence
 
 LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
 """Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
-TAP_S: Final = (0.2, 2.5)
-"""Bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15."""
+TAP_S: Final = (0.2, 2.5)  # bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15.
 _RELAXATION_S: Final = (0.2, 5.0)
 _OFF: Final = {"saturation_counts": (inf, inf, inf)}
 
@@ -70,8 +69,7 @@ class Nuisances:
         return replace(self, **{name: _OFF.get(name, 0.0) for name in names})
 
 
-NAMES: Final = tuple(field.name for field in fields(Nuisances))
-"""Names of all nuisances in the order in which they act."""
+NAMES: Final = tuple(field.name for field in fields(Nuisances))  # names of all nuisances in the order in which they act
 
 
 def apply_nuisances(

@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from train.physics.elastic_layer import Layer
 
 _WIDTH_MM: Final = 20.0
-_GIVES: Final = ((0.959, 0.3415, 0.2247), (0.0255, 1.590, 0.6034))
-"""Terms (a, b, c) of the surface's compliance."""
+_GIVES: Final = ((0.959, 0.3415, 0.2247), (0.0255, 1.590, 0.6034))  # terms (a, b, c) of the surface's compliance
 _DOWN: Final = (0.0404, 0.690, 1.147, 0.420)
 """Term of the magnets' way down: factor on 1 / (G h), decay lengths to magnet and load, width along the side."""
-_OUT: Final = (0.1703, 1.117, 0.592, 0.593)
-"""Term of their way to the side."""
-_LEAN: Final = (1.000, 0.431, 0.317, 0.463)
-"""Term of their axes, tops towards the side; its factor is on 1 / (G h^2)."""
+_OUT: Final = (0.1703, 1.117, 0.592, 0.593)  # term of their way to the side
+_LEAN: Final = (1.000, 0.431, 0.317, 0.463)  # term of their axes, tops towards the side; its factor is on 1 / (G h^2)
 
 
 @dataclass(frozen=True, slots=True)

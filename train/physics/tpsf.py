@@ -17,8 +17,7 @@ from torch import Tensor
 
 BETA_MM: Final = 1.3
 """Reach with the best fit to the default layer's surface: 2.6 % of the indentation over the 18 surfaces, see tests."""
-PLANES: Final = 4
-"""Largest number of planes; twice as many change the error by less than 0.1 % of the indentation."""
+PLANES: Final = 4  # largest number of planes; twice as many change the error by less than 0.1 % of the indentation
 EDGE_BETA_MM: Final = 0.6
 """Reach of a plane that just touches, fitted to the default layer under spheres and cylinders, see tests."""
 

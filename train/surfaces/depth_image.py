@@ -11,12 +11,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-NOTHING_MM: Final = 1e3
-"""Depth where there is no surface at all: out of any press's reach."""
+NOTHING_MM: Final = 1e3  # depth where there is no surface at all: out of any press's reach
 _UNFELT_MM: Final = 0.05
 """Height above the cells' centres from which a point between them counts as finer than a cell, in [mm]."""
-_ROUNDING_PX: Final = 1e-9
-"""Tolerance in [px], so that no pixel on the common edge of two triangles is missed."""
+_ROUNDING_PX: Final = 1e-9  # tolerance in [px], so that no pixel on the common edge of two triangles is missed
 
 
 class Pose(NamedTuple):

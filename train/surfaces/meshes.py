@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from train.errors import MeshError
 
-MESH: Final = "mesh:"
-"""Beginning of a surface's name that is a user's file."""
+MESH: Final = "mesh:"  # beginning of a surface's name that is a user's file
 _UNIT: Final = "?unit_mm="
 SUFFIXES: Final = (".stl", ".obj", ".ply")
 MAX_TRIANGLES: Final = 2_000_000

@@ -30,13 +30,10 @@ _STROKE_MM: Final = 3.0
 _WALL_MM: Final = 2.5
 _LARGE_RADIUS_MM: Final = 7.0
 _SMALL_RADIUS_MM: Final = 3.5
-_W, _H = 4.0, 6.0
-"""Half the width and height of a letter, between stroke centres."""
-GLYPH_REACH_MM: Final = 8.0
-"""Largest distance of a glyph's points from the plate's centre along x and y."""
+_W, _H = 4.0, 6.0  # half the width and height of a letter, between stroke centres
+GLYPH_REACH_MM: Final = 8.0  # largest distance of a glyph's points from the plate's centre along x and y
 POLYGON_REACH_MM: Final = 9.5
-AREA_MM2: Final = (8.0, 250.0)
-"""Smallest and largest contact area of a random figure."""
+AREA_MM2: Final = (8.0, 250.0)  # smallest and largest contact area of a random figure
 _CAPS: Final[tuple[Literal["round", "square", "flat"], ...]] = ("round", "square", "flat")
 _JOINS: Final[tuple[Literal["round", "mitre", "bevel"], ...]] = ("round", "mitre", "bevel")
 
@@ -63,11 +60,9 @@ _STROKES: Final[dict[str, list[Points]]] = {
 }
 _CORNERS: Final = {"circle": 96, "square": 4, "triangle": 3}
 
-LETTERS: Final = tuple(_STROKES)
-"""Names of the nine surfaces on the first of the paper's contact plates."""
+LETTERS: Final = tuple(_STROKES)  # names of the nine surfaces on the first of the paper's contact plates
 SHAPES: Final = tuple(f"{form} {shape}" for shape in _CORNERS for form in ("hollow", "large", "small"))
-SURFACES: Final = LETTERS + SHAPES
-"""Names of the 18 surfaces, nine on each plate."""
+SURFACES: Final = LETTERS + SHAPES  # names of the 18 surfaces, nine on each plate
 
 
 def surface_mesh(name: str) -> trimesh.Trimesh:

@@ -25,15 +25,12 @@ MAX_TAPS: Final = 7
 TARGET_ANGLES_DEG: Final = (0.0, 30.0, 60.0, 90.0)
 HELD_OUT_RADIUS_MM: Final = 1.0
 """Distance that random poses keep from the two held-out positions, in [mm]; see docs/decisions.md."""
-SURFACE_REACH_MM: Final = 3.5
-"""Largest distance of random poses from the surface's centre along x and along y, in [mm]."""
+SURFACE_REACH_MM: Final = 3.5  # largest distance of random poses from the surface's centre along x and along y, in [mm]
 
 HALF_PITCH_MM: Final = USPA44.pitch_mm / 2
-REACH_MM: Final = 6.0
-"""Largest distance of an earlier tap: two thirds of both pads overlap at least, side by side."""
+REACH_MM: Final = 6.0  # largest distance of an earlier tap: two thirds of both pads overlap at least, side by side
 NEAR_MM: Final = 3.0
-NEAR_DEG: Final = 45.0
-"""Bounds of most random poses."""
+NEAR_DEG: Final = 45.0  # bounds of most random poses
 
 Schedule = Callable[[np.random.Generator, int], NDArray[np.float64]]
 """Function from draws and a number of taps, K, to their poses (K, 3)."""

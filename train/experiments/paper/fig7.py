@@ -36,8 +36,7 @@ _PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
 _PAD_PX: Final = 42
 _ON_TOP_MM: Final = 1e-3
 
-Maps = NDArray[np.float32]
-"""Maps (surfaces, steps, 40, 40) in [mm]."""
+Maps = NDArray[np.float32]  # maps (surfaces, steps, 40, 40) in [mm]
 
 
 class Method(NamedTuple):

@@ -130,8 +130,7 @@ PRESS, HOLD, RELEASE, REST = range(4)
 _ENDS_S: Final = np.cumsum([PRESS_S, HOLD_S, RELEASE_S, REST_S])
 RANGE_N: Final = TEST_FORCE_N
 _PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
-CLAIM_N: Final = 0.02 * RANGE_N
-"""Volume force above which a pattern claims a contact, in [N]: 2 % of the range."""
+CLAIM_N: Final = 0.02 * RANGE_N  # volume force above which a pattern claims a contact, in [N]: 2 % of the range
 
 
 class Course:
@@ -221,8 +220,7 @@ def _rms_percent(error_n: NDArray[np.floating]) -> float:
 
 
 _TAPS: Final = 4
-_ANGLE: Final = 1
-"""Index of the test angle at which each surface is pressed: 30 degrees, the paper's target."""
+_ANGLE: Final = 1  # index of the test angle at which each surface is pressed: 30 degrees, the paper's target
 _ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
 CONDITIONS: Final = {"just zeroed": _ZEROED, "drifted": Nuisances()}
 

@@ -25,8 +25,7 @@ from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
 _QUICK_WINDOWS: Final = 300
-HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")
-"""Surfaces that Fig. 16 leaves out of a training."""
+HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")  # surfaces that Fig. 16 leaves out of a training.
 KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
 _SET: Final = World(taps=MAX_TAPS, schedule="turns", spread=0.0, scale=FINE_SCALE)
 SETS: Final = {

@@ -63,8 +63,7 @@ COMPARED: Final = (
     *(("compact stsr", "stsr"), ("compact mtsr4", "mtsr4")),
     *(("mtsr2", "stsr longer"), ("compact mtsr2", "compact stsr")),
 )
-ONE_IN: Final = 8
-"""Step between evaluated frames of a tap."""
+ONE_IN: Final = 8  # step between evaluated frames of a tap
 ANGLES_DEG: Final = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
@@ -188,8 +187,7 @@ def run_taps(bench: Workbench, folder: Path) -> Path:
 TEST_SEED: Final = 999_000_000
 TEST_FIGURES: Final = 24
 GIVEN: Final = (1, 4)
-_FEW_FIGURES: Final = 833
-"""Number of figures that make a tenth of the windows."""
+_FEW_FIGURES: Final = 833  # number of figures that make a tenth of the windows
 _EVERY: Final = Training("unseen-all", "compact-mtsr4", Recipe(steps=16_000, given=given_taps(max(GIVEN)), bf16=True))
 
 

@@ -36,8 +36,7 @@ PAPER: Final = World(
 
 Source: Wu and Liu 2024, Fig. 13."""
 _WAYS: Final = ((DEFAULT_MODEL, 1), (POSED_MODEL, 2), (POSED_MODEL, 4), (POSED_MODEL, MAX_TAPS))
-USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)
-"""Errors of poses, in [mm] and [deg], where a robot states none."""
+USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)  # errors of poses, in [mm] and [deg], where a robot states none
 _OFF: Final = ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0))
 """Errors of every earlier tap's pose in the rows on robustness, in [mm] and [deg]."""
 _SHOWN: Final = (1, 2, 3, 4, 7)

@@ -37,8 +37,7 @@ from train.report import Report, Row, bootstrap_interval
 
 _SCAN_NS: Final = 16_750_000
 _TAXELS: Final = USPA44.taxel_count
-_RIDGE: Final = 0.1
-"""Ridge of the operator that leaves the least of z on validation presses."""
+_RIDGE: Final = 0.1  # ridge of the operator that leaves the least of z on validation presses
 
 
 class Played(NamedTuple):

@@ -10,10 +10,8 @@ from firmware_bridge.pad_geometry import USPA44
 from train.learning.contact_check import magnet_field
 from train.networks.symmetric import symmetries
 
-Counts = NDArray[np.float32]
-"""Readings of one sensor, (n, 3, rows, cols), zeroed."""
-Fault = Callable[[np.random.Generator, Counts], Counts]
-"""Readings of one sensor as a fault changes them."""
+Counts = NDArray[np.float32]  # readings of one sensor, (n, 3, rows, cols), zeroed
+Fault = Callable[[np.random.Generator, Counts], Counts]  # readings of one sensor as a fault changes them
 Field = Callable[[np.random.Generator], Counts]
 """Counts (3, rows, cols) that something near the pad adds to each reading."""
 

@@ -20,8 +20,7 @@ from train.data.frozen_presses import FrozenPresses
 
 NOTHING, ALL = "nothing", "pad and gains"
 """Levels of knowledge about a sensor: nothing, or all constants of its pad with the taxels' gains."""
-SHORT: Final = {NOTHING: "model", ALL: "model, all known"}
-"""Names of the levels in tables."""
+SHORT: Final = {NOTHING: "model", ALL: "model, all known"}  # names of the levels in tables
 
 
 class Inferred(NamedTuple):
@@ -73,8 +72,7 @@ _REST: Final = np.array((16_000, 16_400, 38_600), dtype=np.int32)[:, None, None]
 _SENSOR: Final = "4"
 _PERIOD_NS: Final = 10_000_000
 _FREE_SCANS: Final = 2
-_TAP_SCANS: Final = 2
-"""Scans of an earlier tap: one alone may be a flipped bit, and is not remembered."""
+_TAP_SCANS: Final = 2  # scans of an earlier tap: one alone may be a flipped bit, and is not remembered
 
 
 class PushedSensor:

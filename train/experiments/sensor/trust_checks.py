@@ -131,10 +131,8 @@ def _detected(model: ModelSession, sensors: FrozenPresses) -> list[Row]:
     return [{"fault": name} | verdicts_on(model, *one) for name, one in tracked(given.items(), "faults", "fault")]
 
 
-AFTER: Final = (1, 3, 5, 10)
-"""Contacts after which the running evidence is looked at."""
-CONTACTS: Final = max(AFTER) + 1
-"""Contacts of each sensor; the evidence of one is weighed when the next begins."""
+AFTER: Final = (1, 3, 5, 10)  # contacts after which the running evidence is looked at
+CONTACTS: Final = max(AFTER) + 1  # contacts of each sensor; the evidence of one is weighed when the next begins
 _OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad")
 """Reasons that a scan gives by itself."""
 RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
