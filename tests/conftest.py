@@ -26,6 +26,17 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture
+def limits(monkeypatch):
+    """Function that sets limits of a module, of time or size, which a test would have to wait for or to fill."""
+
+    def set_limits(module, **limits):
+        for name, limit in limits.items():
+            monkeypatch.setattr(module, name, limit)
+
+    return set_limits
+
+
+@pytest.fixture
 def bounded_memory():
     tracemalloc.start()
     yield

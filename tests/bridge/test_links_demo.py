@@ -43,8 +43,8 @@ def test_leaving_early_ends_the_emulator_without_force(recording, monkeypatch):
     assert len(list(Path("/proc/self/fd").iterdir())) == open_before
 
 
-def test_an_emulator_that_hangs_is_killed(recording, monkeypatch):
-    monkeypatch.setattr(demo, "END_TIMEOUT_S", 0.2)
+def test_an_emulator_that_hangs_is_killed(recording, limits):
+    limits(demo, END_TIMEOUT_S=0.2)
     with DemoLink(recording, rate_hz=50) as link:
         read_scans(link, 1)
         (process_id,) = processes_playing(recording)

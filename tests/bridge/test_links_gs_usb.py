@@ -163,8 +163,8 @@ def test_what_is_older_than_the_opening_is_dropped():
     assert not port.adapter.mute
 
 
-def test_an_adapter_that_goes_on_sending_holds_up_no_opening(monkeypatch):
-    monkeypatch.setattr(gs_usb_link, "MOST_OLD_TRANSFERS", 20)
+def test_an_adapter_that_goes_on_sending_holds_up_no_opening(monkeypatch, limits):
+    limits(gs_usb_link, MOST_OLD_TRANSFERS=20)
     monkeypatch.setattr(GsUsbBackend, "bulk_read", lambda *_: 24)
     with opened()[1]:
         pass

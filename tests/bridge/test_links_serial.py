@@ -30,8 +30,8 @@ LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wi
 
 
 @pytest.mark.parametrize(("acknowledges", "latency_s"), [(True, 0.001), (False, 0.016)])
-def test_every_scan_comes_once_and_in_order(acknowledges, latency_s, monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 60 * 10**9)  # a busy machine makes no silence to ask about
+def test_every_scan_comes_once_and_in_order(acknowledges, latency_s, limits):
+    limits(slcan_status, ADAPTER_ASKED_NS=60 * 10**9)  # a busy machine makes no silence to ask about
     recordings = [make_recording(30, seed=1), make_recording(30, seed=2)]
     with (
         Emulator(recordings, acknowledges=acknowledges, latency_s=latency_s, jitter_s=0.002) as emulator,
@@ -224,8 +224,8 @@ def fill(port_fd: int) -> None:
         time.sleep(0.01)
 
 
-def test_a_device_that_takes_nothing_holds_up_nobody(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
+def test_a_device_that_takes_nothing_holds_up_nobody(limits):
+    limits(slcan_serial, WRITE_TIMEOUT_S=0.05)
     with SilentDevice() as device:
         with SlcanSerialLink(device.port):
             fill(device.client_fd)
@@ -235,8 +235,8 @@ def test_a_device_that_takes_nothing_holds_up_nobody(monkeypatch):
         serial.Serial(device.port, exclusive=True).close()  # the port is free again
 
 
-def test_a_stream_that_will_not_stop_holds_up_no_opening(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "LONGEST_SETTLE_S", 0.1)
+def test_a_stream_that_will_not_stop_holds_up_no_opening(limits):
+    limits(slcan_serial, LONGEST_SETTLE_S=0.1)
     stop = threading.Event()
     with SilentDevice() as device:
         os.set_blocking(device.device_fd, False)

@@ -78,8 +78,8 @@ LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
 
 
 @pytest.mark.parametrize("text", [LATE, b"".join(cycle_lines(0, 0))], ids=["other units", "standing still"])
-def test_stamps_that_are_no_clock_are_left_out(text, monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
+def test_stamps_that_are_no_clock_are_left_out(text, limits):
+    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
     with SilentDevice() as device:
         with SlcanSerialLink(device.port) as link:
 
@@ -99,9 +99,9 @@ def test_stamps_that_are_no_clock_are_left_out(text, monkeypatch):
         assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
-def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
-    monkeypatch.setattr(slcan_serial, "LATE_STAMPS_FRAMES", 20)
+def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(limits):
+    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
+    limits(slcan_serial, LATE_STAMPS_FRAMES=20)
     with SilentDevice() as device:
         link = SlcanSerialLink(device.port)
         for opening in range(2):
@@ -121,10 +121,9 @@ def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(monkeypatch):
 
 
 @pytest.fixture
-def impatient(monkeypatch):
+def impatient(limits):
     """Asks every 50 ms instead of 5 s."""
-    monkeypatch.setattr(slcan_status, "INTERVAL_NS", 50 * MS)
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 40 * MS)
+    limits(slcan_status, INTERVAL_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
 
 
 def read_until(link: SlcanSerialLink, condition) -> None:
@@ -194,10 +193,9 @@ def test_opening_again_does_not_unsay_what_was_said(impatient):
             read_until(link, lambda: link.trouble is None)
 
 
-def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(monkeypatch):
+def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(limits):
     """Some adapters write the setting to an EEPROM each time."""
-    monkeypatch.setattr(slcan_serial, "MOST_SILENT_OPENINGS", 2)
-    monkeypatch.setattr(slcan_serial, "QUIET_S", 0.001)
+    limits(slcan_serial, MOST_SILENT_OPENINGS=2, QUIET_S=0.001)
     stamped, plain = b"C\rS8\rZ1\rO\rC\rZ0\r", b"C\rS8\rO\rC\r"
     with SilentDevice() as device:
         link = SlcanSerialLink(device.port)

@@ -82,22 +82,25 @@ class TestReplay:
 
 
 class TestModels:
-    def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
+    @pytest.fixture
+    def bundle_folder(self, monkeypatch, tmp_path):
         monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        write_model(tmp_path / "mtsr4.onnx")
+        return tmp_path
+
+    def test_models_are_listed_from_their_contracts(self, bundle_folder, capsys):
+        write_model(bundle_folder / "mtsr4.onnx")
         sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
-        write_model(tmp_path / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
+        write_model(bundle_folder / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
         assert cli.main(["models"]) == 0
         out = capsys.readouterr().out.splitlines()
-        size_mb = (tmp_path / "mtsr4.onnx").stat().st_size / 1e6
+        size_mb = (bundle_folder / "mtsr4.onnx").stat().st_size / 1e6
         assert out[1].split() == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
         assert out[2].split() == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
         assert max(map(len, out)) <= 80
 
-    def test_run_times_are_measured_next_to_the_error(self, monkeypatch, capsys, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        monkeypatch.setattr(models_command, "RATE_HZ", 2000.0)
-        write_model(tmp_path / "mtsr4.onnx")
+    def test_run_times_are_measured_next_to_the_error(self, bundle_folder, limits, capsys):
+        limits(models_command, RATE_HZ=2000.0)
+        write_model(bundle_folder / "mtsr4.onnx")
         assert cli.main(["models", "--measure"]) == 0
         head, row, _, note, *_ = capsys.readouterr().out.splitlines()
         assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"
@@ -192,8 +195,7 @@ def test_thresholds_and_sinks_that_cannot_be_are_2_before_anything_is_opened(com
 
 
 @pytest.mark.parametrize("ports", [[], ["/dev/ttyUSB0", "/dev/ttyUSB1"]])
-def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(monkeypatch, capsys, tmp_path, ports):
-    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
+def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(monkeypatch, capsys, ports):
     seen = [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
     monkeypatch.setattr(source, "serial_ports", lambda: [*seen, Port("/dev/ttyS9", None, None, "n/a")])
     assert cli.main(["--sink", "jsonl:-"]) == 3

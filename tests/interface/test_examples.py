@@ -139,9 +139,9 @@ def stop_on_area():
 
 
 @pytest.fixture
-def at_once(stop_on_area, monkeypatch):
+def at_once(stop_on_area, limits):
     """The example, which knows with the first reading which sensors there are."""
-    monkeypatch.setattr(stop_on_area, "SETTLING_NS", 0)
+    limits(stop_on_area, SETTLING_NS=0)
     return stop_on_area
 
 

@@ -58,9 +58,9 @@ class Terminal:
 
 @pytest.mark.parametrize(("options", "shown"), [([], True), (["--sink", "status"], False), (["--paced"], False)])
 @pytest.mark.parametrize("to", ["-", "out.jsonl"])
-def test_a_replay_at_full_speed_shows_one_for_the_live_line(tmp_path, monkeypatch, capfd, terminal, options, shown, to):
+def test_a_replay_shows_one_for_the_live_line(tmp_path, monkeypatch, limits, capfd, terminal, options, shown, to):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(progress, "DELAY_S", 0)
+    limits(progress, DELAY_S=0)
     monkeypatch.setattr(recordings, "Progress", partial(Progress, stream=terminal.stream))
     monkeypatch.setattr(status, "StatusSink", partial(status.StatusSink, terminal.stream))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)

@@ -152,9 +152,9 @@ sys.exit(cli.main(["--source", "demo", "--model", sys.argv[1]]))
 
 
 class TestEndlessLoad:
-    def test_it_ends_at_the_limit_with_4_and_one_line(self, tmp_path, monkeypatch, capsys):
+    def test_it_ends_at_the_limit_with_4_and_one_line(self, tmp_path, limits, capsys):
         """No work is done on constants while it loads, which nothing could end; the first run can be ended."""
-        monkeypatch.setattr(loading, "LOAD_LIMIT_S", 0.5)
+        limits(loading, LOAD_LIMIT_S=0.5)
         path = written(tmp_path / "slow.onnx", hours_of_work())
         assert cli.main(["--source", "demo", "--model", str(path)]) == 4
         assert capsys.readouterr().err == f"edge-sr: {path}: not loaded within 0.5 s: export a smaller graph\n"
