@@ -5,6 +5,10 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from firmware_bridge.links.serial_ports import Port
 
 MEMORY_LIMIT_BYTES = 60_000_000
 
@@ -34,6 +38,23 @@ def limits(monkeypatch):
             monkeypatch.setattr(module, name, limit)
 
     return set_limits
+
+
+@pytest.fixture
+def plugged(monkeypatch):
+    """Serial ports that pyserial finds on this machine, to be filled by a test."""
+    ports: list[Port] = []
+
+    def listed(port):
+        info = ListPortInfo(port.path)
+        info.vid, info.pid = port.usb_id or (None, None)
+        info.serial_number, info.description = port.serial_number, port.description
+        info.product, info.manufacturer = port.product, port.manufacturer
+        info.location = f"{port.location or ''}:{port.interface or ''}"
+        return info
+
+    monkeypatch.setattr(list_ports, "comports", lambda: list(map(listed, ports)))
+    return ports
 
 
 @pytest.fixture

@@ -31,8 +31,6 @@ from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
 from edge.pipeline.gain_keeper import keep_learned
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.links import discovery as devices
-from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -137,7 +135,7 @@ def emulated():
 
 
 @pytest.fixture
-def world(emulated, tmp_path, monkeypatch):
+def world(emulated, tmp_path, plugged, monkeypatch):
     """Folder with what the pages take for granted, and adapters at the places that they name."""
     left, right, server = emulated
     monkeypatch.chdir(tmp_path)
@@ -153,11 +151,9 @@ def world(emulated, tmp_path, monkeypatch):
     shutil.copy(find_model("stsr"), "mine/stsr.onnx")
 
     def prepare(command: str) -> list[str]:
-        ports = [Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus")]
+        plugged.append(Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus"))
         if "D30BL401" in command:
-            ports.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
-        monkeypatch.setattr(source, "serial_ports", lambda: ports)
-        monkeypatch.setattr(devices, "serial_ports", lambda: ports)
+            plugged.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
         if "press.mcap" in command and " record " not in command and "mcap:press.mcap" not in command:
             cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
         if command.endswith(" bag"):

@@ -21,7 +21,6 @@ from edge.api import USPA44, load_sensor_file
 from edge.cli import main as cli
 from edge.cli.run_options import parser
 from edge.doctor import command, examine
-from edge.doctor import write_sensor_file as keep
 from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
@@ -266,10 +265,9 @@ def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
     assert process.returncode == 130 and "rate:" in out and "\nstopped after " in out and not (tmp_path / "s").exists()
 
 
-def test_the_serial_number_of_the_adapter_is_kept(monkeypatch, tmp_path):
+def test_the_serial_number_of_the_adapter_is_kept(plugged, tmp_path):
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        seen = [Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter")]
-        monkeypatch.setattr(keep, "serial_ports", lambda: seen)
+        plugged.append(Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter"))
         doctor(emulator.port, "--out", tmp_path / "s.toml")
     assert load_sensor_file(tmp_path / "s.toml").adapter == "D30BL366"
 

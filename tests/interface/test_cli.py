@@ -15,7 +15,6 @@ from edge import __version__
 from edge.cli import main as cli
 from edge.cli import models_command
 from edge.inference import bundled as bundle
-from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -195,9 +194,9 @@ def test_thresholds_and_sinks_that_cannot_be_are_2_before_anything_is_opened(com
 
 
 @pytest.mark.parametrize("ports", [[], ["/dev/ttyUSB0", "/dev/ttyUSB1"]])
-def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(monkeypatch, capsys, ports):
-    seen = [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
-    monkeypatch.setattr(source, "serial_ports", lambda: [*seen, Port("/dev/ttyS9", None, None, "n/a")])
+def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(plugged, capsys, ports):
+    plugged += [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
+    plugged.append(Port("/dev/ttyS9", None, None, "n/a"))
     assert cli.main(["--sink", "jsonl:-"]) == 3
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1
