@@ -1,13 +1,16 @@
 """Conditions that hold in every test."""
 
 import signal
+import sys
 import tracemalloc
+from functools import partial
 from pathlib import Path
 
 import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from edge.inference import bundled
 from firmware_bridge.links.serial_ports import Port
 
 MEMORY_LIMIT_BYTES = 60_000_000
@@ -55,6 +58,26 @@ def plugged(monkeypatch):
 
     monkeypatch.setattr(list_ports, "comports", lambda: list(map(listed, ports)))
     return ports
+
+
+@pytest.fixture
+def bundle(monkeypatch, tmp_path):
+    """Empty folder in place of that of the bundled models."""
+    monkeypatch.setattr(bundled, "BUNDLE_DIR", tmp_path / "bundled")
+    bundled.BUNDLE_DIR.mkdir()
+    return bundled.BUNDLE_DIR
+
+
+@pytest.fixture
+def stdin(monkeypatch):
+    """Function that sets sys.stdin."""
+    return partial(monkeypatch.setattr, sys, "stdin")
+
+
+@pytest.fixture
+def argv(monkeypatch):
+    """Function that sets sys.argv, for programs that take nothing else."""
+    return partial(monkeypatch.setattr, sys, "argv")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import socket
-import sys
 import threading
 from pathlib import Path
 
@@ -71,8 +70,7 @@ def test_a_server_with_none_that_fits_is_an_error_not_silence():
     assert not isinstance(refused.value, LinkLostError)  # another try would not help
 
 
-def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "stdin", None)
+def test_edge_sr_reads_a_server(tmp_path, capsys):
     records = tmp_path / "records.jsonl"
     still = make_recording(130, rate_hz=400.0)
     still.tracks[0].counts[:] = REST_COUNTS + np.random.default_rng(1).integers(0, 5, still.tracks[0].counts.shape)

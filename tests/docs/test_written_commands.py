@@ -12,7 +12,6 @@ import runpy
 import shlex
 import shutil
 import subprocess
-import sys
 import threading
 import tomllib
 from contextlib import nullcontext
@@ -221,12 +220,12 @@ def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
 
 
 @pytest.mark.parametrize("command", [one for one in RUN if one.startswith("python ")])
-def test_programs_run(command, world, monkeypatch, capfd):
+def test_programs_run(command, world, argv, capfd):
     words = world(command)
     if words[1].startswith("docs/"):  # such a program writes next to itself
         Path("docs").mkdir()
         shutil.copy(ROOT / words[1], words[1])
-        monkeypatch.setattr(sys, "argv", words[1:])
+        argv(words[1:])
         runpy.run_path(str(Path(words[1]).resolve()), run_name="__main__")
         assert {path.suffix for path in Path("docs").iterdir()} > {".py"}
         return

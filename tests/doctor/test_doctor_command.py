@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -195,13 +194,20 @@ def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wr
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
 
 
-def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch, limits):
+def examined(open_link, *arguments, out=None, err=None):
+    """Return the exit code and the output of a visit to a link."""
+    options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(examine, "links_to", lambda *_, **__: [open_link()])
+        return command.run(options, out, err or io.StringIO()), out.getvalue()
+
+
+def test_a_sensor_that_falls_silent_while_it_is_pressed(limits):
     limits(command, GIVEN_UP_S=0.3)
-    options = parser("doctor").parse_args(["--drift-s", "0.1", "--json"])
-    out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
-    monkeypatch.setattr(examine, "links_to", lambda *_, **__: [link])
-    assert command.run(options, out, Terminal(Person())) == 1
-    settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
+    link = FakeLink([as_scans(healthy_counts())], endless=True)
+    code, out = examined(lambda: link, "--drift-s", 0.1, "--json", err=Terminal(Person()))
+    settled = {one["name"]: one["verdict"] for one in json.loads(out)["findings"]}
+    assert code == 1
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
 
 
@@ -219,11 +225,11 @@ class Impatient(Person):
             super().hear(text)
 
 
-def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(monkeypatch):
+def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(stdin):
     """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
     leader, follower = os.openpty()
-    with os.fdopen(follower) as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
+    with os.fdopen(follower) as keyboard:
+        stdin(keyboard)
         os.write(leader, b"\n")  # before anything is asked: no answer to it
         person = Impatient(lambda: os.write(leader, b"\n"))
         with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:

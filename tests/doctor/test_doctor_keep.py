@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
-from test_doctor_command import doctor, recording
+from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli import main as cli
-from edge.cli.run_options import parser
-from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
@@ -162,13 +160,9 @@ class TestUse:
 WELL = as_scans(healthy_counts(200))
 
 
-def told(*arguments, link=None, out=None):
+def told(*arguments, link=lambda: FakeLink([WELL], kind="replay"), out=None):
     """The exit code, and what the doctor printed of a link that is well."""
-    options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
-    out = io.StringIO() if out is None else out
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(examine, "links_to", lambda *_, **__: [link() if link else FakeLink([WELL], kind="replay")])
-        return command.run(options, out, io.StringIO()), out.getvalue()
+    return examined(link, "--no-press", *arguments, out=out)
 
 
 @pytest.mark.parametrize(

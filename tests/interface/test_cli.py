@@ -14,7 +14,6 @@ from edge_samples import BASELINE, ROOT, make_contract, write_model
 from edge import __version__
 from edge.cli import main as cli
 from edge.cli import models_command
-from edge.inference import bundled as bundle
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -81,25 +80,20 @@ class TestReplay:
 
 
 class TestModels:
-    @pytest.fixture
-    def bundle_folder(self, monkeypatch, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        return tmp_path
-
-    def test_models_are_listed_from_their_contracts(self, bundle_folder, capsys):
-        write_model(bundle_folder / "mtsr4.onnx")
+    def test_models_are_listed_from_their_contracts(self, bundle, capsys):
+        write_model(bundle / "mtsr4.onnx")
         sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
-        write_model(bundle_folder / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
+        write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
         assert cli.main(["models"]) == 0
         out = capsys.readouterr().out.splitlines()
-        size_mb = (bundle_folder / "mtsr4.onnx").stat().st_size / 1e6
+        size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
         assert out[1].split() == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
         assert out[2].split() == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
         assert max(map(len, out)) <= 80
 
-    def test_run_times_are_measured_next_to_the_error(self, bundle_folder, limits, capsys):
+    def test_run_times_are_measured_next_to_the_error(self, bundle, limits, capsys):
         limits(models_command, RATE_HZ=2000.0)
-        write_model(bundle_folder / "mtsr4.onnx")
+        write_model(bundle / "mtsr4.onnx")
         assert cli.main(["models", "--measure"]) == 0
         head, row, _, note, *_ = capsys.readouterr().out.splitlines()
         assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"

@@ -95,10 +95,10 @@ class TestEnds:
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
 
-    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, monkeypatch, capsys):
+    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, capsys):
         """A link that is slow to open would hold up the message."""
         received = []
-        monkeypatch.setattr(emulator.adapter, "feed", lambda data: received.append(data) or b"")
+        emulator.adapter.feed = lambda data: received.append(data) or b""
         assert cli.main(["--model", "nothere", "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err.startswith("edge-sr: no model 'nothere'") and received == []
 
@@ -119,7 +119,7 @@ class TestEnds:
             return answer
 
         monkeypatch.setattr(run_command, "load_model", load)
-        monkeypatch.setattr(emulator.adapter, "feed", feed)
+        emulator.adapter.feed = feed
         path = files / "tiny.onnx"
         assert cli.main(["--model", str(path), "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
