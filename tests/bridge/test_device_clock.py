@@ -56,10 +56,10 @@ def test_hours_of_silence_are_hours() -> None:
     assert clock.restarts == 0
 
 
-@pytest.mark.parametrize("rate", [0.985, 0.99, 0.995, 0.9999, 1.001, 1.01])
+@pytest.mark.parametrize("rate", [0.985, 0.9999, 1.01])
 def test_a_device_slower_or_faster_than_the_host_is_followed(rate) -> None:
     clock = DeviceClock(US, WRAP_US)
-    for i in range(60_000):
+    for i in range(30_000):
         arrival_ns = HOST_NS + i * 10 * MS
         assert arrival_ns - clock.at(round(i * 10_000 * rate), arrival_ns).host_ns <= 4 * MS
     assert not clock.dropped
@@ -149,7 +149,7 @@ def test_frames_that_changed_places_are_no_new_beginning() -> None:
 def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
     """Stamps of socketcan and of a server are of one. No scan is lost, so none may be reported missing."""
     clock, cadences, noise = DeviceClock(US, None), Cadences(rate_hz=100.0), random.Random(back_ms)
-    for number in range(5_000):
+    for number in range(2_000):
         bus_us = 10_000 * number
         arrival_ns = HOST_NS + bus_us * US + noise.randint(0, 2 * MS)
         stamp_us = 1_800_000_000_000_000 + bus_us - 1_000 * back_ms * (number >= 1_000)

@@ -17,6 +17,7 @@ import tomllib
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 import written_samples
 from bridge_samples import write_recording
@@ -40,6 +41,8 @@ from firmware_bridge.zeroing.baseline import save_baselines
 COMMANDS = written_samples.commands()
 RATE_HZ = 500
 ENOUGH = 60
+TAPS_SCANS = 460
+"""Scans of the demo up to the end of its four taps."""
 """Results of a sensor that would go on for ever."""
 
 PARSED = {
@@ -133,15 +136,28 @@ def emulated():
         yield left, right, server
 
 
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    """Recordings of the demo's taps as press.npz and press.mcap."""
+    folder = tmp_path_factory.mktemp("press")
+    with np.load(demo_recording()) as demo:
+        taps = {name: demo[name][:TAPS_SCANS] for name in ("sensor", "scan", "time_ns", "counts")}
+        poses = demo["pose_time_ns"] <= taps["time_ns"][-1]
+        taps |= {name: demo[name][poses] for name in ("pose_time_ns", "pose", "pose_holds")}
+        np.savez(folder / "press.npz", **taps, **{name: demo[name] for name in ("format", "version", "rate_hz")})
+    cli.main(["--source", f"replay:{folder}/press.npz", "--rate-hz", "2000", "--sink", f"mcap:{folder}/press.mcap"])
+    return folder
+
+
 @pytest.fixture
-def world(emulated, tmp_path, plugged, monkeypatch):
+def world(emulated, press, tmp_path, plugged, monkeypatch):
     """Folder with what the pages take for granted, and adapters at the places that they name."""
     left, right, server = emulated
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    shutil.copy(demo_recording(), "press.npz")
+    shutil.copy(press / "press.npz", "press.npz")
     for name in ("left", "right", "released", "held"):
         write_recording(tmp_path / f"{name}.csv", healthy_counts(150))
     save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
@@ -154,11 +170,10 @@ def world(emulated, tmp_path, plugged, monkeypatch):
         if "D30BL401" in command:
             plugged.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
         if "press.mcap" in command and " record " not in command and "mcap:press.mcap" not in command:
-            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
+            shutil.copy(press / "press.mcap", "press.mcap")
         if command.endswith(" bag"):
-            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:bag.mcap"])
             Path("bag").mkdir()
-            Path("bag.mcap").rename("bag/bag_0.mcap")
+            shutil.copy(press / "press.mcap", "bag/bag_0.mcap")
         if "--forget-gains" in command:
             keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
         if " convert " in command:
