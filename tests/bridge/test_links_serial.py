@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import os
-import select
 import subprocess
 import sys
 import termios
@@ -101,26 +100,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
                 os.write(device.device_fd, text[at : at + piece_bytes])
             scans = read_scans(link, len(complete))  # the torn one waits for the next
             assert [scan.complete for scan in scans] == complete
-
-
-def test_few_reads_make_a_scan(monkeypatch):
-    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
-    wakes = []
-    poll = select.poll
-
-    class CountedPoll:
-        def __init__(self):
-            self._poll = poll()
-            self.register = self._poll.register
-
-        def poll(self, timeout_ms):
-            wakes.append(timeout_ms)
-            return self._poll.poll(timeout_ms)
-
-    monkeypatch.setattr(select, "poll", CountedPoll)
-    with Emulator([make_recording(30)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
-        assert len(read_until_lost(link)) == 30
-    assert len(wakes) < 30 * 5, "one for each of sixteen frames"
 
 
 def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):

@@ -13,7 +13,6 @@ from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
-from edge.perception.change_gate import CHANGED_COUNTS, NOISE_COUNTS, LastReading
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
 from edge.perception.result import mask_bits
@@ -216,49 +215,6 @@ class TestAway:
         notes = make_runtime().push(dataclasses.replace(scan, device_ns=device_ns, unread_ns=unread_ns)).notes
         late = [one.text for one in notes if one.kind == "late"]
         assert len(late) == (note is not None) and (note is None or note in late[0])
-
-
-SHAPE = (3, 4, 4)
-BEFORE = (2000.0 * np.random.default_rng(0).random(SHAPE)).astype(np.float32)
-
-
-@pytest.fixture
-def last():
-    """The last reading, of which a model has made a pattern."""
-    last = LastReading(SHAPE)
-    last.keep(BEFORE, "model")
-    return last
-
-
-class TestLastReading:
-    def test_noise_is_no_change_and_a_little_everywhere_is(self, last):
-        noise = NOISE_COUNTS * np.random.default_rng(1).standard_normal((2001, *SHAPE), dtype=np.float32)
-        last.keep(BEFORE + noise[0], "model")
-        assert sum(last.holds(BEFORE + one, "model") for one in noise[1:]) >= 1990
-        last.keep(BEFORE, "model")
-        assert last.holds(BEFORE + np.float32(3.9), "model")
-        assert not last.holds(BEFORE + np.float32(4.0), "model")
-
-    def test_one_taxel_that_changed_is_seen(self, last):
-        for place in np.ndindex(SHAPE):
-            after = BEFORE.copy()
-            after[place] -= CHANGED_COUNTS + 1
-            assert not last.holds(after, "model")
-
-    def test_drift_is_followed_however_slowly(self, last):
-        counts, made = BEFORE, 0
-        for _ in range(400):
-            counts = counts + np.float32(0.1)
-            if not last.holds(counts, "model"):
-                last.keep(counts, "model")
-                made += 1
-        assert made == 10
-
-    def test_another_maker_or_none_makes_it_anew(self, last):
-        last.keep(BEFORE, ("model", 0, 1))
-        assert last.holds(BEFORE, ("model", 0, 1)) and not last.holds(BEFORE, ("model", 1, 1))
-        last.keep(BEFORE, None)
-        assert not last.holds(BEFORE, ("model", 0, 1)) and not LastReading(SHAPE).holds(BEFORE, "model")
 
 
 def make_pad(**settings):

@@ -192,25 +192,6 @@ def test_rest_is_a_second_without_contact_of_stamped_sensors():
     assert not setter.waited(make_scan(154))
 
 
-@pytest.mark.parametrize(
-    ("sensors", "period_s", "patience_s", "stamped", "pace"),
-    [
-        (1, 0.01, 0.0, True, Pace()),
-        (1, 0.01, 0.1, False, Pace()),
-        (1, 0.002, 0.1, True, Pace()),
-        (1, float("inf"), 0.1, True, Pace()),
-        (3, 0.01, 0.0, True, Pace()),
-        (4, 0.01, 0.0, True, Pace(0.0025)),
-        (4, 0.1, 0.0, True, Pace()),
-        (4, 0.01, 0.1, True, Pace(0.01, 10)),
-    ],
-)
-def test_many_are_read_together_and_rest_needs_patience(sensors, period_s, patience_s, stamped, pace):
-    setter = PaceSetter(patience_s)
-    followed(setter, 200, stamped=stamped)
-    assert setter.choose(sensors, period_s) == pace
-
-
 def recording(scans, pressed):
     """Two sensors on a bus, which change in every scan, and are pressed at the end."""
     rng = np.random.default_rng(2)

@@ -1,7 +1,6 @@
 """Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
 # pyright: reportArgumentType=false
 
-import base64
 import json
 import math
 from collections.abc import Callable
@@ -18,8 +17,8 @@ from edge.api import Contract, ModelError
 from edge.inference import small_network as networks
 from edge.inference.forward_model import GRID, KPA, condensed, features
 from edge.inference.onnx_session import ModelSession
-from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network, unpacked
-from edge.inference.trust import check_of, contact_features, trust_of
+from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network
+from edge.inference.trust import contact_features
 
 GAIN_ERROR = 0.075
 
@@ -87,13 +86,6 @@ class TestTrust:
             Contract.from_metadata(contract.to_metadata())
         assert "\n" not in str(told.value) and "export the model again" in str(told.value)
 
-    @pytest.mark.parametrize("value", [None, [], 3, "text"])
-    def test_what_is_no_map_is_refused(self, value):
-        with pytest.raises(ValueError, match="expected forward, contact, tap"):
-            trust_of(value, CONSTANTS)
-        with pytest.raises(ValueError, match="expected layers and a limit"):
-            check_of(value)
-
 
 def layers(*widths, seed=0):
     rng = np.random.default_rng(seed)
@@ -135,28 +127,6 @@ class TestSmallNetwork:
     def test_layers_that_are_none_are_refused(self, made, said):
         with pytest.raises(ValueError, match=said):
             SmallNetwork(made)
-
-    def test_numbers_are_packed_in_half_precision(self):
-        values = np.array([[1.0, -2.5], [1 / 3, 60_000.0]])
-        assert unpacked(packed(values)) == pytest.approx(values, rel=1e-3)
-        assert unpacked(packed(values)).dtype == np.float32
-
-    @pytest.mark.parametrize(
-        "value",
-        [
-            *({"shape": shape} for shape in ([2, 3], [0, 4], [-2, -2], [1 << 17, 1], ["two", 2], 4, None, [math.nan])),
-            *({"f2": text} for text in ("AAAA", "no base64!", "\u00e4", 7)),
-            *(
-                {"f2": base64.b64encode(np.array([1, 2, 3, bad], dtype="<f2").tobytes()).decode()}
-                for bad in (np.nan, np.inf)
-            ),
-            *(None, [], "text", 3),
-        ],
-    )
-    def test_what_is_no_array_is_refused(self, value):
-        good = packed(np.ones((2, 2)))
-        with pytest.raises(ValueError, match=r"\w"):
-            unpacked(good | value if isinstance(value, dict) else value)
 
 
 def make_maps(seed=0, size=40):
