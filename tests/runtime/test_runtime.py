@@ -15,7 +15,6 @@ from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.contact_patch import touched, touched_patch
-from edge.perception.result import mask_bits
 from firmware_bridge.scans.mounting import Mounting
 
 SURE = make_contract(interval_factor=1.6)
@@ -75,27 +74,11 @@ class TestResult:
         assert window[:, 2, 1, 1].tolist() == [3.0, 5.0, 0.0, 0.0]
         assert not window[:, :2].any()
 
-    def test_masks_have_bit_i_for_taxel_i(self):
-        for taxel in range(16):
-            assert mask_bits(make_scan(absent=(taxel,)).fresh) == 0xFFFF ^ (1 << taxel)
-        assert mask_bits(np.ones((2, 3), dtype=bool)) == 0b111111 and mask_bits(np.zeros((4, 4), dtype=bool)) == 0
-
-    @pytest.mark.parametrize(
-        ("values", "pitch_mm", "area_mm2", "centroid_mm"),
-        [
-            ({(39, 0): 2}, 0.47, 0.47**2, (-19.5 * 0.47, 19.5 * 0.47)),
-            # It is weighted, and leaves out what is below the level.
-            ({(1, 0): 0.49, (1, 1): 0.5, (1, 3): 1.0}, 2.0, 8, ((1 * 0.5 + 3 * 1.0) / 1.5 * 2 - 39, -37)),
-            ({}, 1.0, 0, None),
-            (dict.fromkeys(np.ndindex(40, 40), -1), 1.0, 0, None),
-        ],
-    )
-    def test_the_patch_that_is_touched(self, values, pitch_mm, area_mm2, centroid_mm):
+    def test_the_patch_is_weighted_and_leaves_out_what_is_below_the_level(self):
         pattern = np.zeros((40, 40), dtype=np.float32)
-        for place, value in values.items():
-            pattern[place] = value
-        found = touched_patch(pattern, touched(pattern, 0.5), pitch_mm)
-        assert found == (pytest.approx(area_mm2), centroid_mm and pytest.approx(centroid_mm))
+        pattern[1, [0, 1, 3]] = 0.49, 0.5, 1.0
+        centroid_mm = (1 * 0.5 + 3 * 1.0) / 1.5 * 2 - 39, -37
+        assert touched_patch(pattern, touched(pattern, 0.5), 2.0) == (pytest.approx(8), pytest.approx(centroid_mm))
 
 
 class TestRefusals:

@@ -1,6 +1,5 @@
 """Readers and writers of shared memory that come, die and meet."""
 
-import os
 import re
 import signal
 import subprocess
@@ -28,7 +27,7 @@ from shm_read import attach
 pytestmark = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared memory is a folder on Linux alone")
 
 __all__ = ["name", "sink", "start_writer"]
-READS = int(os.environ.get("EDGE_SHM_READS", "20000"))
+READS = 5_000
 PATIENCE_S = 30
 
 
