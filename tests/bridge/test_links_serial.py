@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import make_recording, read_scans, read_until_lost, stacked
+from bridge_samples import make_recording, read_scans
 from edge_samples import wait_for
 from serial_samples import SilentDevice
 
-from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
@@ -26,25 +25,6 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
-
-
-@pytest.mark.parametrize(("acknowledges", "latency_s"), [(True, 0.001), (False, 0.016)])
-def test_every_scan_comes_once_and_in_order(acknowledges, latency_s, limits):
-    limits(slcan_status, ADAPTER_ASKED_NS=60 * 10**9)  # a busy machine makes no silence to ask about
-    recordings = [make_recording(30, seed=1), make_recording(30, seed=2)]
-    with (
-        Emulator(recordings, acknowledges=acknowledges, latency_s=latency_s, jitter_s=0.002) as emulator,
-        SlcanSerialLink(emulator.port) as link,
-    ):
-        scans = read_until_lost(link)
-        counters = {name: count for name, count in link.counters().items() if count}
-    for sensor, recording in zip(("4", "6"), recordings, strict=True):
-        assert [scan.number for scan in scans if scan.sensor == sensor] == list(range(30))
-        assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
-    # The acknowledgement of the opening is seen; those before it are dropped with what is old.
-    lines = 2 * 30 * 16
-    expected = {"received_bytes": lines * 26 + acknowledges, "frames": lines, "readings": lines, "scans": 60}
-    assert counters == expected | ({"replies": 1, "dropped_bytes": 3} if acknowledges else {})
 
 
 def test_the_wrong_line_speed_gives_no_scan():

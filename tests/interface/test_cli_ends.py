@@ -249,8 +249,8 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
     ):
         path.write_text(content, newline="")
         asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]
-        done = subprocess.run([*EDGE_SR, *map(str, asked), "--sink", "jsonl:-"], capture_output=True, cwd=ROOT)
-        printed = (done.stdout + done.stderr).decode()
+        done = run(*asked, "--sink", "jsonl:-")
+        printed = done.stdout + done.stderr
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed
         assert text not in printed and printed.replace("\n", "").isprintable()
 
