@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import select
 import subprocess
 import sys
 import termios
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import make_recording, read_scans
+from bridge_samples import make_recording, read_scans, read_until_lost
 from edge_samples import wait_for
 from serial_samples import SilentDevice
 
@@ -101,6 +102,26 @@ def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
 
 
 # The reader of bursts.
+
+
+def test_few_reads_make_a_scan(monkeypatch):
+    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
+    wakes = []
+    poll = select.poll
+
+    class CountedPoll:
+        def __init__(self):
+            self._poll = poll()
+            self.register = self._poll.register
+
+        def poll(self, timeout_ms):
+            wakes.append(timeout_ms)
+            return self._poll.poll(timeout_ms)
+
+    monkeypatch.setattr(select, "poll", CountedPoll)
+    with Emulator([make_recording(30)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
+        assert len(read_until_lost(link)) == 30
+    assert len(wakes) < 30 * 5, "one for each of sixteen frames"
 
 
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):

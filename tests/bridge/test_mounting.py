@@ -98,6 +98,21 @@ def test_deformation_is_corrected_once():
     assert plain[2, 1, 1] == 900
 
 
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        ({"order": (0,) * 16}, "each of 0..15 once"),
+        ({"order": tuple(range(15))}, "each of 0..15 once"),
+        ({"signs": (1, 0, 1)}, "three of 1 and -1"),
+        ({"gains": (float("nan"),) * 48}, "48 positive"),
+        ({"gains": (1.0,) * 3}, "48 positive"),
+    ],
+)
+def test_a_mounting_that_cannot_be_is_refused(settings, word):
+    with pytest.raises(ValueError, match=word):
+        Mounting(**settings)
+
+
 @pytest.mark.parametrize(("taxels", "mounted"), [(24, 16), (16, 24)])
 def test_csv_of_another_pad_than_its_mounting_is_refused(tmp_path, taxels, mounted):
     (tmp_path / "4.csv").write_text("\n".join([",".join(csv_header(taxels)), ",".join(["1000"] * 3 * taxels), ""]))

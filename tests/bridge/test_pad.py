@@ -182,6 +182,23 @@ class TestRuntime:
 
 
 class TestPad:
+    @pytest.mark.parametrize(
+        "wrong",
+        [
+            {"thickness_mm": 0.0},
+            {"counts_per_newton": float("nan")},
+            {"intervals": {"thickness": (1, 2)}},
+            {"intervals": {"thickness_mm": (5, 4)}},
+            {"gains": (1.0,) * 16},
+            {"gains": (0.0,) * 48},
+            {"gain_half_widths": (0.02,) * 48},
+            {"gains": GAINED, "gain_half_widths": (1.1,) * 48},
+        ],
+    )
+    def test_what_no_pad_has_is_refused(self, wrong):
+        with pytest.raises(ValueError, match="expected"):
+            Pad(**wrong)
+
     def test_gains_go_with_their_places_and_axes(self):
         order = tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist())
         widths = tuple((np.asarray(GAINED) / 50).tolist())

@@ -222,6 +222,11 @@ def test_a_still_grip_is_inferred_once():
     assert again == [None, 18] and len(model.windows) == 4, "the same touch in the next tap"
 
 
+def test_a_press_that_rises_slowly_is_inferred_again():
+    pad, _ = make_pad()
+    assert [pad.push(PRESS + 5 * n).reused_from for n in range(9)] == [None, 0, 0, None, 3, 3, None, 6, 6]
+
+
 def test_every_scan_is_inferred_where_that_is_asked_for():
     pad, model = make_pad(options=RuntimeOptions(every_scan=True))
     assert all(pad.push(PRESS).reused_from is None for _ in range(5))

@@ -192,6 +192,16 @@ def test_rest_is_a_second_without_contact_of_stamped_sensors():
     assert not setter.waited(make_scan(154))
 
 
+def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
+    setter = PaceSetter(0.0)
+    paces = [setter.choose(*of) for of in ((3, 0.01), (4, 0.01), (4, 0.1))]
+    assert paces == [Pace(), Pace(0.0025), Pace()]
+    for period_s, stamped in ((0.01, False), (0.002, True), (float("inf"), True)):
+        setter = PaceSetter(0.1)
+        followed(setter, 200, stamped=stamped)
+        assert setter.choose(1, period_s) == Pace()
+
+
 def recording(scans, pressed):
     """Two sensors on a bus, which change in every scan, and are pressed at the end."""
     rng = np.random.default_rng(2)

@@ -55,6 +55,12 @@ class TestHistogram:
         assert got is not None and exact * (1 - 1e-9) <= got <= exact * 1.0219
         assert got <= histogram.max == max(values)
 
+    def test_extreme_values_stay_within(self):
+        histogram = Histogram()
+        for value in (0.0, 1e-9, 1e30):
+            histogram.add(value)
+        assert histogram.count == 3 and histogram.max == 1e30 and histogram.quantile(0.5) == 1.0
+
 
 def test_it_counts_what_happened():
     statistics = counted(
