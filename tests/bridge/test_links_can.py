@@ -1,8 +1,8 @@
 """The python-can link: its clocks, its bus errors, and what is refused at its opening."""
 
-import builtins
 import errno
 import itertools
+import sys
 import threading
 from functools import partial
 from pathlib import Path
@@ -230,14 +230,7 @@ def test_interfaces_that_are_refused(interface, words):
 
 
 def test_python_can_is_not_installed(monkeypatch):
-    real = builtins.__import__
-
-    def no_can(name, *arguments, **settings):
-        if name == "can":
-            raise ImportError(name)
-        return real(name, *arguments, **settings)
-
-    monkeypatch.setattr(builtins, "__import__", no_can)
+    monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(DeviceError, match=r"pip install '.+\[can\]'"):
         CanBusLink("virtual", "x")
 
