@@ -90,7 +90,7 @@ def test_the_emulator_ends_however_its_parent_ends(recording, how):
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(recording)], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as parent:
-        assert parent.stdout is not None and parent.stdout.readline() == "reading\n"
+        assert parent.stdout.readline() == "reading\n"
         assert len(processes_playing(recording)) == 1
         os.killpg(parent.pid, how)  # to the whole process group, as a terminal sends Ctrl-C
         last_words, _ = parent.communicate(timeout=60)

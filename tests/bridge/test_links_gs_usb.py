@@ -329,7 +329,6 @@ def test_python_can_reads_it(public_port):
     with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
         public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)
         message = bus.recv(1.0)
-        assert message is not None
         assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
         bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
         assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]

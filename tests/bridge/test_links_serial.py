@@ -283,7 +283,7 @@ def test_who_holds_a_port_is_named():
             SlcanSerialLink(device.port).__enter__()
         command = [sys.executable, "-c", f"{held}; input()", device.port]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None and process.stdout.readline() == b"1\n"
+            assert process.stdout.readline() == b"1\n"
             with pytest.raises(DeviceError, match=rf"in use by \S+ \({process.pid}\): .*ModemManager.*udev rule ATTRS"):
                 SlcanSerialLink(device.port).__enter__()
             process.communicate()

@@ -37,13 +37,11 @@ class TestEnds:
     def follow(self, emulator, files, *more):
         """Return a run on the emulator and its first records."""
         process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
-        assert process.stdout is not None
         first = [process.stdout.readline() for _ in range(10)]
         return process, first
 
     def rest(self, process):
         """Return the unread rest; not by communicate(), which ignores the text that readline() has read ahead."""
-        assert process.stdout is not None and process.stderr is not None
         rest, errors = process.stdout.read(), process.stderr.read()  # of errors there are too few to fill a pipe
         process.wait(TIMEOUT_S)
         return rest, errors
@@ -68,7 +66,6 @@ class TestEnds:
             process, _ = self.follow(emulator, files)
         finally:
             signal.signal(number, before)
-        assert process.stdout is not None
         process.send_signal(number)
         got = records("".join(process.stdout.readline() for _ in range(100)))
         assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
@@ -78,7 +75,6 @@ class TestEnds:
 
     def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
         process, _ = self.follow(emulator, files)
-        assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
         assert process.wait(TIMEOUT_S) == 0
         errors = process.stderr.read()
@@ -141,7 +137,7 @@ class TestEnds:
         os.close(reader)
         with start("models", stdout=writer) as process:
             os.close(writer)
-            assert process.stderr is not None and process.stderr.read() == ""
+            assert process.stderr.read() == ""
         assert process.returncode == 0
 
 
@@ -226,7 +222,7 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    assert process.stdout is not None and process.stdout.readline() == "importing\n"
+    assert process.stdout.readline() == "importing\n"
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=TIMEOUT_S)
     assert (process.returncode, errors) == (-signal.SIGINT, "")

@@ -2,7 +2,6 @@
 
 The frozen set has the eighteen figures on one pad, the wide one has every family on pads of their own.
 """
-# pyright: reportArgumentType=false
 
 from functools import cache
 

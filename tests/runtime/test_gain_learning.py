@@ -1,5 +1,4 @@
 """Gains that a running sensor learns from its contacts: bounded, robust, kept, and forgotten on demand."""
-# pyright: reportArgumentType=false, reportOptionalOperand=false, reportOptionalSubscript=false
 
 from dataclasses import replace
 from types import SimpleNamespace

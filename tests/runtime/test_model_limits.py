@@ -167,7 +167,7 @@ class TestEndlessLoad:
         pipe = subprocess.PIPE
         begun = subprocess.Popen([sys.executable, "-c", PROGRAM, path], cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
         with ended(begun) as process:
-            assert process.stdout is not None and process.stdout.readline() == "loading\n"
+            assert process.stdout.readline() == "loading\n"
             process.send_signal(number)
             _, err = process.communicate()
         assert process.returncode == 4

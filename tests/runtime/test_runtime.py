@@ -1,6 +1,4 @@
 """Runtime: what a result holds, zeroing at the start, scans that overtake others, and those that need no pattern."""
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
-# pyright: reportOptionalMemberAccess=false
 
 import dataclasses
 

@@ -1,5 +1,4 @@
 """Source of one or several links: opened in a thread, read in threads at a pace, scripts and emulated adapters."""
-# pyright: reportAttributeAccessIssue=false
 
 import threading
 import time

@@ -1,5 +1,4 @@
 """Statistics of a run, quantiles and the summary at its end; events and notes, each of one of a closed set of kinds."""
-# pyright: reportArgumentType=false
 
 import re
 from dataclasses import replace

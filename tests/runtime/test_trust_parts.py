@@ -1,5 +1,4 @@
 """Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
-# pyright: reportArgumentType=false
 
 import json
 import math
@@ -75,7 +74,6 @@ class TestTrust:
     def test_it_comes_back_from_a_model_file(self, tmp_path):
         made = make_trust()
         again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
-        assert again is not None
         row = np.linspace(-1, 1, 104, dtype=np.float32)
         assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
         assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])

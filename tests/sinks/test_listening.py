@@ -57,7 +57,7 @@ def reachable_of_a_demo(*listeners: str) -> list[str]:
         command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as demo:
         try:
-            assert demo.stdout is not None and demo.stdout.readline().startswith(b"{"), "the demo says nothing"
+            assert demo.stdout.readline().startswith(b"{"), "the demo says nothing"
             return reachable(demo.pid)
         finally:
             demo.terminate()
