@@ -56,10 +56,10 @@ def test_hours_of_silence_are_hours() -> None:
     assert clock.restarts == 0
 
 
-@pytest.mark.parametrize("rate", [0.985, 0.99, 0.995, 0.9999, 1.001, 1.01])
+@pytest.mark.parametrize("rate", [0.985, 0.9999, 1.01])
 def test_a_device_slower_or_faster_than_the_host_is_followed(rate) -> None:
     clock = DeviceClock(US, WRAP_US)
-    for i in range(60_000):
+    for i in range(30_000):
         arrival_ns = HOST_NS + i * 10 * MS
         assert arrival_ns - clock.at(round(i * 10_000 * rate), arrival_ns).host_ns <= 4 * MS
     assert not clock.dropped
@@ -71,7 +71,6 @@ def test_a_stall_of_this_machine_leaves_distances_as_they_are() -> None:
     for number in range(200):
         late_ms = 496 if number == 55 else max(late_ms - 10, 6 * (number > 0))
         at = clock.at(number * 10, HOST_NS + (number * 10 + late_ms) * MS)
-        assert at is not None
         mapped.append(at.host_ns)
     steps_ns = [after - before for before, after in pairwise(mapped)]
     assert min(steps_ns) > 7 * MS and max(steps_ns) < 13 * MS
@@ -149,7 +148,7 @@ def test_frames_that_changed_places_are_no_new_beginning() -> None:
 def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
     """Stamps of socketcan and of a server are of one. No scan is lost, so none may be reported missing."""
     clock, cadences, noise = DeviceClock(US, None), Cadences(rate_hz=100.0), random.Random(back_ms)
-    for number in range(5_000):
+    for number in range(2_000):
         bus_us = 10_000 * number
         arrival_ns = HOST_NS + bus_us * US + noise.randint(0, 2 * MS)
         stamp_us = 1_800_000_000_000_000 + bus_us - 1_000 * back_ms * (number >= 1_000)

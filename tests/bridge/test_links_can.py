@@ -1,8 +1,8 @@
 """The python-can link: its clocks, its bus errors, and what is refused at its opening."""
 
-import builtins
 import errno
 import itertools
+import sys
 import threading
 from functools import partial
 from pathlib import Path
@@ -101,18 +101,24 @@ def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: 
 
 
 @pytest.fixture
+def opens(monkeypatch):
+    """Function that sets what python-can opens."""
+    return partial(monkeypatch.setattr, can, "Bus")
+
+
+@pytest.fixture
 def networks(monkeypatch, tmp_path):
     monkeypatch.setattr(can_bus, "can_networks", partial(can_networks, tmp_path))
     return tmp_path
 
 
 @pytest.fixture
-def lasting(bus, networks, monkeypatch):
+def lasting(bus, networks, opens):
     """Link of socketcan that is opened again when it is silent, over the virtual bus, on a clock of its own."""
     now_ns, plugged = [10**12], threading.Event()
     plugged.set()
     make_network(networks, "can0", up=True)
-    monkeypatch.setattr(can, "Bus", lambda **_: PulledBus(plugged, channel=bus.channel_id))
+    opens(lambda **_: PulledBus(plugged, channel=bus.channel_id))
     inner = CanBusLink("socketcan", "can0", clock_ns=lambda: now_ns[0])
     with LastingLink(inner, clock_ns=lambda: now_ns[0], sleep=lambda _: None) as link:
 
@@ -202,10 +208,10 @@ def test_which_kind_of_source_it_is(interface, channel, kind):
         ("socketcan", "can0", {"channel": "can0", "can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}),
     ],
 )
-def test_the_bitrate_is_given_where_it_is_taken(monkeypatch, networks, interface, channel, settings):
+def test_the_bitrate_is_given_where_it_is_taken(opens, networks, interface, channel, settings):
     asked = []
     make_network(networks, "can0", up=True)
-    monkeypatch.setattr(can, "Bus", lambda **settings: asked.append(settings))
+    opens(lambda **settings: asked.append(settings))
     CanBusLink(interface, channel).__enter__()
     assert asked == [{"interface": interface, "ignore_config": True} | settings]
 
@@ -224,14 +230,7 @@ def test_interfaces_that_are_refused(interface, words):
 
 
 def test_python_can_is_not_installed(monkeypatch):
-    real = builtins.__import__
-
-    def no_can(name, *arguments, **settings):
-        if name == "can":
-            raise ImportError(name)
-        return real(name, *arguments, **settings)
-
-    monkeypatch.setattr(builtins, "__import__", no_can)
+    monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(DeviceError, match=r"pip install '.+\[can\]'"):
         CanBusLink("virtual", "x")
 
@@ -271,11 +270,11 @@ def test_a_network_that_is_not_there_or_down(networks, channel, words):
         (can.CanInitializationError("no such channel"), "cannot be opened: no such channel"),
     ],
 )
-def test_why_a_network_cannot_be_opened(monkeypatch, error, words):
+def test_why_a_network_cannot_be_opened(opens, error, words):
     def refuse(**settings):
         raise error
 
-    monkeypatch.setattr(can, "Bus", refuse)
+    opens(refuse)
     with pytest.raises(DeviceError, match=words) as refused:
         CanBusLink("pcan", "0").__enter__()
     assert not isinstance(refused.value, LinkLostError)

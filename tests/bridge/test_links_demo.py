@@ -43,8 +43,8 @@ def test_leaving_early_ends_the_emulator_without_force(recording, monkeypatch):
     assert len(list(Path("/proc/self/fd").iterdir())) == open_before
 
 
-def test_an_emulator_that_hangs_is_killed(recording, monkeypatch):
-    monkeypatch.setattr(demo, "END_TIMEOUT_S", 0.2)
+def test_an_emulator_that_hangs_is_killed(recording, limits):
+    limits(demo, END_TIMEOUT_S=0.2)
     with DemoLink(recording, rate_hz=50) as link:
         read_scans(link, 1)
         (process_id,) = processes_playing(recording)
@@ -90,7 +90,7 @@ def test_the_emulator_ends_however_its_parent_ends(recording, how):
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(recording)], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as parent:
-        assert parent.stdout is not None and parent.stdout.readline() == "reading\n"
+        assert parent.stdout.readline() == "reading\n"
         assert len(processes_playing(recording)) == 1
         os.killpg(parent.pid, how)  # to the whole process group, as a terminal sends Ctrl-C
         last_words, _ = parent.communicate(timeout=60)

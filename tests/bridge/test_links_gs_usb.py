@@ -82,17 +82,20 @@ def test_what_came_before_the_unplugging_is_not_lost():
             link.read(10.0)
 
 
-def test_a_signal_is_not_an_unplugging(monkeypatch):
+def test_a_signal_is_not_an_unplugging():
     port, link = opened()
-    with link, monkeypatch.context() as patched:
+    signals = [usb.core.USBError("interrupted", -10, errno.EINTR)]
+    with link:
+        fetch = port.adapter.fetch
 
         def interrupted(timeout_s):
-            patched.undo()
-            raise usb.core.USBError("interrupted", -10, errno.EINTR)
+            if signals:
+                raise signals.pop()
+            return fetch(timeout_s)
 
-        patched.setattr(port.adapter, "fetch", interrupted)
+        port.adapter.fetch = interrupted
         port.adapter.hear(*frames_of(1), stamp_us=1000)
-        assert len(link.read(10.0)) == 1 and port.adapter.fetch is not interrupted
+        assert len(link.read(10.0)) == 1 and not signals
 
 
 def test_lost_frames_are_counted_and_told():
@@ -163,10 +166,14 @@ def test_what_is_older_than_the_opening_is_dropped():
     assert not port.adapter.mute
 
 
-def test_an_adapter_that_goes_on_sending_holds_up_no_opening(monkeypatch):
-    monkeypatch.setattr(gs_usb_link, "MOST_OLD_TRANSFERS", 20)
-    monkeypatch.setattr(GsUsbBackend, "bulk_read", lambda *_: 24)
-    with opened()[1]:
+class Endless(GsUsbAdapter):
+    def fetch(self, timeout_s):
+        return bytes(24)
+
+
+def test_an_adapter_that_goes_on_sending_holds_up_no_opening(limits):
+    limits(gs_usb_link, MOST_OLD_TRANSFERS=20)
+    with opened(GsUsbPort(Endless))[1]:
         pass
 
 
@@ -286,7 +293,13 @@ def test_in_use():
         GsUsbLink(backend=GsUsbBackend(port)).__enter__()
 
 
-def test_usb_that_cannot_be_read_or_without_libusb(monkeypatch):
+@pytest.fixture
+def get_backend(monkeypatch):
+    """Function that sets what pyusb takes for the system's libusb."""
+    return partial(monkeypatch.setattr, libusb1, "get_backend")
+
+
+def test_usb_that_cannot_be_read_or_without_libusb(get_backend, monkeypatch):
     class Closed(GsUsbBackend):
         def enumerate_devices(self):
             raise libusb_error(ACCESS)
@@ -294,10 +307,10 @@ def test_usb_that_cannot_be_read_or_without_libusb(monkeypatch):
     with pytest.raises(DeviceError, match="USB cannot be read"):
         list_devices(Closed())
     backend = GsUsbBackend()
-    monkeypatch.setattr(libusb1, "get_backend", lambda: backend)
+    get_backend(lambda: backend)
     monkeypatch.setitem(sys.modules, "libusb_package", None)
     assert gs_usb_devices.usb_backend() is backend, "the system's"
-    monkeypatch.setattr(libusb1, "get_backend", lambda: None)
+    get_backend(lambda: None)
     with pytest.raises(DeviceError, match="libusb cannot be loaded: pip install libusb-package"):
         gs_usb_devices.usb_backend()
 
@@ -306,9 +319,9 @@ def test_usb_that_cannot_be_read_or_without_libusb(monkeypatch):
 
 
 @pytest.fixture
-def public_port(monkeypatch):
+def public_port(get_backend):
     backend = GsUsbBackend()
-    monkeypatch.setattr(libusb1, "get_backend", lambda **_: backend)
+    get_backend(lambda **_: backend)
     return backend.ports[0]
 
 
@@ -316,7 +329,6 @@ def test_python_can_reads_it(public_port):
     with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
         public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)
         message = bus.recv(1.0)
-        assert message is not None
         assert (message.arbitration_id, bytes(message.data), message.timestamp) == (0x114, b"\1\2", 5.0)
         bus.send(can.Message(arbitration_id=0x201, data=b"\7\0", is_extended_id=False))
         assert public_port.adapter.sent == [CanFrame(0x201, b"\7\0")]

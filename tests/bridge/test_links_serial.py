@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import make_recording, read_scans, read_until_lost, stacked
+from bridge_samples import make_recording, read_scans, read_until_lost
 from edge_samples import wait_for
 from serial_samples import SilentDevice
 
-from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
@@ -27,25 +26,6 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
-
-
-@pytest.mark.parametrize(("acknowledges", "latency_s"), [(True, 0.001), (False, 0.016)])
-def test_every_scan_comes_once_and_in_order(acknowledges, latency_s, monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 60 * 10**9)  # a busy machine makes no silence to ask about
-    recordings = [make_recording(30, seed=1), make_recording(30, seed=2)]
-    with (
-        Emulator(recordings, acknowledges=acknowledges, latency_s=latency_s, jitter_s=0.002) as emulator,
-        SlcanSerialLink(emulator.port) as link,
-    ):
-        scans = read_until_lost(link)
-        counters = {name: count for name, count in link.counters().items() if count}
-    for sensor, recording in zip(("4", "6"), recordings, strict=True):
-        assert [scan.number for scan in scans if scan.sensor == sensor] == list(range(30))
-        assert (stacked(scans, sensor) == recording.tracks[0].counts).all()
-    # The acknowledgement of the opening is seen; those before it are dropped with what is old.
-    lines = 2 * 30 * 16
-    expected = {"received_bytes": lines * 26 + acknowledges, "frames": lines, "readings": lines, "scans": 60}
-    assert counters == expected | ({"replies": 1, "dropped_bytes": 3} if acknowledges else {})
 
 
 def test_the_wrong_line_speed_gives_no_scan():
@@ -103,26 +83,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
             assert [scan.complete for scan in scans] == complete
 
 
-def test_few_reads_make_a_scan(monkeypatch):
-    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
-    wakes = []
-    poll = select.poll
-
-    class CountedPoll:
-        def __init__(self):
-            self._poll = poll()
-            self.register = self._poll.register
-
-        def poll(self, timeout_ms):
-            wakes.append(timeout_ms)
-            return self._poll.poll(timeout_ms)
-
-    monkeypatch.setattr(select, "poll", CountedPoll)
-    with Emulator([make_recording(30)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
-        assert len(read_until_lost(link)) == 30
-    assert len(wakes) < 30 * 5, "one for each of sixteen frames"
-
-
 def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
     """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
 
@@ -142,6 +102,26 @@ def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
 
 
 # The reader of bursts.
+
+
+def test_few_reads_make_a_scan(monkeypatch):
+    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
+    wakes = []
+    poll = select.poll
+
+    class CountedPoll:
+        def __init__(self):
+            self._poll = poll()
+            self.register = self._poll.register
+
+        def poll(self, timeout_ms):
+            wakes.append(timeout_ms)
+            return self._poll.poll(timeout_ms)
+
+    monkeypatch.setattr(select, "poll", CountedPoll)
+    with Emulator([make_recording(30)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
+        assert len(read_until_lost(link)) == 30
+    assert len(wakes) < 30 * 5, "one for each of sixteen frames"
 
 
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
@@ -224,8 +204,8 @@ def fill(port_fd: int) -> None:
         time.sleep(0.01)
 
 
-def test_a_device_that_takes_nothing_holds_up_nobody(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "WRITE_TIMEOUT_S", 0.05)
+def test_a_device_that_takes_nothing_holds_up_nobody(limits):
+    limits(slcan_serial, WRITE_TIMEOUT_S=0.05)
     with SilentDevice() as device:
         with SlcanSerialLink(device.port):
             fill(device.client_fd)
@@ -235,8 +215,8 @@ def test_a_device_that_takes_nothing_holds_up_nobody(monkeypatch):
         serial.Serial(device.port, exclusive=True).close()  # the port is free again
 
 
-def test_a_stream_that_will_not_stop_holds_up_no_opening(monkeypatch):
-    monkeypatch.setattr(slcan_serial, "LONGEST_SETTLE_S", 0.1)
+def test_a_stream_that_will_not_stop_holds_up_no_opening(limits):
+    limits(slcan_serial, LONGEST_SETTLE_S=0.1)
     stop = threading.Event()
     with SilentDevice() as device:
         os.set_blocking(device.device_fd, False)
@@ -303,7 +283,7 @@ def test_who_holds_a_port_is_named():
             SlcanSerialLink(device.port).__enter__()
         command = [sys.executable, "-c", f"{held}; input()", device.port]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None and process.stdout.readline() == b"1\n"
+            assert process.stdout.readline() == b"1\n"
             with pytest.raises(DeviceError, match=rf"in use by \S+ \({process.pid}\): .*ModemManager.*udev rule ATTRS"):
                 SlcanSerialLink(device.port).__enter__()
             process.communicate()

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import socket
-import sys
 import threading
 from pathlib import Path
 
@@ -71,8 +70,7 @@ def test_a_server_with_none_that_fits_is_an_error_not_silence():
     assert not isinstance(refused.value, LinkLostError)  # another try would not help
 
 
-def test_edge_sr_reads_a_server(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "stdin", None)
+def test_edge_sr_reads_a_server(tmp_path, capsys):
     records = tmp_path / "records.jsonl"
     still = make_recording(130, rate_hz=400.0)
     still.tracks[0].counts[:] = REST_COUNTS + np.random.default_rng(1).integers(0, 5, still.tracks[0].counts.shape)
@@ -122,9 +120,8 @@ def test_a_dead_sensor_is_told_of_once_and_not_taken_for_back():
         assert "nothing arrives from sensor 1" in notices[1].text
 
 
-def test_a_half_open_connection_is_seen(monkeypatch):
-    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.1)
-    monkeypatch.setattr(xela_server, "ANSWER_S", 0.2)
+def test_a_half_open_connection_is_seen(limits):
+    limits(xela_server, SERVER_QUIET_S=0.1, ANSWER_S=0.2)
     with ServerEmulator(looping()) as server:
         link = XelaServerLink(server.url)
         with link:
@@ -136,12 +133,12 @@ def test_a_half_open_connection_is_seen(monkeypatch):
             assert read_scans(link, 5)
 
 
-def test_one_that_closes_just_before_it_is_asked_is_a_lost_link(monkeypatch):
+def test_one_that_closes_just_before_it_is_asked_is_a_lost_link(monkeypatch, limits):
     def hear_nothing(connection, *args, **kwargs):
         wait_for(lambda: connection.protocol.state is State.CLOSED)
         raise TimeoutError
 
-    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
+    limits(xela_server, SERVER_QUIET_S=0.0)
     with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
         read_scans(link, 1)
         server.kill()
@@ -149,22 +146,22 @@ def test_one_that_closes_just_before_it_is_asked_is_a_lost_link(monkeypatch):
         assert lose(link).startswith(f"{server.url}: link lost: ")
 
 
-def test_a_server_with_nothing_to_say_is_no_lost_link(monkeypatch):
+def test_a_server_with_nothing_to_say_is_no_lost_link(monkeypatch, limits):
     """The server answers pings, and is not asked while it sends."""
     asked, ping = [], ClientConnection.ping
     monkeypatch.setattr(ClientConnection, "ping", lambda link: asked.append(ping(link)) or asked[-1])
     with ServerEmulator(looping(), message_hz=0.2) as server, XelaServerLink(server.url) as link:
         link.read(0.1)
-        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 60.0)
+        limits(xela_server, SERVER_QUIET_S=60.0)
         assert not any(link.read(0.01) for _ in range(3)) and not asked
-        monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.05)
+        limits(xela_server, SERVER_QUIET_S=0.05)
         wait_for(lambda: link.read(0.02) is not None and len(asked) >= 4)
         assert all(pong.wait(60) for pong in asked[:-1])
 
 
-def test_a_server_that_talks_but_answers_no_ping_is_kept(monkeypatch):
+def test_a_server_that_talks_but_answers_no_ping_is_kept(monkeypatch, limits):
     asked, now_ns = [], [0]
-    monkeypatch.setattr(xela_server, "SERVER_QUIET_S", 0.0)
+    limits(xela_server, SERVER_QUIET_S=0.0)
     monkeypatch.setattr(ClientConnection, "ping", lambda link: asked.append(threading.Event()) or asked[-1])
     with ServerEmulator(looping()) as server, XelaServerLink(server.url, clock_ns=lambda: now_ns[0]) as link:
         for _ in range(10):
@@ -231,17 +228,16 @@ HTTP = b"HTTP/1.1 %s\r\nContent-Length: 0\r\n%s\r\n"
         (None, r"has not answered for 0\.2 s"),
     ],
 )
-def test_others_that_listen_there(answer, words, monkeypatch):
+def test_others_that_listen_there(answer, words, limits):
     if answer is None:
-        monkeypatch.setattr(xela_server, "OPENING_S", 0.2)
+        limits(xela_server, OPENING_S=0.2)
     with listening(answer) as url, pytest.raises(DeviceError, match=words) as refused:
         XelaServerLink(url).__enter__()
     assert str(refused.value).startswith(url) and "\n" not in str(refused.value)
 
 
-def test_one_that_was_met_and_hangs_holds_up_nobody_long(monkeypatch):
-    monkeypatch.setattr(xela_server, "OPENING_S", 20.0)
-    monkeypatch.setattr(xela_server, "REOPENING_S", 0.2)
+def test_one_that_was_met_and_hangs_holds_up_nobody_long(limits):
+    limits(xela_server, OPENING_S=20.0, REOPENING_S=0.2)
     with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
         read_scans(link, 3)
         server.freeze()

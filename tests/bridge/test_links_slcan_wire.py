@@ -1,7 +1,6 @@
 """Wire of an slcan adapter besides frames: time stamps and status."""
 
 import os
-import time
 
 import pytest
 from bridge_samples import make_recording, read_scans
@@ -78,8 +77,8 @@ LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
 
 
 @pytest.mark.parametrize("text", [LATE, b"".join(cycle_lines(0, 0))], ids=["other units", "standing still"])
-def test_stamps_that_are_no_clock_are_left_out(text, monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
+def test_stamps_that_are_no_clock_are_left_out(text, limits):
+    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
     with SilentDevice() as device:
         with SlcanSerialLink(device.port) as link:
 
@@ -99,9 +98,9 @@ def test_stamps_that_are_no_clock_are_left_out(text, monkeypatch):
         assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
-def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(monkeypatch):
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 10**12)
-    monkeypatch.setattr(slcan_serial, "LATE_STAMPS_FRAMES", 20)
+def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(limits):
+    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
+    limits(slcan_serial, LATE_STAMPS_FRAMES=20)
     with SilentDevice() as device:
         link = SlcanSerialLink(device.port)
         for opening in range(2):
@@ -121,10 +120,9 @@ def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(monkeypatch):
 
 
 @pytest.fixture
-def impatient(monkeypatch):
+def impatient(limits):
     """Asks every 50 ms instead of 5 s."""
-    monkeypatch.setattr(slcan_status, "INTERVAL_NS", 50 * MS)
-    monkeypatch.setattr(slcan_status, "ADAPTER_ASKED_NS", 40 * MS)
+    limits(slcan_status, INTERVAL_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
 
 
 def read_until(link: SlcanSerialLink, condition) -> None:
@@ -163,19 +161,6 @@ def read_now(device: SilentDevice) -> bytes:
         return b""
 
 
-def test_who_has_answered_once_is_asked_again_after_an_opening(impatient):
-    with SilentDevice() as device:
-        link = SlcanSerialLink(device.port)
-        with link:
-            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
-            os.write(device.device_fd, b"F00\r")
-            end_s = time.monotonic() + 0.05 * (slcan_status.MOST_UNANSWERED + 2)
-            wait_for(lambda: link.read(0.01) == [] and time.monotonic() > end_s)
-        read_now(device)
-        with link:
-            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
-
-
 def test_opening_again_does_not_unsay_what_was_said(impatient):
     """A link that lasts opens a silent adapter again and again: its trouble must not come and go with that."""
     with Emulator([make_recording(10)], loop=True) as emulator:
@@ -194,10 +179,9 @@ def test_opening_again_does_not_unsay_what_was_said(impatient):
             read_until(link, lambda: link.trouble is None)
 
 
-def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(monkeypatch):
+def test_stamps_are_not_asked_for_for_ever_where_nothing_comes(limits):
     """Some adapters write the setting to an EEPROM each time."""
-    monkeypatch.setattr(slcan_serial, "MOST_SILENT_OPENINGS", 2)
-    monkeypatch.setattr(slcan_serial, "QUIET_S", 0.001)
+    limits(slcan_serial, MOST_SILENT_OPENINGS=2, QUIET_S=0.001)
     stamped, plain = b"C\rS8\rZ1\rO\rC\rZ0\r", b"C\rS8\rO\rC\r"
     with SilentDevice() as device:
         link = SlcanSerialLink(device.port)

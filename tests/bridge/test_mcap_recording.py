@@ -29,6 +29,7 @@ from mcap_samples import (
 from edge.api import open_runtime, open_source
 from edge.perception.event import Event
 from edge.pipeline.sink import RunFacts
+from edge.sinks import mcap_writer
 from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
 from edge.sinks.registry import open_sink
@@ -137,8 +138,8 @@ class TestSink:
         sink.close()
 
     @pytest.mark.parametrize("lossless", [True, False])
-    def test_a_disk_that_hangs_is_waited_for_by_the_lossless_alone(self, tmp_path, monkeypatch, lossless):
-        monkeypatch.setattr("edge.sinks.mcap_writer.MOST_WAITING_BYTES", 20_000)
+    def test_a_disk_that_hangs_is_waited_for_by_the_lossless_alone(self, tmp_path, limits, lossless):
+        limits(mcap_writer, MOST_WAITING_BYTES=20_000)
         path = HangingDisk(tmp_path / "out.mcap")
         path.hangs_s = 0.05 if lossless else None
         results = make_results([make_scan(number) for number in range(50)])

@@ -64,7 +64,6 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
     temperature_k, ups_hz = (np.arange(16, dtype=np.float32).reshape(4, 4) + base for base in (300, 80))
     wire = replace(make_scan(absent=()), vendor=VendorReading(newtons, temperature_k, ups_hz))
     put = mounting.place(wire)
-    assert put.vendor is not None and put.vendor.newtons is not None and put.vendor_force_n is not None
     assert np.array_equal(put.vendor.newtons, seen(replace(mounting, gains=(1.0,) * 48), newtons))
     force_n = np.array(wire.vendor_force_n)[[1, 0, 2] if mounting.swap_xy else [0, 1, 2]] * mounting.signs
     assert put.vendor_force_n == pytest.approx(force_n, abs=1e-5)

@@ -12,7 +12,6 @@ from serial.tools.list_ports_common import ListPortInfo
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
-from firmware_bridge.links import registry as source
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
 from firmware_bridge.links.gs_usb_link import GsUsbLink
@@ -31,18 +30,14 @@ BUILT_IN = Port("/dev/ttyS0", None, None, "n/a")
 
 def test_the_ports_of_this_machine(monkeypatch):
     """pyserial raises a TypeError where a device goes while ports are listed: int(None, 16)."""
-    usb, none, fails = (
-        ListPortInfo("/dev/ttyUSB1"),
-        ListPortInfo("/dev/ttyS0"),
-        [TypeError("int()"), TypeError("int()")],
-    )
+    usb, fails = ListPortInfo("/dev/ttyUSB1"), [TypeError("int()"), TypeError("int()")]
     usb.vid, usb.pid, usb.serial_number, usb.description = 0x0403, 0x6015, "D30BL366", "x"
     usb.product, usb.manufacturer, usb.location = "USB-CAN Plus", "VScom", "1-2.1:1.0"
 
     def comports():
         if fails:
             raise fails.pop()
-        return [usb, none]
+        return [usb, ListPortInfo("/dev/ttyS0")]
 
     monkeypatch.setattr(list_ports, "comports", comports)
     expected = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30BL366", "x", "USB-CAN Plus", "VScom", "1.0", "1-2.1")
@@ -112,9 +107,10 @@ def test_by_serial_number():
         find_by_serial("D30BL366", [VSCOM, VSCOM])
 
 
-@pytest.fixture(autouse=True)
-def two_vscom(monkeypatch):
-    monkeypatch.setattr(source, "serial_ports", lambda: [BUILT_IN, VSCOM, SECOND_VSCOM])
+@pytest.fixture
+def two_vscom(plugged):
+    plugged += [BUILT_IN, VSCOM, SECOND_VSCOM]
+    return plugged
 
 
 @pytest.mark.parametrize(
@@ -129,7 +125,7 @@ def two_vscom(monkeypatch):
         ("slcan:serial=D30BL366@1000000", "/dev/ttyUSB0", 1_000_000),
     ],
 )
-def test_slcan_sources(text, port, baudrate):
+def test_slcan_sources(two_vscom, text, port, baudrate):
     link = open_source(text)
     assert isinstance(link, SlcanSerialLink)
     assert (link.port, link.baudrate, link.name, link.kind) == (port, baudrate, text, "device")
@@ -149,10 +145,10 @@ def test_other_sources(text, link, kind):
     assert isinstance(opened, link) and (opened.name, opened.kind) == (text, kind)
 
 
-def test_no_source_is_the_one_adapter_and_never_a_pretended_one(monkeypatch):
+def test_no_source_is_the_one_adapter_and_never_a_pretended_one(two_vscom):
     with pytest.raises(NoDeviceError, match="--source demo"):
         open_source(None, demo_recording="demo.npz")
-    monkeypatch.setattr(source, "serial_ports", lambda: [BUILT_IN, VSCOM])
+    two_vscom.remove(SECOND_VSCOM)
     link = open_source(None)
     assert isinstance(link, SlcanSerialLink) and (link.port, link.name) == ("/dev/ttyUSB0", "slcan:/dev/ttyUSB0")
 
@@ -308,19 +304,10 @@ def test_a_link_that_the_user_named_by_place_is_followed(tmp_path):
         adapter.find(ports[1:])
 
 
-def test_the_cable_out_and_in_again_under_another_name(monkeypatch):
+def test_the_cable_out_and_in_again_under_another_name(plugged):
     """The ports are real pseudo-terminals, which only the listing takes for USB."""
-    plugged: list[ListPortInfo] = []
-    monkeypatch.setattr(list_ports, "comports", lambda: list(plugged))
-    monkeypatch.setattr(source, "serial_ports", serial_ports)
-
-    def plug(port: str) -> None:
-        info = ListPortInfo(port)
-        info.vid, info.pid, info.serial_number, info.product = 0x0403, 0x6015, "D30BL366", "USB-CAN Plus"
-        plugged[:] = [info]
-
     with Emulator([make_recording(10)], loop=True) as first, Emulator([make_recording(10)], loop=True) as second:
-        plug(first.port)
+        plugged.append(VSCOM._replace(path=first.port))
         link = open_source("slcan:serial=D30BL366")
         with link:
             before = read_scans(link, 3)
@@ -328,7 +315,7 @@ def test_the_cable_out_and_in_again_under_another_name(monkeypatch):
         plugged.clear()
         with pytest.raises(NoDeviceError, match=r"no adapter .* with serial number D30BL366"):
             link.__enter__()
-        plug(second.port)
+        plugged.append(VSCOM._replace(path=second.port))
         with link:
             after = read_scans(link, 3)
     assert link.name == "slcan:serial=D30BL366"

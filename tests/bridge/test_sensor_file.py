@@ -225,17 +225,6 @@ def test_that_text_is_refused_for_its_id_alone(tmp_path):
     assert read.baseline is not None and read.baseline.counts[2, 3, 3] == 15
 
 
-def test_a_file_that_cannot_be_replaced_stays(tmp_path, monkeypatch):
-    path = tmp_path / "s.toml"
-    path.write_text("old")
-    monkeypatch.setattr(
-        "pathlib.Path.replace", lambda self, target: (_ for _ in ()).throw(OSError(28, "No space left"))
-    )
-    with pytest.raises(SensorFileError, match="cannot be written: No space left"):
-        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry()}))
-    assert path.read_text() == "old" and [one.name for one in tmp_path.iterdir()] == ["s.toml"]
-
-
 def test_numpys_numbers_are_written_and_a_silent_taxel_is_not(tmp_path):
     save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry(counts_per_newton=np.float64(1180.0))}))
     assert load_sensor_file(tmp_path / "s.toml").sensors["4"].counts_per_newton == 1180.0

@@ -12,12 +12,12 @@ import runpy
 import shlex
 import shutil
 import subprocess
-import sys
 import threading
 import tomllib
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 import written_samples
 from bridge_samples import write_recording
@@ -31,8 +31,6 @@ from edge.cli import run_command as run
 from edge.inference.bundled import demo_recording, find_model
 from edge.pipeline.gain_keeper import keep_learned
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.links import discovery as devices
-from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.pad_constants import GAINS, Pad
@@ -43,6 +41,8 @@ from firmware_bridge.zeroing.baseline import save_baselines
 COMMANDS = written_samples.commands()
 RATE_HZ = 500
 ENOUGH = 60
+TAPS_SCANS = 460
+"""Scans of the demo up to the end of its four taps."""
 """Results of a sensor that would go on for ever."""
 
 PARSED = {
@@ -136,15 +136,28 @@ def emulated():
         yield left, right, server
 
 
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    """Recordings of the demo's taps as press.npz and press.mcap."""
+    folder = tmp_path_factory.mktemp("press")
+    with np.load(demo_recording()) as demo:
+        taps = {name: demo[name][:TAPS_SCANS] for name in ("sensor", "scan", "time_ns", "counts")}
+        poses = demo["pose_time_ns"] <= taps["time_ns"][-1]
+        taps |= {name: demo[name][poses] for name in ("pose_time_ns", "pose", "pose_holds")}
+        np.savez(folder / "press.npz", **taps, **{name: demo[name] for name in ("format", "version", "rate_hz")})
+    cli.main(["--source", f"replay:{folder}/press.npz", "--rate-hz", "2000", "--sink", f"mcap:{folder}/press.mcap"])
+    return folder
+
+
 @pytest.fixture
-def world(emulated, tmp_path, monkeypatch):
+def world(emulated, press, tmp_path, plugged, monkeypatch):
     """Folder with what the pages take for granted, and adapters at the places that they name."""
     left, right, server = emulated
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    shutil.copy(demo_recording(), "press.npz")
+    shutil.copy(press / "press.npz", "press.npz")
     for name in ("left", "right", "released", "held"):
         write_recording(tmp_path / f"{name}.csv", healthy_counts(150))
     save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
@@ -153,17 +166,14 @@ def world(emulated, tmp_path, monkeypatch):
     shutil.copy(find_model("stsr"), "mine/stsr.onnx")
 
     def prepare(command: str) -> list[str]:
-        ports = [Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus")]
+        plugged.append(Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus"))
         if "D30BL401" in command:
-            ports.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
-        monkeypatch.setattr(source, "serial_ports", lambda: ports)
-        monkeypatch.setattr(devices, "serial_ports", lambda: ports)
+            plugged.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
         if "press.mcap" in command and " record " not in command and "mcap:press.mcap" not in command:
-            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:press.mcap"])
+            shutil.copy(press / "press.mcap", "press.mcap")
         if command.endswith(" bag"):
-            cli.main(["--source", "replay:press.npz", "--rate-hz", "2000", "--sink", "mcap:bag.mcap"])
             Path("bag").mkdir()
-            Path("bag.mcap").rename("bag/bag_0.mcap")
+            shutil.copy(press / "press.mcap", "bag/bag_0.mcap")
         if "--forget-gains" in command:
             keep_learned(Path("sensor.toml"), "4", Pad(gains=(1.0,) * GAINS))
         if " convert " in command:
@@ -225,12 +235,12 @@ def test_edge_sr_does_what_is_typed(command, world, monkeypatch, capfd):
 
 
 @pytest.mark.parametrize("command", [one for one in RUN if one.startswith("python ")])
-def test_programs_run(command, world, monkeypatch, capfd):
+def test_programs_run(command, world, argv, capfd):
     words = world(command)
     if words[1].startswith("docs/"):  # such a program writes next to itself
         Path("docs").mkdir()
         shutil.copy(ROOT / words[1], words[1])
-        monkeypatch.setattr(sys, "argv", words[1:])
+        argv(words[1:])
         runpy.run_path(str(Path(words[1]).resolve()), run_name="__main__")
         assert {path.suffix for path in Path("docs").iterdir()} > {".py"}
         return

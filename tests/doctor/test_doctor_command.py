@@ -5,8 +5,8 @@ import json
 import os
 import re
 import signal
-import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +20,6 @@ from edge.api import USPA44, load_sensor_file
 from edge.cli import main as cli
 from edge.cli.run_help import parser
 from edge.doctor import command, examine
-from edge.doctor import write_sensor_file as keep
 from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
@@ -96,21 +95,19 @@ def recording(*counts, rate_hz=200.0):
 TOO_FEW = re.compile(r'"measured": "[1-9]\d? scans", "norm": "at least')
 
 
-def doctor(monkeypatch, port, *arguments, **settings):
+def doctor(port, *arguments, **settings):
     """One look; once more, a few times, where the machine stood still for most of it, which is no sensor's fault."""
     for _ in range(4):
-        done = look(monkeypatch, port, *arguments, **settings)
+        done = look(port, *arguments, **settings)
         if not TOO_FEW.search(" ".join(done.out.split())):
             break
     return done
 
 
-def look(monkeypatch, port, *arguments, drift_s=0.7, people=()):
+def look(port, *arguments, drift_s=0.7, people=()):
     """Return the exit code, the output, and the prompts to the people."""
     out, err = io.StringIO(), Terminal(*people)
-    with monkeypatch.context() as streams:
-        streams.setattr(sys, "stdout", out)
-        streams.setattr(sys, "stderr", err)
+    with redirect_stdout(out), redirect_stderr(err):
         rate = () if "--rate-hz" in arguments else ("--rate-hz", 200)
         asked = ("--source", f"slcan:{port}", "--drift-s", drift_s, *rate, *arguments)
         code = cli.main(["doctor", *map(str, asked)])
@@ -132,9 +129,9 @@ def verdicts(done):
     }
 
 
-def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
+def test_a_healthy_sensor_is_0_and_ok_in_every_line():
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json")
+        done = doctor(emulator.port, "--json")
     document = json.loads(done.out)
     assert verdicts(done) == {}
     told = {"stopped": False, "kind": "emulated", "sensor_file": None, "id_map": "uSPa44"}
@@ -147,10 +144,10 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line(monkeypatch):
     assert done.err == f"slcan:{emulator.port}: watching for 0.7 s; keep the pad free and still\n"
 
 
-def test_another_line_speed_than_the_adapters(monkeypatch):
+def test_another_line_speed_than_the_adapters(limits):
     with Emulator([recording(healthy_counts(200))], loop=True, left_open=True) as emulator:
-        monkeypatch.setattr(command, "GIVEN_UP_S", 0.5)
-        done = doctor(monkeypatch, f"{emulator.port}@115200", "--json")
+        limits(command, GIVEN_UP_S=0.5)
+        done = doctor(f"{emulator.port}@115200", "--json")
     found = verdicts(done)
     assert found["link"] == "wrong" and found["scans"] == "wrong" and len(found) == 2 and done.code == 1
     assert "another line speed" in done.out
@@ -163,12 +160,11 @@ def test_another_line_speed_than_the_adapters(monkeypatch):
 def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypatch, tmp_path, turn, swap, signs):
     sits = Mounting(orders()[turn], swap, signs)
     file = tmp_path / "sensor.toml"
-    monkeypatch.setattr(keep, "serial_ports", list)
     person = Person(sits)
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         monkeypatch.setenv("COLUMNS", "40")
         asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
-        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+        done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     assert f"taxel order: {turn.split()[0]}" in done.out, done.out
     shown = (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines()
     # One word alone may be longer: the path of the latency timer, which a reader that comes late is told of.
@@ -183,28 +179,35 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     person = Person(sits)
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         asked = ("--rate-hz", 400, "--json", "--sensor", file)
-        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=1.5)
+        done = doctor(emulator.port, *asked, people=[person], drift_s=1.5)
     assert verdicts(done) == {}, done.out
     settled = {one["name"]: one["verdict"] for one in json.loads(done.out)["findings"]}
     assert settled["taxel order"] == settled["axis signs"] == settled["load"] == "ok"
 
 
-def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong(monkeypatch):
+def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong():
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
     with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--json", "--rate-hz", 120, people=people, drift_s=1.2)
+        done = doctor(emulator.port, "--json", "--rate-hz", 120, people=people, drift_s=1.2)
     found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
 
 
-def test_a_sensor_that_falls_silent_while_it_is_pressed(monkeypatch):
-    monkeypatch.setattr(command, "GIVEN_UP_S", 0.3)
-    options = parser("doctor").parse_args(["--drift-s", "0.1", "--json"])
-    out, link = io.StringIO(), FakeLink([as_scans(healthy_counts())], endless=True)
-    monkeypatch.setattr(examine, "links_to", lambda *_, **__: [link])
-    assert command.run(options, out, Terminal(Person())) == 1
-    settled = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
+def examined(open_link, *arguments, out=None, err=None):
+    """Return the exit code and the output of a visit to a link."""
+    options, out = parser("doctor").parse_args([*map(str, arguments)]), out or io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(examine, "links_to", lambda *_, **__: [open_link()])
+        return command.run(options, out, err or io.StringIO()), out.getvalue()
+
+
+def test_a_sensor_that_falls_silent_while_it_is_pressed(limits):
+    limits(command, GIVEN_UP_S=0.3)
+    link = FakeLink([as_scans(healthy_counts())], endless=True)
+    code, out = examined(lambda: link, "--drift-s", 0.1, "--json", err=Terminal(Person()))
+    settled = {one["name"]: one["verdict"] for one in json.loads(out)["findings"]}
+    assert code == 1
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
 
 
@@ -222,16 +225,16 @@ class Impatient(Person):
             super().hear(text)
 
 
-def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(monkeypatch):
+def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(stdin):
     """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
     leader, follower = os.openpty()
-    with os.fdopen(follower) as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
+    with os.fdopen(follower) as keyboard:
+        stdin(keyboard)
         os.write(leader, b"\n")  # before anything is asked: no answer to it
         person = Impatient(lambda: os.write(leader, b"\n"))
         with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
             asked = ("--rate-hz", 400, "--json")
-            done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+            done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     os.close(leader)
     settled = {one["name"]: (one["verdict"], one["measured"]) for one in json.loads(done.out)["findings"]}
     assert settled["taxel order"] == ("not known", "2 of 4 corners measured")
@@ -239,20 +242,20 @@ def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(monkeypatc
     assert re.search(r"\rfelt \[[# ]{10}\] (60|59) s left, Enter skips", done.err)
 
 
-def test_ctrl_c_at_a_request_keeps_the_baseline(monkeypatch, tmp_path):
+def test_ctrl_c_at_a_request_keeps_the_baseline(tmp_path):
     file = tmp_path / "s.toml"
     person = Impatient(lambda: signal.raise_signal(signal.SIGINT))
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         asked = ("--rate-hz", 400, "--out", file)
-        done = doctor(monkeypatch, emulator.port, *asked, people=[person], drift_s=0.4)
+        done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     entry = load_sensor_file(file).sensors["4"]
     assert done.code == 130 and f"kept in {file}" in done.out
     assert entry.baseline is not None and "mounting" in entry.assumed
 
 
-def test_a_cable_pulled_out_is_3_after_what_was_found(monkeypatch, tmp_path):
+def test_a_cable_pulled_out_is_3_after_what_was_found(tmp_path):
     with Emulator([recording(healthy_counts(150), rate_hz=150.0)]) as emulator:
-        done = doctor(monkeypatch, emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
+        done = doctor(emulator.port, "--out", tmp_path / "s.toml", drift_s=30)
     assert done.code == 3 and "link: lost" in done.out and "noise" in done.out
     assert "link lost" in done.err and not (tmp_path / "s.toml").exists()
 
@@ -268,21 +271,19 @@ def test_ctrl_c_tells_what_was_found_and_is_130(tmp_path):
     assert process.returncode == 130 and "rate:" in out and "\nstopped after " in out and not (tmp_path / "s").exists()
 
 
-def test_the_serial_number_of_the_adapter_is_kept(monkeypatch, tmp_path):
+def test_the_serial_number_of_the_adapter_is_kept(plugged, tmp_path):
     with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-        seen = [Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter")]
-        monkeypatch.setattr(keep, "serial_ports", lambda: seen)
-        doctor(monkeypatch, emulator.port, "--out", tmp_path / "s.toml")
+        plugged.append(Port(str(Path(emulator.port).resolve()), (0x0403, 0x6015), "D30BL366", "adapter"))
+        doctor(emulator.port, "--out", tmp_path / "s.toml")
     assert load_sensor_file(tmp_path / "s.toml").adapter == "D30BL366"
 
 
-def test_a_recording_is_examined_but_not_pressed(monkeypatch, tmp_path):
+def test_a_recording_is_examined_but_not_pressed(tmp_path):
     out, err = io.StringIO(), Terminal(Person())
     write_recording(tmp_path / "r.npz", [0] * 150)
-    monkeypatch.setattr(sys, "stdout", out)
-    monkeypatch.setattr(sys, "stderr", err)
     kept = tmp_path / "sensor.toml"
-    assert cli.main(["doctor", "--source", f"replay:{tmp_path}/r.npz", "--json", "--out", str(kept)]) == 0
+    with redirect_stdout(out), redirect_stderr(err):
+        assert cli.main(["doctor", "--source", f"replay:{tmp_path}/r.npz", "--json", "--out", str(kept)]) == 0
     assert np.isnan(load_sensor_file(kept).baselines["4"].created_unix_s), "nobody knows of when it is"
     document = json.loads(out.getvalue())
     assert document["kind"] == "replay" and not any(one["sensor"] is None for one in document["findings"])

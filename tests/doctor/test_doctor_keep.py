@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from doctor_samples import as_scans, healthy_counts
 from edge_samples import BASELINE, FakeLink
-from test_doctor_command import doctor, recording
+from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli import main as cli
-from edge.cli.run_help import parser
-from edge.doctor import command, examine
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
@@ -65,7 +63,7 @@ class TestLoss:
         assert (now.counts_per_newton, now.baseline is None) == (held.counts_per_newton, held.baseline is None)
         assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
 
-    def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, monkeypatch, tmp_path):
+    def test_a_pad_that_is_pressed_now_leaves_the_baseline_of_the_free_pad(self, tmp_path):
         path, free = tmp_path / "s.toml", healthy_counts(200)
         baseline = Baseline.from_counts("4", free, 1.79e9)
         entry = SensorEntry(baseline=baseline, emulated=frozenset({"baseline"}))
@@ -74,7 +72,7 @@ class TestLoss:
         pressed[:, 2] += 800
         for counts, stored in ((pressed, False), (free, True)):
             with Emulator([recording(counts)], loop=True) as emulator:
-                done = doctor(monkeypatch, emulator.port, "--no-press", "--sensor", path, "--out", path)
+                done = doctor(emulator.port, "--no-press", "--sensor", path, "--out", path)
             assert ("this baseline is not stored" in " ".join(done.out.split())) is not stored
             now = load_sensor_file(path).sensors["4"].baseline
             assert (now.id != baseline.id) is stored and np.abs(now.counts - baseline.counts).max() < 10
@@ -108,9 +106,9 @@ class TestLoss:
 
 
 class TestMarks:
-    def test_an_emulated_visit_without_presses_says_both(self, monkeypatch, tmp_path):
+    def test_an_emulated_visit_without_presses_says_both(self, tmp_path):
         with Emulator([recording(healthy_counts(200))], loop=True) as emulator:
-            done = doctor(monkeypatch, emulator.port, "--json", "--no-press", "--out", tmp_path / "s.toml")
+            done = doctor(emulator.port, "--json", "--no-press", "--out", tmp_path / "s.toml")
         assert json.loads(done.out)["sensor_file"] is not None, done.out
         entry = load_sensor_file(tmp_path / "s.toml").sensors["4"]
         assert entry.assumed == {"mounting"} and entry.emulated == {"baseline"}
@@ -161,13 +159,9 @@ class TestUse:
 WELL = as_scans(healthy_counts(200))
 
 
-def told(*arguments, link=None, out=None):
+def told(*arguments, link=lambda: FakeLink([WELL], kind="replay"), out=None):
     """The exit code, and what the doctor printed of a link that is well."""
-    options = parser("doctor").parse_args(["--no-press", *map(str, arguments)])
-    out = io.StringIO() if out is None else out
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(examine, "links_to", lambda *_, **__: [link() if link else FakeLink([WELL], kind="replay")])
-        return command.run(options, out, io.StringIO()), out.getvalue()
+    return examined(link, "--no-press", *arguments, out=out)
 
 
 @pytest.mark.parametrize(

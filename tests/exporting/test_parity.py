@@ -40,7 +40,7 @@ def frozen():
     return load_frozen_set(BUNDLE_DIR / "frozen.npz")
 
 
-IN_GATE = 3
+IN_GATE = 6
 """One frame in so many is compared; of float32, which is the same on each window, a third of these."""
 
 

@@ -37,7 +37,7 @@ from firmware_bridge.sensor_file.model import load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_baselines
 
-INPUTS = int(os.environ.get("EDGE_FUZZ_INPUTS", "300"))
+INPUTS = int(os.environ.get("EDGE_FUZZ_INPUTS", "150"))
 LONGEST_MESSAGE = 1000
 _KEPT = tempfile.TemporaryDirectory(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
 FOLDER = Path(_KEPT.name)

@@ -88,8 +88,8 @@ class TestArchives:
             load_recording(path)
         assert one_line(raised)
 
-    def test_a_bomb(self, tmp_path, monkeypatch, bounded_memory):
-        monkeypatch.setattr(recording, "MOST_NPZ_BYTES", 1 << 20)
+    def test_a_bomb(self, tmp_path, limits, bounded_memory):
+        limits(recording, MOST_NPZ_BYTES=1 << 20)
         bomb = archive(compressed=True, **recording_arrays() | {"counts": np.zeros((300_000, 3, 4, 4), np.int8)})
         assert len(bomb) < 50_000
         self.refused(tmp_path, bomb, r"arrays of 14,400,\d+ bytes, expected at most 1,048,576")
@@ -170,8 +170,8 @@ class TestText:
         with pytest.raises(RecordingError, match="line 2: a line longer than 16384 bytes"):
             load_recording(path)
 
-    def test_a_csv_file_larger_than_is_read(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(csv_reader, "MOST_CSV_BYTES", 1000)
+    def test_a_csv_file_larger_than_is_read(self, tmp_path, limits):
+        limits(csv_reader, MOST_CSV_BYTES=1000)
         path = tmp_path / "finger.csv"
         path.write_text(",".join(CSV_HEADER) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
         with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):

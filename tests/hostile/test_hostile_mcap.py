@@ -194,8 +194,8 @@ def test_a_definition_of_another_release(tmp_path):
     refused(written(tmp_path, *channel_of(SCAN, text=b"int8 a\n"), message(SCAN, GOOD)), r"of another release")
 
 
-def test_more_than_can_be_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(mcap_recording, "MOST_KEPT_BYTES", 1000)
+def test_more_than_can_be_kept(tmp_path, limits):
+    limits(mcap_recording, MOST_KEPT_BYTES=1000)
     scans = [message(SCAN, GOOD, time_ns=10 + n) for n in range(6)]
     refused(written(tmp_path, *channel_of(SCAN), *scans), r"more scans than 1,000 bytes hold")
 

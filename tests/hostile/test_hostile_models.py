@@ -10,6 +10,7 @@ from hostile_samples import one_line
 from onnx import TensorProto, helper, numpy_helper
 
 from edge.errors import ModelError
+from edge.inference import onnx_guard
 from edge.inference.onnx_guard import check_plain
 from edge.inference.onnx_session import ModelSession
 
@@ -70,8 +71,8 @@ class TestModels:
         with pytest.raises(ModelError, match="sparse"):
             check_plain(onnx.ModelProto(graph=onnx.GraphProto(sparse_initializer=[sparse])).SerializeToString())
 
-    def test_more_fields_than_a_graph_has(self, monkeypatch):
-        monkeypatch.setattr("edge.inference.onnx_guard.MOST_FIELDS", 1000)
+    def test_more_fields_than_a_graph_has(self, limits):
+        limits(onnx_guard, MOST_FIELDS=1000)
         with pytest.raises(ModelError, match="more than 1000 fields"):
             check_plain(b"\x08\x01" * 1001)
 
@@ -89,8 +90,8 @@ class TestModels:
             with pytest.raises(ModelError, match="damaged"):
                 check_plain(broken)
 
-    def test_a_file_larger_than_any_model(self, tmp_path, monkeypatch, bounded_memory):
-        monkeypatch.setattr("edge.inference.onnx_guard.MOST_BYTES", 1 << 20)
+    def test_a_file_larger_than_any_model(self, tmp_path, limits, bounded_memory):
+        limits(onnx_guard, MOST_BYTES=1 << 20)
         path = tmp_path / "large.onnx"
         with path.open("wb") as file:
             file.truncate(3_000_000_000)

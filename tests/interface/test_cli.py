@@ -14,8 +14,6 @@ from edge_samples import BASELINE, ROOT, make_contract, write_model
 from edge import __version__
 from edge.cli import main as cli
 from edge.cli import models_command
-from edge.inference import bundled as bundle
-from firmware_bridge.links import registry as source
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
@@ -82,22 +80,20 @@ class TestReplay:
 
 
 class TestModels:
-    def test_models_are_listed_from_their_contracts(self, monkeypatch, capsys, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        write_model(tmp_path / "mtsr4.onnx")
+    def test_models_are_listed_from_their_contracts(self, bundle, capsys):
+        write_model(bundle / "mtsr4.onnx")
         sure = {"1": {"psnr_db": 30.1, "coverage_90": 0.9034}}
-        write_model(tmp_path / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
+        write_model(bundle / "stsr.onnx", make_contract(taps=1, interval_factor=1.6, test_error=sure))
         assert cli.main(["models"]) == 0
         out = capsys.readouterr().out.splitlines()
-        size_mb = (tmp_path / "mtsr4.onnx").stat().st_size / 1e6
+        size_mb = (bundle / "mtsr4.onnx").stat().st_size / 1e6
         assert out[1].split() == ["mtsr4", "4", f"{size_mb:.1f}", "float32", "33.2", "2.10", "-"]
         assert out[2].split() == ["stsr", "1", f"{size_mb:.1f}", "float32", "30.1", "-", "-"]
         assert max(map(len, out)) <= 80
 
-    def test_run_times_are_measured_next_to_the_error(self, monkeypatch, capsys, tmp_path):
-        monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-        monkeypatch.setattr(models_command, "RATE_HZ", 2000.0)
-        write_model(tmp_path / "mtsr4.onnx")
+    def test_run_times_are_measured_next_to_the_error(self, bundle, limits, capsys):
+        limits(models_command, RATE_HZ=2000.0)
+        write_model(bundle / "mtsr4.onnx")
         assert cli.main(["models", "--measure"]) == 0
         head, row, _, note, *_ = capsys.readouterr().out.splitlines()
         assert "p50 us p99 us" in head and note == "run times of 150 patterns each at 2000 Hz, on one thread"
@@ -192,10 +188,9 @@ def test_thresholds_and_sinks_that_cannot_be_are_2_before_anything_is_opened(com
 
 
 @pytest.mark.parametrize("ports", [[], ["/dev/ttyUSB0", "/dev/ttyUSB1"]])
-def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(monkeypatch, capsys, tmp_path, ports):
-    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path)
-    seen = [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
-    monkeypatch.setattr(source, "serial_ports", lambda: [*seen, Port("/dev/ttyS9", None, None, "n/a")])
+def test_without_source_none_or_several_adapters_are_3_and_nothing_is_emulated(plugged, capsys, ports):
+    plugged += [Port(path, (0x0403, 0x6015), f"S{path[-1]}", "adapter") for path in ports]
+    plugged.append(Port("/dev/ttyS9", None, None, "n/a"))
     assert cli.main(["--sink", "jsonl:-"]) == 3
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1

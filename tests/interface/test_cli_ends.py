@@ -37,13 +37,11 @@ class TestEnds:
     def follow(self, emulator, files, *more):
         """Return a run on the emulator and its first records."""
         process = start(*base_options(files), "--source", f"slcan:{emulator.port}", "--sink", "jsonl:-", *more)
-        assert process.stdout is not None
         first = [process.stdout.readline() for _ in range(10)]
         return process, first
 
     def rest(self, process):
         """Return the unread rest; not by communicate(), which ignores the text that readline() has read ahead."""
-        assert process.stdout is not None and process.stderr is not None
         rest, errors = process.stdout.read(), process.stderr.read()  # of errors there are too few to fill a pipe
         process.wait(TIMEOUT_S)
         return rest, errors
@@ -68,7 +66,6 @@ class TestEnds:
             process, _ = self.follow(emulator, files)
         finally:
             signal.signal(number, before)
-        assert process.stdout is not None
         process.send_signal(number)
         got = records("".join(process.stdout.readline() for _ in range(100)))
         assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
@@ -78,7 +75,6 @@ class TestEnds:
 
     def test_a_closed_pipe_ends_it_cleanly_with_the_summary(self, emulator, files):
         process, _ = self.follow(emulator, files)
-        assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
         assert process.wait(TIMEOUT_S) == 0
         errors = process.stderr.read()
@@ -95,10 +91,10 @@ class TestEnds:
         assert summary[0].startswith(f"EMULATED slcan:{emulator.port}: {len(got)} scans")
         assert last.startswith(f"edge-sr: {emulator.port}: link lost")
 
-    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, monkeypatch, capsys):
+    def test_a_model_that_does_not_exist_ends_before_the_link_is_opened(self, emulator, capsys):
         """A link that is slow to open would hold up the message."""
         received = []
-        monkeypatch.setattr(emulator.adapter, "feed", lambda data: received.append(data) or b"")
+        emulator.adapter.feed = lambda data: received.append(data) or b""
         assert cli.main(["--model", "nothere", "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err.startswith("edge-sr: no model 'nothere'") and received == []
 
@@ -119,7 +115,7 @@ class TestEnds:
             return answer
 
         monkeypatch.setattr(run_command, "load_model", load)
-        monkeypatch.setattr(emulator.adapter, "feed", feed)
+        emulator.adapter.feed = feed
         path = files / "tiny.onnx"
         assert cli.main(["--model", str(path), "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
@@ -141,7 +137,7 @@ class TestEnds:
         os.close(reader)
         with start("models", stdout=writer) as process:
             os.close(writer)
-            assert process.stderr is not None and process.stderr.read() == ""
+            assert process.stderr.read() == ""
         assert process.returncode == 0
 
 
@@ -226,7 +222,7 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    assert process.stdout is not None and process.stdout.readline() == "importing\n"
+    assert process.stdout.readline() == "importing\n"
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=TIMEOUT_S)
     assert (process.returncode, errors) == (-signal.SIGINT, "")
@@ -249,8 +245,8 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
     ):
         path.write_text(content, newline="")
         asked = ["--source", "demo", "--sensor", path] if path.suffix == ".toml" else ["replay", path, "--rate-hz", 100]
-        done = subprocess.run([*EDGE_SR, *map(str, asked), "--sink", "jsonl:-"], capture_output=True, cwd=ROOT)
-        printed = (done.stdout + done.stderr).decode()
+        done = run(*asked, "--sink", "jsonl:-")
+        printed = done.stdout + done.stderr
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed
         assert text not in printed and printed.replace("\n", "").isprintable()
 

@@ -98,14 +98,14 @@ def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
     assert commands.poll() == [], "a pipe that has ended is not touched again"
 
 
-def test_a_terminal_and_a_missing_stdin_are_left_alone(monkeypatch):
+def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
     leader, follower = os.openpty()
     with os.fdopen(follower) as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
+        stdin(terminal)
         os.write(leader, b'{"cmd": "reset"}\n')
         assert polled_stdin() == []
     assert polled_stdin() == []  # closed
-    monkeypatch.setattr(sys, "stdin", None)
+    stdin(None)
     assert polled_stdin() == []
     os.close(leader)
 
@@ -121,9 +121,9 @@ class Told:
         self.done.append((name, force))
 
 
-def test_all_places_are_asked_and_obeyed_in_their_order(monkeypatch, pipe):
-    with os.fdopen(os.dup(pipe[0])) as stdin:
-        monkeypatch.setattr(sys, "stdin", stdin)
+def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
+    with os.fdopen(os.dup(pipe[0])) as commands:
+        stdin(commands)
         runtime = Told()
         with user_commands() as everything:
             os.write(pipe[1], b'nonsense\n{"cmd": "reset"}\n{"cmd": "zero", "sensor": "4", "force": true}\n')

@@ -38,9 +38,8 @@ def first(pressed, sensor=None, id_map=None, **settings):
         return next(iter(Stream(source, open_runtime(FakeModel(), source, **settings))))
 
 
-def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, monkeypatch):
-    adapter = Port("/dev/ttyUSB5", (0x0403, 0x6015), "D30BL366", "VScom")
-    monkeypatch.setattr("firmware_bridge.links.registry.serial_ports", lambda: [adapter])
+def test_a_file_gives_map_mounting_baseline_force_and_adapter(file, pressed, plugged):
+    plugged.append(Port("/dev/ttyUSB5", (0x0403, 0x6015), "D30BL366", "VScom"))
     source = open_source(sensor=file)
     assert source.name == "slcan:serial=D30BL366" and source.sensor_file.model_map.name == "XR1944"
     result = first(pressed, file)

@@ -123,27 +123,26 @@ def test_the_bitrate_is_asked_of_ip(roots, tmp_path, monkeypatch, says, bitrate)
 
 
 @pytest.fixture
-def plugged(monkeypatch):
-    """Devices that are plugged in, to be filled by a test."""
-    there: dict[str, list] = {"ports": [], "gs_usb": [], "can": []}
-    monkeypatch.setattr(devices, "serial_ports", lambda: there["ports"])
-    monkeypatch.setattr(devices, "can_interfaces", lambda: there["can"])
-    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", lambda: there["gs_usb"])
+def gs_usb(plugged, monkeypatch):
+    """Adapters on USB, to be filled by a test, on a machine without a CAN network."""
+    there: list[GsUsbDevice] = []
+    monkeypatch.setattr(devices, "can_interfaces", list)
+    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", lambda: there)
     monkeypatch.setenv("COLUMNS", "200")
     return there
 
 
-def test_nothing_is_said_in_one_line(plugged, capsys):
-    plugged["ports"] = [BUILT_IN]
+def test_nothing_is_said_in_one_line(plugged, gs_usb, capsys):
+    plugged[:] = [BUILT_IN]
     assert cli.main(["devices"]) == 3
     out, err = capsys.readouterr()
     assert err == f"edge-sr: {NOTHING}\n" and "both plugs" in NOTHING and "dmesg" in NOTHING and "dialout" in NOTHING
     assert out.splitlines()[0] == "/dev/ttyS0" and out.splitlines()[-1] == SERVER_HINT
 
 
-def test_everything_is_listed_adapters_first(plugged, capsys):
-    plugged["ports"] = [BUILT_IN, VSCOM._replace(path="/dev/ttyUSB9")]
-    plugged["gs_usb"] = [
+def test_everything_is_listed_adapters_first(plugged, gs_usb, capsys):
+    plugged[:] = [BUILT_IN, VSCOM._replace(path="/dev/ttyUSB9")]
+    gs_usb[:] = [
         GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight"),
         GsUsbDevice(1, 5, (0x1D50, 0x606F), None, None),
         GsUsbDevice(2, 4, (0x1D50, 0x606F), "0001", "candleLight", "2-1.4"),
@@ -167,34 +166,34 @@ def test_everything_is_listed_adapters_first(plugged, capsys):
     assert "  --source gs_usb\n  ! no permission: " in out and "udev" in out and err == ""
 
 
-def test_for_programs(plugged, capsys):
-    plugged["ports"] = [VSCOM]
+def test_for_programs(plugged, gs_usb, capsys):
+    plugged[:] = [VSCOM]
     assert cli.main(["devices", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["notes"] == [] and [one["source"] for one in told["devices"]] == ["slcan:serial=D30BL366"]
     assert Found(**told["devices"][0])._replace(problems=()) == serial_devices([VSCOM])[0]._replace(problems=())
-    plugged["ports"] = []
+    plugged.clear()
     assert cli.main(["devices", "--json"]) == 3
     assert json.loads(capsys.readouterr().out) == {"devices": [], "notes": []}
 
 
-def test_usb_that_cannot_be_read_hides_no_port(plugged, capsys, monkeypatch):
+def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypatch):
     why = "libusb cannot be loaded: pip install libusb-package"
 
     def fail():
         raise DeviceError(why)
 
     monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", fail)
-    plugged["ports"] = [VSCOM]
+    plugged[:] = [VSCOM]
     assert cli.main(["devices"]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]
 
 
-def test_the_page_fits_a_narrow_terminal(plugged, capsys, monkeypatch):
+def test_the_page_fits_a_narrow_terminal(plugged, gs_usb, capsys, monkeypatch):
     """All but what is to be typed, which is one line, and whole."""
     by_path = "/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"
-    plugged["ports"] = [VSCOM._replace(path="/dev/ttyUSB9"), BUILT_IN._replace(path=by_path)]
-    plugged["gs_usb"] = [GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight")]
+    plugged[:] = [VSCOM._replace(path="/dev/ttyUSB9"), BUILT_IN._replace(path=by_path)]
+    gs_usb[:] = [GsUsbDevice(1, 4, (0x1D50, 0x606F), "004B", "candleLight")]
     monkeypatch.setenv("COLUMNS", "40")
     assert cli.main(["devices"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -139,9 +139,9 @@ def stop_on_area():
 
 
 @pytest.fixture
-def at_once(stop_on_area, monkeypatch):
+def at_once(stop_on_area, limits):
     """The example, which knows with the first reading which sensors there are."""
-    monkeypatch.setattr(stop_on_area, "SETTLING_NS", 0)
+    limits(stop_on_area, SETTLING_NS=0)
     return stop_on_area
 
 
@@ -243,8 +243,8 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
 
 @pytest.mark.parametrize("limit", ["--area-mm2", "--most-counts", "--oldest-ms", "--duration-s"])
 @pytest.mark.parametrize("value", ["nan", "-1", "0", "much"])
-def test_a_limit_is_a_positive_number(stop_on_area, monkeypatch, capsys, limit, value):
-    monkeypatch.setattr(sys, "argv", ["stop_on_area.py", "--area-mm2", "20", f"{limit}={value}"])
+def test_a_limit_is_a_positive_number(stop_on_area, argv, capsys, limit, value):
+    argv(["stop_on_area.py", "--area-mm2", "20", f"{limit}={value}"])
     with pytest.raises(SystemExit, match="2"):
         stop_on_area.main()
     assert f"argument {limit}: invalid positive value: '{value}'" in capsys.readouterr().err
@@ -303,13 +303,13 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     assert out[-1].startswith("not handed over: it is not better than stsr-int8. Train it for longer")
 
 
-def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(monkeypatch, tmp_path, capsys):
+def test_only_a_model_that_is_better_on_unseen_presses_is_handed_over(tmp_path, capsys):
     example = loaded("train_and_deploy")
     trimesh.creation.box((8, 8, 8)).export(tmp_path / "box.stl")
     example.JUDGED = 12
     good, poor = find_model("stsr"), write_model(tmp_path / "poor.onnx", make_contract(taps=1))
     for own, bundled, better in ((good, poor, True), (poor, good, False)):
-        monkeypatch.setattr(example, "find_model", lambda name, path=bundled: path)
+        example.find_model = lambda name, path=bundled: path
         assert example.is_better(own, tmp_path / "box.stl", tmp_path, 1) == better
         assert ("not handed over: it is not better than" in capsys.readouterr().out) != better
 

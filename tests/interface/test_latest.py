@@ -56,12 +56,12 @@ def stream_of(source, **settings):
     return Stream(source, open_runtime(settings.pop("model", FakeModel()), source, baselines=BASELINES), **settings)
 
 
-def test_it_is_the_newest_and_what_it_passed_over_is_counted_and_kept(monkeypatch):
+def test_it_is_the_newest_and_what_it_passed_over_is_counted_and_kept():
     link, sink = StagedLink(scans(*range(7)), scans(7), endless=True), ListSink()
     waits_s = set()
     with Source(link) as source:
         take = source.take
-        monkeypatch.setattr(source, "take", lambda timeout_s: waits_s.add(timeout_s) or take(timeout_s))
+        source.take = lambda timeout_s: waits_s.add(timeout_s) or take(timeout_s)
         stream = stream_of(source, sinks=[sink], clock_ns=lambda: make_scan(6).time_ns + 5_000_000)
         before = stream.latest()  # nothing has come, and it does not wait for that
         assert (before.result, before.age_s, before.link, before.new) == (None, math.inf, "up", False)

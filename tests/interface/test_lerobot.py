@@ -176,10 +176,10 @@ def test_lerobot_loads_the_dataset_that_it_was_given(plugin, tmp_path):
     assert info["features"]["observation.state"]["dtype"] == "float32"
 
 
-def test_the_example_observes_by_the_command_of_the_readme(plugin, monkeypatch, capsys):
+def test_the_example_observes_by_the_command_of_the_readme(plugin, argv, capsys):
     (line,) = re.findall(r"^ *(python examples/lerobot_camera_tactile_sr/observe\.py .*)$", README.read_text(), re.M)
     words = shlex.split(line, comments=True)[1:]
-    monkeypatch.setattr(sys, "argv", words)
+    argv(words)
     runpy.run_path(str(ROOT / words[0]), run_name="__main__")
     image = r"observation\.images\.tactile: \(40, 40, 3\) uint8, .*"
     assert re.match(image + r"\nobservation\.state: \d+ numbers, .*", capsys.readouterr().out)

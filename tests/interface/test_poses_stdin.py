@@ -217,7 +217,6 @@ def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
     recording = write_recording(files / "long.npz", ([0] * 5 + [3000] * 5) * 30)
     options = [*base_options(files), "--source", f"replay:{recording}", "--sink", "jsonl:-"]
     with start(*options, stdin=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stdout is not None
         out = []
         reader = threading.Thread(target=lambda: out.extend(process.stdout))
         reader.start()
@@ -265,7 +264,6 @@ def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, long, tmp_path):
     options = [*base_options(files), "--source", f"replay:{long}", "--sink", f"jsonl:{lines}"]
     files_of_map = ["--out", out, "--png", picture, "--size-mm", "40", "--px-per-mm", "2"]
     with start("map", *options, *files_of_map, stdin=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stderr is not None
         process.stdin.write(HELD)
         process.stdin.flush()
         wait_for(lambda: lines.exists() and lines.read_text().count('"state":"contact"') > 30)
@@ -292,7 +290,6 @@ def test_a_recording_with_poses_becomes_a_map(files, tmp_path):
     posed = tmp_path / "posed.mcap"
     with start("record", posed, *base_options(files), "--source", f"replay:{files / 'taps.npz'}",
                stdin=subprocess.PIPE) as process:  # fmt: skip
-        assert process.stdin is not None
         process.stdin.write(HELD)
         process.stdin.flush()
         assert process.wait() == 0, process.stderr.read()

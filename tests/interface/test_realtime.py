@@ -87,9 +87,9 @@ def test_a_refusal_is_one_line_and_the_run_goes_on(monkeypatch, call, words):
 
     granted, calls = [], ("os.sched_setscheduler", "os.sched_setaffinity", "edge.cli.realtime._lock_memory")
     for name in calls:
-        monkeypatch.setattr(name, lambda *args, name=name: granted.append(name) or (lambda: None))
+        grant = lambda *args, name=name: granted.append(name) or (lambda: None)  # noqa: E731
+        monkeypatch.setattr(name, refuse if name == call else grant)
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {1, 3})
-    monkeypatch.setattr(call, refuse)
     told = []
     with realtime(told.append):
         assert len(told) == 1 and set(granted) == {*calls} - {call}

@@ -1,5 +1,4 @@
 """Map of an object: what perfect patterns of a figure give, which presses count, its files, and its states."""
-# pyright: reportArgumentType=false, reportOptionalOperand=false
 
 import errno
 import tracemalloc

@@ -1,5 +1,4 @@
 """Drift, warming and old baselines, which look like a touch, are no contact; what begins as a touch is one."""
-# pyright: reportArgumentType=false
 
 import itertools
 from dataclasses import replace

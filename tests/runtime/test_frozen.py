@@ -8,7 +8,7 @@ from edge_samples import write_model
 
 from edge.errors import ModelError, UsageError
 from edge.evaluation.test_set import FrozenSet, FrozenSetError, load_frozen_set
-from edge.inference import bundled as bundle
+from edge.inference import bundled
 
 
 @pytest.fixture
@@ -60,19 +60,17 @@ class TestSet:
             load_frozen_set(path)
 
     def test_the_bundled_one_is_the_one_that_is_frozen(self):
-        frozen = load_frozen_set(bundle.BUNDLE_DIR / "frozen.npz")
+        frozen = load_frozen_set(bundled.BUNDLE_DIR / "frozen.npz")
         assert len(frozen) == 1152 and len(set(frozen.surface.tolist())) == 18
         assert float(frozen.patterns().max()) <= frozen.full_scale_mm
 
 
 @pytest.fixture
-def models(tmp_path, monkeypatch):
-    monkeypatch.setattr(bundle, "BUNDLE_DIR", tmp_path / "bundled")
+def models(bundle, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    bundle.BUNDLE_DIR.mkdir()
     for name in ("mtsr4", "stsr"):
-        write_model(bundle.BUNDLE_DIR / f"{name}.onnx")
-    return bundle.BUNDLE_DIR
+        write_model(bundle / f"{name}.onnx")
+    return bundle
 
 
 class TestBundle:
@@ -80,19 +78,19 @@ class TestBundle:
     def test_a_name_without_precision_is_the_best_file_there_is(self, models, name):
         write_model(models / "mtsr4-int8.onnx")
         asked = name.format(models=models)
-        assert bundle.find_model(asked) == models / "mtsr4.onnx"
+        assert bundled.find_model(asked) == models / "mtsr4.onnx"
         (models / "mtsr4.onnx").unlink()
-        assert bundle.find_model(asked) == models / "mtsr4-int8.onnx"
-        assert [path.stem for path in bundle.bundled_models()] == ["mtsr4-int8", "stsr"]
+        assert bundled.find_model(asked) == models / "mtsr4-int8.onnx"
+        assert [path.stem for path in bundled.bundled_models()] == ["mtsr4-int8", "stsr"]
 
     def test_a_file_wins_over_a_bundled_name_and_no_directory_does(self, models, tmp_path):
         (tmp_path / "mtsr4").mkdir()
         (tmp_path / "stsr").write_text("mine")
-        assert bundle.find_model("mtsr4") == models / "mtsr4.onnx" and bundle.find_model("stsr").read_text() == "mine"
+        assert bundled.find_model("mtsr4") == models / "mtsr4.onnx" and bundled.find_model("stsr").read_text() == "mine"
 
     def test_what_is_missing_is_told(self, models):
         for name in ("mtsr9", "mtsr4.onn", "", "none/mtsr4.onnx"):
             with pytest.raises(ModelError, match=r"no model.*bundled: mtsr4.onnx, stsr.onnx"):
-                bundle.find_model(name)
+                bundled.find_model(name)
         with pytest.raises(UsageError, match=r"demo.npz is missing"):
-            bundle.demo_recording()
+            bundled.demo_recording()

@@ -152,9 +152,9 @@ sys.exit(cli.main(["--source", "demo", "--model", sys.argv[1]]))
 
 
 class TestEndlessLoad:
-    def test_it_ends_at_the_limit(self, tmp_path, monkeypatch):
+    def test_it_ends_at_the_limit(self, tmp_path, limits):
         """No work is done on constants while it loads, which nothing could end; the first run can be ended."""
-        monkeypatch.setattr(loading, "LOAD_LIMIT_S", 0.5)
+        limits(loading, LOAD_LIMIT_S=0.5)
         path = written(tmp_path / "slow.onnx", hours_of_work())
         with pytest.raises(ModelError, match=re.escape(f"{path}: not loaded within 0.5 s: export a smaller graph")):
             ModelSession(path)  # edge-sr would end this process by force, if its work is not over by then
@@ -167,7 +167,7 @@ class TestEndlessLoad:
         pipe = subprocess.PIPE
         begun = subprocess.Popen([sys.executable, "-c", PROGRAM, path], cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
         with ended(begun) as process:
-            assert process.stdout is not None and process.stdout.readline() == "loading\n"
+            assert process.stdout.readline() == "loading\n"
             process.send_signal(number)
             _, err = process.communicate()
         assert process.returncode == 4

@@ -15,19 +15,6 @@ HALF_MM = USPA44.pitch_mm / 2
 REACH_MM = 6.0
 
 
-def test_four_taps_make_a_square_of_half_a_pitch():
-    places = np.zeros((1, 2))
-    for _ in range(6):
-        shift_mm = next_shift_mm(places[::-1] - places[-1], REACH_MM)
-        assert shift_mm is not None
-        places = np.vstack([places, places[-1] + shift_mm])
-    halves = [tuple(row) for row in np.rint(places / HALF_MM).astype(int).tolist()]
-    assert len(set(halves)) == 7
-    assert {(x % 2, y % 2) for x, y in halves[:4]} == {(0, 0), (0, 1), (1, 0), (1, 1)}
-    apart_mm = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
-    assert apart_mm.max() <= REACH_MM
-
-
 def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     assert next_shift_mm(np.array([[0.0, 0.0], [HALF_MM + 0.3, -0.2]]), REACH_MM) not in (None, (HALF_MM, 0.0))
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)

@@ -1,5 +1,4 @@
 """Verdicts on patterns: what is not believed and why, what contacts show of their sensor, and both in the runtime."""
-# pyright: reportCallIssue=false, reportPossiblyUnboundVariable=false
 
 from dataclasses import replace
 

@@ -1,6 +1,4 @@
 """Model that takes poses, in the runtime and alone: which taps a pattern is made from, and with which poses."""
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalMemberAccess=false
-# pyright: reportPossiblyUnboundVariable=false
 
 from dataclasses import replace
 from itertools import permutations

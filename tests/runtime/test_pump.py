@@ -1,5 +1,4 @@
 """Loop from a source through the runtime into sinks: order, overtaking, what ends it, and its deadlines."""
-# pyright: reportAssignmentType=false, reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false
 
 import contextlib
 import itertools

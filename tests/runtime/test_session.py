@@ -1,6 +1,4 @@
 """Session of a model: what it computes, which inputs and outputs it refuses, and which files are no model."""
-# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
-# pyright: reportCallIssue=false
 
 import numpy as np
 import onnx

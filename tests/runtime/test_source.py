@@ -1,5 +1,4 @@
 """Source of one or several links: opened in a thread, read in threads at a pace, scripts and emulated adapters."""
-# pyright: reportAttributeAccessIssue=false
 
 import threading
 import time
@@ -192,23 +191,14 @@ def test_rest_is_a_second_without_contact_of_stamped_sensors():
     assert not setter.waited(make_scan(154))
 
 
-@pytest.mark.parametrize(
-    ("sensors", "period_s", "patience_s", "stamped", "pace"),
-    [
-        (1, 0.01, 0.0, True, Pace()),
-        (1, 0.01, 0.1, False, Pace()),
-        (1, 0.002, 0.1, True, Pace()),
-        (1, float("inf"), 0.1, True, Pace()),
-        (3, 0.01, 0.0, True, Pace()),
-        (4, 0.01, 0.0, True, Pace(0.0025)),
-        (4, 0.1, 0.0, True, Pace()),
-        (4, 0.01, 0.1, True, Pace(0.01, 10)),
-    ],
-)
-def test_many_are_read_together_and_rest_needs_patience(sensors, period_s, patience_s, stamped, pace):
-    setter = PaceSetter(patience_s)
-    followed(setter, 200, stamped=stamped)
-    assert setter.choose(sensors, period_s) == pace
+def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
+    setter = PaceSetter(0.0)
+    paces = [setter.choose(*of) for of in ((3, 0.01), (4, 0.01), (4, 0.1))]
+    assert paces == [Pace(), Pace(0.0025), Pace()]
+    for period_s, stamped in ((0.01, False), (0.002, True), (float("inf"), True)):
+        setter = PaceSetter(0.1)
+        followed(setter, 200, stamped=stamped)
+        assert setter.choose(1, period_s) == Pace()
 
 
 def recording(scans, pressed):

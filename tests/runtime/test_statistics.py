@@ -1,5 +1,4 @@
 """Statistics of a run, quantiles and the summary at its end; events and notes, each of one of a closed set of kinds."""
-# pyright: reportArgumentType=false
 
 import re
 from dataclasses import replace
@@ -57,7 +56,6 @@ class TestHistogram:
 
     def test_extreme_values_stay_within(self):
         histogram = Histogram()
-        assert histogram.quantile(0.5) is None
         for value in (0.0, 1e-9, 1e30):
             histogram.add(value)
         assert histogram.count == 3 and histogram.max == 1e30 and histogram.quantile(0.5) == 1.0

@@ -1,5 +1,4 @@
 """Dead taxels: detected, named, held for a while, trusted again; and what is not one."""
-# pyright: reportOperatorIssue=false, reportOptionalMemberAccess=false
 
 from dataclasses import replace
 

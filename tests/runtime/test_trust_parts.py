@@ -1,7 +1,5 @@
 """Checks of a contract: what its forward model and its small networks compute, and that no damaged one is taken."""
-# pyright: reportArgumentType=false
 
-import base64
 import json
 import math
 from collections.abc import Callable
@@ -18,8 +16,8 @@ from edge.api import Contract, ModelError
 from edge.inference import small_network as networks
 from edge.inference.forward_model import GRID, KPA, condensed, features
 from edge.inference.onnx_session import ModelSession
-from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network, unpacked
-from edge.inference.trust import check_of, contact_features, trust_of
+from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network
+from edge.inference.trust import contact_features
 
 GAIN_ERROR = 0.075
 
@@ -53,6 +51,9 @@ DAMAGE = {
     "an operator without a shape": put("forward", "operator", {"shape": [], "f2": "AAA="}),
     "an endless shape": put("forward", "noise", "shape", [math.inf]),
     "bytes cut short": put("forward", "noise", "f2", "AAAA"),
+    "bytes that are no base64": put("forward", "noise", "f2", "no base64!"),
+    "a shape of words": put("forward", "noise", "shape", ["two", 2]),
+    "noise that is not finite": put("forward", "noise", packed(np.array([1.0, 1.0, np.nan]))),
     "noise below 0": put("forward", "noise", packed(np.array([1.0, 1.0, -1.0]))),
     "more in the forward model": put("forward", "more", 1.0),
     "a contact limit that is no number": put("contact", "limit", math.nan),
@@ -73,7 +74,6 @@ class TestTrust:
     def test_it_comes_back_from_a_model_file(self, tmp_path):
         made = make_trust()
         again = ModelSession(write_model(tmp_path / "checks.onnx", make_trusted_contract())).contract.read_trust()
-        assert again is not None
         row = np.linspace(-1, 1, 104, dtype=np.float32)
         assert again.tap.network(row[None]) == made.tap.network(row[None]) and again.tap.limit == made.tap.limit
         assert again.contact.network(row[None, :54]) == made.contact.network(row[None, :54])
@@ -86,13 +86,6 @@ class TestTrust:
         with pytest.raises(ModelError, match="contract key 'trust' is damaged") as told:
             Contract.from_metadata(contract.to_metadata())
         assert "\n" not in str(told.value) and "export the model again" in str(told.value)
-
-    @pytest.mark.parametrize("value", [None, [], 3, "text"])
-    def test_what_is_no_map_is_refused(self, value):
-        with pytest.raises(ValueError, match="expected forward, contact, tap"):
-            trust_of(value, CONSTANTS)
-        with pytest.raises(ValueError, match="expected layers and a limit"):
-            check_of(value)
 
 
 def layers(*widths, seed=0):
@@ -135,28 +128,6 @@ class TestSmallNetwork:
     def test_layers_that_are_none_are_refused(self, made, said):
         with pytest.raises(ValueError, match=said):
             SmallNetwork(made)
-
-    def test_numbers_are_packed_in_half_precision(self):
-        values = np.array([[1.0, -2.5], [1 / 3, 60_000.0]])
-        assert unpacked(packed(values)) == pytest.approx(values, rel=1e-3)
-        assert unpacked(packed(values)).dtype == np.float32
-
-    @pytest.mark.parametrize(
-        "value",
-        [
-            *({"shape": shape} for shape in ([2, 3], [0, 4], [-2, -2], [1 << 17, 1], ["two", 2], 4, None, [math.nan])),
-            *({"f2": text} for text in ("AAAA", "no base64!", "\u00e4", 7)),
-            *(
-                {"f2": base64.b64encode(np.array([1, 2, 3, bad], dtype="<f2").tobytes()).decode()}
-                for bad in (np.nan, np.inf)
-            ),
-            *(None, [], "text", 3),
-        ],
-    )
-    def test_what_is_no_array_is_refused(self, value):
-        good = packed(np.ones((2, 2)))
-        with pytest.raises(ValueError, match=r"\w"):
-            unpacked(good | value if isinstance(value, dict) else value)
 
 
 def make_maps(seed=0, size=40):

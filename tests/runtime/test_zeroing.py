@@ -1,5 +1,4 @@
 """Zeroing: of a source by itself, on demand in the runtime, the ages of baselines, and what records tell of it."""
-# pyright: reportArgumentType=false
 
 import threading
 

@@ -14,12 +14,11 @@ ANY_PEER = {"00000000:0000", "00000000000000000000000000000000:0000"}
 RUN = """
 import socket, sys
 from edge.cli import main as cli
-if len(sys.argv) > 1:
-    kind = socket.SOCK_DGRAM if sys.argv[1] == "udp" else socket.SOCK_STREAM
-    family = socket.AF_INET6 if ":" in sys.argv[2] else socket.AF_INET
-    listener = socket.socket(family, kind)
-    listener.bind((sys.argv[2], 0))
-    sys.argv[1] == "udp" or listener.listen()
+listeners = []
+for protocol, host in zip(sys.argv[1::2], sys.argv[2::2]):
+    listeners.append(socket.socket(type=socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM))
+    listeners[-1].bind((host, 0))
+    protocol == "udp" or listeners[-1].listen()
 sys.exit(cli.main(["--source", "demo", "--sink", "jsonl:-"]))
 """
 
@@ -51,14 +50,14 @@ def reachable(process_id: int) -> list[str]:
     return found
 
 
-def reachable_of_a_demo(*listener: str) -> list[str]:
-    command = [sys.executable, "-c", RUN, *listener]
+def reachable_of_a_demo(*listeners: str) -> list[str]:
+    command = [sys.executable, "-c", RUN, *listeners]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as demo:
         try:
-            assert demo.stdout is not None and demo.stdout.readline().startswith(b"{"), "the demo says nothing"
+            assert demo.stdout.readline().startswith(b"{"), "the demo says nothing"
             return reachable(demo.pid)
         finally:
             demo.terminate()
@@ -69,8 +68,6 @@ def test_a_running_demo_can_be_reached_by_nobody():
     assert reachable_of_a_demo() == []
 
 
-@pytest.mark.parametrize(
-    ("listener", "count"), [(("tcp", "0.0.0.0"), 1), (("tcp", "127.0.0.1"), 0), (("udp", "0.0.0.0"), 1)]
-)
-def test_and_one_that_could_would_be_seen(listener, count):
-    assert len(reachable_of_a_demo(*listener)) == count
+def test_and_those_that_could_would_be_seen():
+    found = reachable_of_a_demo("tcp", "0.0.0.0", "tcp", "127.0.0.1", "udp", "0.0.0.0")
+    assert sorted(one.partition(" ")[0] for one in found) == ["tcp", "udp"]

@@ -89,7 +89,6 @@ with zenoh.open(config) as session:
         endpoint = free_endpoint()
         how = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
         with subprocess.Popen([sys.executable, "-c", self.PUBLISH, endpoint], **how) as process:
-            assert process.stdin is not None and process.stdout is not None
             assert process.stdout.readline() == "ready\n"
 
             def put(key, text):
@@ -146,7 +145,6 @@ class TestRos2:
         topics = [["arm/pose", kind] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         with subprocess.Popen([*command, json.dumps(topics)], env=environment, text=True, **pipes) as process:
-            assert process.stdin is not None and process.stdout is not None
             assert process.stdout.readline() == "ready\n"  # else stamps would be old when they are published
 
             def put(topic, kind, message):
@@ -243,7 +241,6 @@ class TestRos2:
             Emulator([make_recording(300)], loop=True) as emulator,  # the demo's robot states poses of its own
             start(*options, "--source", f"slcan:{emulator.port}") as process,
         ):
-            assert process.stdout is not None and process.stderr is not None
             lines = []
             for line in process.stdout:
                 lines.append(line)

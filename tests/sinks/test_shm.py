@@ -41,7 +41,6 @@ class TestWhatIsThere:
         result = make_result(7, press_counts=3000, stale=(0, 15))
         sink.write(result, {})
         half = latest(attach(name), "4")
-        assert half is not None
         said = fields(half)
         assert said["sensor"].rstrip(b"\0") == b"4" and said["model"].rstrip(b"\0") == b"fake"
         assert (said["time_ns"], said["scan"], said["device_time_ns"], said["sequence"]) == (80_000_000, 7, -1, 1)
@@ -136,7 +135,6 @@ class TestLayout:
             result = make_wrench_result(number, press)
             sink.write(result, {})
             half = latest(memory, "4")
-            assert half is not None
             told[press] = fields(half), np.frombuffer(half, kind, math.prod(shape), at).reshape(shape), result
         sink.close()
         said, traction, result = told[20_000]

@@ -138,7 +138,7 @@ class TestWhoComesAndGoes:
     def test_the_example_tells_patterns_events_and_grippers(self, endpoint):
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
         with ended(subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)) as listener:
-            assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
+            assert listener.stdout.readline() == "listens\n"
             sink, (free, pressed) = ZenohSink(f"grip/left?connect={endpoint}"), make_results(2)
             wait_for(lambda: sink.write(free, {}) or sink.trouble is None)
             sink.write(pressed, {})
@@ -155,13 +155,12 @@ class TestWhoComesAndGoes:
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
-            assert listener.stdout is not None and listener.stdout.readline() == "listens\n"
+            assert listener.stdout.readline() == "listens\n"
             if reader_goes:
                 listener.stdout.close()
                 ZenohSink(f"grip/left?connect={endpoint}").close()  # its arrival is what would be reported
             else:
                 listener.send_signal(signal.SIGINT)
-            assert listener.stderr is not None
             assert (listener.stderr.read(), listener.wait(60)) == ("", 0)
 
 

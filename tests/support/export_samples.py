@@ -11,7 +11,9 @@ import torch
 from press_samples import make_press_set
 
 from edge.evaluation.test_set import FrozenSet
+from edge.inference.bundled import find_model
 from edge.inference.contract import ANY_BATCH
+from edge.inference.onnx_session import ModelSession
 from export.graphs.intervals import IntervalData
 from export.to_onnx import export
 from train.data.frozen_presses import freeze_presses
@@ -105,7 +107,8 @@ def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> P
 
 
 def posed_models(folder: Path) -> None:
-    """Write fused.onnx, which takes poses."""
+    """Write fused.onnx, which takes poses, with checks."""
+    trust = ModelSession(find_model("stsr-int8")).contract.read_trust()
     validation = freeze_presses(POSED_PRESSES, 1).as_frozen_set()
     fit_network(FUSED, POSED_PRESSES, validation, folder)
     net, _ = load_network(folder / "fused.pt")
@@ -118,4 +121,4 @@ def posed_models(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_fit, "_STEPS", 50)
         intervals = IntervalData(POSED_PRESSES, POSED_PRESSES)
-        export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals)
+        export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals, trust=trust)

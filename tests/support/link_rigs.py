@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import can
 from bridge_samples import frames_of, make_counts, read_scans, write_recording
@@ -169,7 +170,7 @@ class GsUsbRig(CanRig):
         return self._port.adapter.sent
 
     def after_next_frame(self, action):
-        _after_next(self._port.adapter, "fetch", action)
+        self._port.adapter.fetch = _then_once(self._port.adapter.fetch, action)
 
     def lose(self):
         self._port.adapter.unplug()
@@ -228,7 +229,7 @@ class PythonCanRig(CanRig):
         return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
 
     def after_next_frame(self, action):
-        _after_next(self._near, "recv", action)
+        self._near.recv = _then_once(self._near.recv, action)
 
     def lose(self):
         self._plugged.clear()
@@ -299,16 +300,16 @@ class ReplayRig(Rig):
         return ReplayLink([self._recording])
 
 
-def _after_next(device: object, fetching: str, action: Callable[[], object]) -> None:
-    fetch = getattr(device, fetching)
+def _then_once(fetch: Callable[..., Any], action: Callable[[], object]) -> Callable[..., Any]:
+    actions = [action]
 
-    def fetch_and_act(timeout_s):
-        setattr(device, fetching, fetch)
-        fetched = fetch(timeout_s)
-        action()
+    def fetch_and_act(timeout):
+        fetched = fetch(timeout)
+        while actions:
+            actions.pop()()
         return fetched
 
-    setattr(device, fetching, fetch_and_act)
+    return fetch_and_act
 
 
 def processes_playing(path: Path) -> list[int]:

@@ -264,12 +264,12 @@ def check_saved(page):
     np.testing.assert_allclose(np.reshape(table, (40, 40)), pattern, rtol=1e-5)
 
 
-def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, monkeypatch, capsys):
+def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, capsys):
     """One of those of docs/live_pictures.py, without its waiting for the last tap."""
     spec = importlib.util.spec_from_file_location("live_pictures", ROOT / "docs" / "live_pictures.py")
     pictures = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(pictures)
-    monkeypatch.setattr(pictures, "PICTURES", tmp_path)
+    pictures.PICTURES = tmp_path
     counts = pictures.held_demo()
     with pictures.emulator(tmp_path, counts) as bus, pictures.live_page(bus.port) as (_, url):
         page = pictures.look(browser, url, pictures.PHONE, "dark")

@@ -90,8 +90,8 @@ class TestPage:
         assert response.status == 405 and (method == "HEAD" or response.read() == b"only GET\n")
         connection.close()
 
-    def test_who_says_nothing_is_not_waited_for(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(server, "OPEN_S", 0.1)
+    def test_who_says_nothing_is_not_waited_for(self, tmp_path, limits):
+        limits(server, OPEN_S=0.1)
         with live_page(tmp_path) as page, page.stranger(b"GET / HTTP/1.1\r\n") as stranger:
             assert stranger.recv(1000) == b""
             assert get(page)[0] == 200
@@ -117,8 +117,8 @@ class TestFrames:
         for result in again:
             np.testing.assert_array_equal(shown[result.scan.number]["pattern"], result.pattern)
 
-    def test_state_comes_with_every_change_and_every_second(self, page, monkeypatch):
-        monkeypatch.setattr(server, "STATE_S", 0.05)
+    def test_state_comes_with_every_change_and_every_second(self, page, limits):
+        limits(server, STATE_S=0.05)
         with page.viewer() as first:
             assert frame(first, "state")[0] == {
                 "kind": "state",
@@ -155,9 +155,9 @@ class TestFrames:
         x_mm, y_mm = pixels_mm(mapped.sink.whole.grid)
         assert (whole[(letter(x_mm, y_mm) == 0) & (np.abs(y_mm) < 8) & (np.abs(x_mm + 12) < 3)] > 0.9).all()
 
-    def test_viewers_are_told_when_the_run_ends(self, tmp_path, monkeypatch):
+    def test_viewers_are_told_when_the_run_ends(self, tmp_path, limits):
         """A client that says nothing does not delay the end."""
-        monkeypatch.setattr(server, "OPEN_S", 600.0)
+        limits(server, OPEN_S=600.0)
         threads = threading.active_count()
         with ExitStack() as run:
             page = run.enter_context(live_page(tmp_path))
@@ -167,7 +167,6 @@ class TestFrames:
                 with pytest.raises(ConnectionClosed) as caught:
                     while True:
                         viewer.recv(TIMEOUT_S)
-        assert caught.value.rcvd is not None
         assert (caught.value.rcvd.code, caught.value.rcvd.reason) == (1001, "the run has ended")
         assert threading.active_count() == threads
 

@@ -38,8 +38,8 @@ def answer(stranger):
     return stranger.recv(12)[9:].decode()
 
 
-def test_who_never_reads_costs_little_and_harms_nobody(page, monkeypatch):
-    monkeypatch.setattr(attended, "LATE_S", 0.1)
+def test_who_never_reads_costs_little_and_harms_nobody(page, limits):
+    limits(attended, LATE_S=0.1)
     with page.viewer() as other, page.stranger(HANDSHAKE) as blocked:
         with page.playing():
             shown = [frame(other, "result") for _ in range(30)]
@@ -52,8 +52,8 @@ def test_who_never_reads_costs_little_and_harms_nobody(page, monkeypatch):
 
 
 @pytest.mark.parametrize("how", ["never reads", "network vanishes"])
-def test_the_place_of_who_takes_nothing_is_free_again(page, monkeypatch, how):
-    monkeypatch.setattr(attended, "GONE_S", 1.5)
+def test_the_place_of_who_takes_nothing_is_free_again(page, limits, how):
+    limits(attended, GONE_S=1.5)
     with page.viewer() as other, page.playing(), ExitStack() as gone:
         network = None
         if how == "never reads":
@@ -69,8 +69,8 @@ def test_the_place_of_who_takes_nothing_is_free_again(page, monkeypatch, how):
         wait_for(lambda: seen_by(other) == 1)
 
 
-def test_the_place_of_who_takes_no_first_frame_is_free_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(server, "OPEN_S", 0.2)
+def test_the_place_of_who_takes_no_first_frame_is_free_again(tmp_path, limits):
+    limits(server, OPEN_S=0.2)
     with live_page(tmp_path, name="x" * 5_000_000) as page, ExitStack() as strangers:
         for _ in range(MOST_VIEWERS):
             strangers.enter_context(page.stranger(HANDSHAKE))
@@ -91,8 +91,8 @@ def test_as_many_are_admitted_as_there_is_room_for(page):
 
 
 @pytest.mark.parametrize("frame_", [LONG_PING, b"\x8a\x80mask", b"\x81\x82mask{}"], ids=["ping", "pong", "text"])
-def test_who_sends_more_than_a_person_asks_for_is_cut_off(page, frame_, monkeypatch):
-    monkeypatch.setattr(attended, "GONE_S", 600.0)  # not because it reads nothing
+def test_who_sends_more_than_a_person_asks_for_is_cut_off(page, frame_, limits):
+    limits(attended, GONE_S=600.0)  # not because it reads nothing
     with page.viewer(ping_interval=None) as other, page.stranger(HANDSHAKE) as flood:  # one process for all
         much = (200_000 // len(frame_)) * frame_  # at once: a few hundred commands are answered one by one
         with pytest.raises(ConnectionError):
@@ -103,8 +103,8 @@ def test_who_sends_more_than_a_person_asks_for_is_cut_off(page, frame_, monkeypa
         assert frame(other, "result")
 
 
-def test_behind_a_pause_in_reading_comes_the_newest(page, monkeypatch):
-    monkeypatch.setattr(attended, "LATE_S", 0.05)
+def test_behind_a_pause_in_reading_comes_the_newest(page, limits):
+    limits(attended, LATE_S=0.05)
     with page.viewer(max_queue=2) as viewer, page.playing():
         headers = [frame(viewer, "result")[0]]
         end = page.press.number + 100
@@ -119,9 +119,9 @@ def test_behind_a_pause_in_reading_comes_the_newest(page, monkeypatch):
         assert traced == sorted(set(traced))
 
 
-def test_who_says_nothing_makes_room_for_the_next(tmp_path, monkeypatch):
+def test_who_says_nothing_makes_room_for_the_next(tmp_path, limits):
     """Idle connections lock nobody out; those of viewers are not theirs to take."""
-    monkeypatch.setattr(server, "OPEN_S", 600.0)  # they make room, and not because they were silent for so long
+    limits(server, OPEN_S=600.0)  # they make room, and not because they were silent for so long
     with live_page(tmp_path) as page, page.viewer() as viewer, ExitStack() as strangers:
         idle = [strangers.enter_context(page.stranger()) for _ in range(MOST_CONNECTIONS + 6)]
         assert get(page)[0] == 200
@@ -153,9 +153,9 @@ def test_what_ends_the_server_is_told_and_the_run_goes_on(tmp_path):
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_clients_leave_nothing_behind(page, client, monkeypatch):
+def test_clients_leave_nothing_behind(page, client, limits):
     """Garbage collection is off, as while the loop runs."""
-    monkeypatch.setattr(server, "TIDY_S", 0.05)
+    limits(server, TIDY_S=0.05)
 
     def come_and_go(count):
         for number in range(count):
