@@ -39,11 +39,11 @@ from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import load_network
 from train.learning.expected_error_table import confidence_sets
 from train.learning.interval_fit import half_width_mm
-from train.learning.trust_limits import load_trust
 from train.networks.blocks import PatternNet
 from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
+from train.trust import load_trust
 
 OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1

@@ -11,11 +11,11 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.to_onnx import export
 from export.verify import verify
-from train.learning.trust_limits import load_trust
 from train.networks.graph_weights import network_of
 from train.networks.registry import build
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import REACH_MM
+from train.trust import load_trust
 
 
 @pytest.fixture(scope="module")
