@@ -26,7 +26,7 @@ from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import PatternCheck
 from edge.terminal.progress_bar import tracked
-from export.graphs.parity import FULL_RANGE_COUNTS, extreme_windows
+from export.parity import FULL_RANGE_COUNTS, extreme_windows
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ABSENT

@@ -29,8 +29,7 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
-from export.graphs.graph import contract_in, in_float, outputs
-from export.graphs.parity import (
+from export.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
     TOLERANCE,
@@ -40,16 +39,15 @@ from export.graphs.parity import (
     differences,
     extreme_windows,
     read_windows,
+    run_network,
 )
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
 from train.errors import CheckpointError, TrainError
-from train.learning.checkpoint import load_network
+from train.learning.checkpoint import load_network, network_of, origin_of
 from train.networks.blocks import PatternNet
-from train.networks.graph_weights import network_of, origin_of
 
-_TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
 BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.05)}
 """Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch.
@@ -103,7 +101,7 @@ def verify(
     """
     model = _load(path)
     try:
-        contract = contract_in(model)
+        contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
         net = _network(path, model, contract, checkpoints)
     except (ModelError, ExportError, CheckpointError) as error:
         raise type(error)(f"{path}: {error}") from error
@@ -113,7 +111,7 @@ def verify(
     if contract.takes_poses:
         groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
-    expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
+    expected = {name: run_network(net, windows) for name, windows in groups.items()}
     on_pass()
     truth = frozen.patterns() if contract.scale == frozen.scale else None
     for level in LEVELS:
@@ -177,7 +175,7 @@ def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints
         net, report = load_network(source)
         trained = report.get("training_sha256")
     else:
-        source = in_float(path)
+        source = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
         if not source.exists():
             raise ExportError(
                 f"the float32 model {source.name} is not in the folder of its int8 model: put it there, or name the "
@@ -197,11 +195,6 @@ def _load(path: Path) -> onnx.ModelProto:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
     except DecodeError as error:
         raise ModelError(f"{path}: not an ONNX model") from error
-
-
-def _run_torch(net: PatternNet, windows: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    parts = [outputs(net, part) for part in torch.from_numpy(windows).split(_TORCH_BATCH)]
-    return [torch.cat(maps).numpy() for maps in zip(*parts, strict=True)]
 
 
 def table(rows: list[Parity]) -> str:

@@ -17,7 +17,8 @@ from edge.inference.onnx_session import ModelSession
 from edge.inference.pose_input import scheduled_rows
 from export import verify as verify_module
 from export.errors import ParityError
-from export.graphs.parity import (
+from export.int8 import convolutions
+from export.parity import (
     LEVELS,
     GraphRun,
     accepted,
@@ -25,11 +26,10 @@ from export.graphs.parity import (
     extreme_windows,
     read_windows,
 )
-from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 from train.errors import CheckpointError
-from train.networks.graph_weights import network_of
+from train.learning.checkpoint import network_of
 
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]

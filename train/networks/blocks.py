@@ -20,11 +20,13 @@ class PatternNet(nn.Module):
     Attributes:
         taps: K.
         scale: pattern pixels per taxel pitch.
+        known: numbers that it takes of the pad's constants.
         takes_poses: True if it takes the poses of the taps as well, and any number of taps up to K.
     """
 
     taps: int
     scale: int
+    known: int = 0
     takes_poses: bool = False
 
     def take_over(self, start: "PatternNet") -> None:
