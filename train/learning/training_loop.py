@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import distributed, nn
@@ -30,10 +30,11 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
 from train.errors import TrainError
-from train.networks.blocks import Objective, PatternNet
+from train.networks.blocks import Loss, PatternNet
 
 Batches = Callable[[int], Batch]
 """Function from a number to its batch; the same number always gives the same batch."""
+Part = nn.Module | torch.optim.Optimizer
 Course = list[dict[str, float]]
 """Validation figures at some steps of a training."""
 
@@ -151,7 +152,7 @@ def learning_rate_share(progress: float) -> float:
 
 def train(
     net: PatternNet,
-    objective: Objective,
+    loss_of: Loss,
     batches: Batches,
     recipe: Recipe,
     resume_path: Path,
@@ -164,7 +165,7 @@ def train(
 
     Args:
         net: on any device; left in evaluation mode.
-        objective: loss function.
+        loss_of: loss function.
         batches: function from a number to its batch.
         recipe: hyperparameters.
         resume_path: file that keeps the state; the caller deletes it when the result is safe.
@@ -183,7 +184,7 @@ def train(
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     parallel = DistributedDataParallel(net) if world > 1 else net
-    parts = {"net": net, "optimizer": optimizer, "objective": objective}
+    parts: dict[str, Part] = {"net": net, "optimizer": optimizer}
     recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
     state = _restored(resume_path, parts, recipe_sha256, device)
     wait_for_all()  # the first process to finish may delete the state
@@ -200,7 +201,7 @@ def train(
                 group["lr"] = rate
             batch = next(drawn).share(rank, world, device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
-                descended = objective.loss(parallel, batch)
+                descended = loss_of(parallel, batch)
             optimizer.zero_grad()
             descended.backward()
             norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
@@ -208,7 +209,6 @@ def train(
             if not (isfinite(norm) and isfinite(loss)):
                 raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step}: lower the learning rate")
             optimizer.step()
-            objective.after_step()
             step += 1
             log.step(step, loss, rate)
             if validate and step in check_at and rank == 0:
@@ -283,14 +283,7 @@ def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
     return max(by_steps, float(by_time))
 
 
-class _Part(Protocol):
-    """Part of a run that has a state: network, optimizer, objective."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
-
-
-def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
+def _restored(path: Path, parts: Mapping[str, Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
     """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
     if not path.exists():
         return {"step": 0, "elapsed_s": 0.0, "course": []}
@@ -305,7 +298,7 @@ def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device
     return {"course": []} | state
 
 
-def _keep(path: Path, parts: Mapping[str, _Part], facts: Mapping[str, Any]) -> None:
+def _keep(path: Path, parts: Mapping[str, Part], facts: Mapping[str, Any]) -> None:
     """Keep the state of a run on disk, so that an interruption costs at most a minute."""
     state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
     write_in_place(
