@@ -4,14 +4,14 @@ python -m export.stability --out reports
 
 Three parts: the simulated pad (nearly incompressible, thin, thick, touched by a cell or by a ball of a metre), the
 bundled graphs (no touch, denormals, presses beyond any sensor, soft and stiff pads, in int8 and in float32, on one and
-on several threads), and the program from raw counts to records (saturated, wrapped, absent and single taxels).
+on several threads), and the program from raw counts to records (saturated, wrapped, absent and single taxels). How int8
+differs from float32 where something touches is in `export.verify`; what has to be refused is in the tests.
 """
 
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from edge.api import infer
-from edge.errors import EdgeError, UsageError, WindowError
+from edge.errors import EdgeError
 from edge.inference.bundled import DEFAULT_MODEL, INT8_SUFFIX, POSED_MODEL, bundled_models, find_model
 from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
@@ -45,16 +45,13 @@ FAR_MM: Final = 1e3
 RESIDUAL: Final = 1e-3
 WIDE: Final = 24
 """Factor of a grid whose copies are farther away than any thickness requires."""
-INT8_PRESS, INT8_BEYOND = 0.25, 1.05
-"""Largest difference of int8 from float32 in any pixel, as a share of the largest value in float32: on presses, as
-`export.verify` has it, and on windows beyond any touch, where int8 saturates and the runtime believes no pattern."""
-SAME: Final = 1e-5
-"""Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
-steps."""
+SAME, INT8_BEYOND = 1e-5, 1.05
+"""Largest difference by threads and windows of one call, as a share; the second is of int8 beyond any touch, where a
+last bit may move it by whole steps, and the runtime believes no pattern."""
 TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
 NO_TOUCH: Final = ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
 QUIET: Final = 1e-3
-"""The difference of int8 where nothing touches, as a share of full scale."""
+"""Largest difference of int8 from float32 where nothing touches, as a share of full scale."""
 MOST_MM: Final = 5.0
 """Bound of a pattern and its deviation in a record: the pad is 4.5 mm thick."""
 THREADS: Final = 4
@@ -68,37 +65,24 @@ FREE_SCANS, TOUCHED_SCANS, KEPT_SCANS = 30, 40, 10
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One row of the table: a stiff or extreme input, the measured quantity and its upper bound.
-
-    Where the case must be refused the value is None, and `note` the error; else it may hold the states of the records.
-    """
+    """One row of the table: a stiff or extreme input, the measured quantity and its upper bound."""
 
     name: str
     what: str
-    value: float | None
+    value: float
     most: float
     note: str = ""
     model: str = ""
 
     @property
     def holds(self) -> bool:
-        """True within the bound, which NaN never is, or if refused."""
-        return bool(self.note) if self.value is None else self.value <= self.most
+        """True within the bound, which NaN never is."""
+        return self.value <= self.most
 
     def cells(self) -> Row:
         """Return the case as cells of a table."""
-        verdict = ("refused" if self.value is None else "holds") if self.holds else "BROKEN"
         cells: Row = {"case": self.name, "measured": self.what, "value": self.value, "at most": self.most}
-        return cells | {"model": self.model, "verdict": verdict, "note": self.note}
-
-
-def refused(name: str, work: Callable[[], object], by: type[Exception], model: str = "") -> Case:
-    """Return a case that must end in an error; broken if it does not."""
-    try:
-        work()
-    except by as error:
-        return Case(name, "refused", None, 0.0, str(error), model)
-    return Case(name, "refused", float("nan"), 0.0, f"expected {by.__name__}, but there was none", model)
+        return cells | {"model": self.model, "verdict": "holds" if self.holds else "BROKEN", "note": self.note}
 
 
 def pad_cases() -> Iterator[Case]:
@@ -114,15 +98,7 @@ def pad_cases() -> Iterator[Case]:
         yield from _pressed(name, whole, depth_mm)
     for thickness_mm in (4.5, 50.0):
         yield against_a_wide_grid(replace(whole, thickness_mm=thickness_mm), f"{thickness_mm:g} mm thick")
-    solver = ContactSolver(whole, SIZE, CELL_MM)
-    yield refused("nothing touches", lambda: solver.solve(punch(-1.0)[None], INDENTATION_MM), ValueError)
-    yield refused("pressed by 0 mm", lambda: solver.solve(punch()[None], 0.0), ValueError)
-    yield refused("Poisson's ratio 0.5", lambda: replace(whole, poisson=0.5), ValueError)
-    yield refused("dipole near its chip", lambda: MagnetArray(USPA44, Magnet(height_mm=1.0)), ValueError)
     array = MagnetArray(USPA44, Magnet())
-    through = np.zeros((1, USPA44.taxel_count, len(MOVEMENT)), np.float32)
-    through[..., MOVEMENT.index("down_mm")] = Magnet().clearance_mm
-    yield refused("magnet pressed through its chip", lambda: array.change_mt(through), ValueError)
     rng = np.random.default_rng(0)
     for size_mm in (1e-6, 0.5):
         moved = rng.uniform(-size_mm, size_mm, (100, USPA44.taxel_count, len(MOVEMENT)))
@@ -132,7 +108,7 @@ def pad_cases() -> Iterator[Case]:
 
 
 def punch(radius_mm: float = 4.0, middle_mm: float = 0.0) -> NDArray[np.float64]:
-    """Return the depth image of a flat round punch, (size, size) in [mm]; with a radius below 0 nothing touches."""
+    """Return the depth image of a flat round punch, (size, size) in [mm]."""
     return np.where(_off_mm(middle_mm) <= radius_mm, 0.0, FAR_MM)
 
 
@@ -181,13 +157,6 @@ def graph_cases() -> Iterator[Case]:
         for name, pad in pads(one.contract).items():
             size_mm = largest(one, given["press"], one.contract.pad_row(pad))
             yield Case(name, "largest, mm", size_mm, MOST_MM, model=path.stem)
-    for model in (DEFAULT_MODEL, POSED_MODEL):
-        session = ModelSession(find_model(model))
-        good = windows(session.contract)["press"]
-        for bad in (np.nan, np.inf, -np.inf):
-            spoiled = good.copy()
-            spoiled[0, 2, 1, 1] = bad
-            yield refused(f"{bad} in one place", partial(session.run, spoiled), WindowError, model)
 
 
 def windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
@@ -235,13 +204,9 @@ def _graph(
     most = SAME if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
     what = f"{THREADS} threads and {TOGETHER} windows, to one"
     yield Case(name, what, spread / max(size, full_scale), most, model=one.name)
-    if peer is not None and (touch or name in extreme_windows(one.contract)):
-        in_float = peer.run(window)
-        apart, largest_float = float(np.abs(in_float - pattern).max()), float(np.abs(in_float).max())
-        share, most = apart / max(largest_float, full_scale), INT8_PRESS if touch else INT8_BEYOND
-        if name in NO_TOUCH:
-            share, most = apart / full_scale, QUIET
-        yield Case(name, "int8 to float32", share, most, model=one.name)
+    if peer is not None and name in NO_TOUCH:
+        apart = float(np.abs(peer.run(window) - pattern).max())
+        yield Case(name, "int8 to float32", apart / full_scale, QUIET, model=one.name)
 
 
 def largest(session: ModelSession, window: NDArray[np.float32], pad: NDArray[np.float32] | None = None) -> float:
@@ -264,8 +229,6 @@ def program_cases() -> Iterator[Case]:
             yield played(name, session, raw, patterns)
         for rest in (0, 1, LARGEST - 1, LARGEST):
             yield resting(f"free pad at {rest}, wraps by noise", session, rest)
-        wrong = np.full((1, *USPA44.scan_shape), np.nan)
-        yield refused("NaN counts", partial(infer, session, wrong, _free(1)), UsageError, model)
 
 
 def scans() -> Mapping[str, tuple[NDArray[np.int32], bool]]:
@@ -327,7 +290,7 @@ def worst(cases: list[Case]) -> list[Case]:
     kept: list[Case] = []
     for key in dict.fromkeys((case.name, case.what, case.most) for case in cases):
         same = [case for case in cases if (case.name, case.what, case.most) == key]
-        kept += [case for case in same if not case.holds] or [max(same, key=lambda case: case.value or 0.0)]
+        kept += [case for case in same if not case.holds] or [max(same, key=lambda case: case.value)]
     return kept
 
 
@@ -338,9 +301,8 @@ def run(folder: Path) -> list[Case]:
     every = [case for same in cases.values() for case in same]
     broken = [case for case in every if not case.holds]
     report.say(
-        f"{len(every)} rows, {sum(case.value is None for case in every)} of them refused by a clear error; "
-        f"{len(broken)} are broken. A value that is not a number is broken, whatever its bound. Of the models the one "
-        "that is nearest to its bound is shown."
+        f"{len(every)} rows; {len(broken)} are broken. A value that is not a number is broken, whatever its bound. Of "
+        "the models the one that is nearest to its bound is shown."
     )
     for part, same in cases.items():
         report.show([case.cells() for case in worst(same)], f"## {part}")

@@ -4,13 +4,13 @@ python -m export.verify edge/models/*.onnx
 
 Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings if available,
 and on extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network from which they were
-quantised. That network is restored from the float32 graph's own weights, or loaded from a checkpoint.
+quantised. That network is restored from the float32 graph's own weights.
 """
 
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -45,7 +45,7 @@ from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
 from train.errors import CheckpointError, TrainError
-from train.learning.checkpoint import load_network, network_of, origin_of
+from train.learning.checkpoint import network_of, origin_of
 from train.networks.blocks import PatternNet
 
 _SCANS_APART: Final = 20
@@ -85,14 +85,13 @@ COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR chan
 def verify(
     path: Path,
     frozen: FrozenSet,
-    checkpoints: Path | None = None,
     recordings: Path | None = None,
     *,
     on_pass: Callable[[], object] = lambda: None,
 ) -> Iterator[Parity]:
     """Compare one model with its network at every level, on every kind of windows; `on_pass` is called PASSES times.
 
-    Without `checkpoints`, the folder of NAME.pt, the network is restored from NAME.onnx, that of NAME-int8.onnx too.
+    The network is restored from NAME.onnx, that of NAME-int8.onnx too.
     A model of another scale than the test set's is compared with its network, but not evaluated.
 
     Raises:
@@ -102,7 +101,7 @@ def verify(
     model = _load(path)
     try:
         contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
-        net = _network(path, model, contract, checkpoints)
+        net = _network(path, model, contract)
     except (ModelError, ExportError, CheckpointError) as error:
         raise type(error)(f"{path}: {error}") from error
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
@@ -167,23 +166,15 @@ def _judge(
     return found, change_db, broken
 
 
-def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints: Path | None) -> PatternNet:
-    """Return a model's network, whose name and training hash must match."""
-    made = origin_of(model)["training_sha256"]
-    if checkpoints is not None:
-        source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
-        net, report = load_network(source)
-        trained = report.get("training_sha256")
-    else:
-        source = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
-        if not source.exists():
-            raise ExportError(
-                f"the float32 model {source.name} is not in the folder of its int8 model: put it there, or name the "
-                "folder of its checkpoint with --checkpoints"
-            )
-        graph = _load(source)
-        net, trained = network_of(graph), origin_of(graph)["training_sha256"]
-    if trained != made or (net.taps, net.scale) != (contract.taps, contract.scale):
+def _network(path: Path, model: onnx.ModelProto, contract: Contract) -> PatternNet:
+    """Return a model's network, whose training hash must match."""
+    source = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
+    if not source.exists():
+        raise ExportError(f"the float32 model {source.name} is not in the folder of its int8 model: put it there")
+    graph = _load(source)
+    net = network_of(graph)
+    trained_alike = origin_of(graph)["training_sha256"] == origin_of(model)["training_sha256"]
+    if not trained_alike or (net.taps, net.scale) != (contract.taps, contract.scale):
         raise ExportError(f"{source} is of another training than the model: export the model again from it")
     return net
 
@@ -224,27 +215,20 @@ def _worst(rows: list[Parity]) -> list[Parity]:
     return kept
 
 
-def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os.environ) -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
-    parser.add_argument("--checkpoints", type=Path, help="folder of NAME.pt (default: the graphs' own weights)")
-    folder = environment.get("TACTILE_RECORDINGS")
-    parser.add_argument(
-        "--recordings",
-        type=Path,
-        default=Path(folder) if folder else None,
-        help="folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)",
-    )
+    recordings = os.environ.get("TACTILE_RECORDINGS") or None
+    help_of_recordings = "folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)"
+    parser.add_argument("--recordings", type=Path, default=recordings, help=help_of_recordings)
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
     try:
         frozen = load_frozen_set(FROZEN)
         with Progress("verifying", len(options.models) * PASSES, "pass") as bar:
             rows = [
-                row
-                for path in options.models
-                for row in verify(path, frozen, options.checkpoints, options.recordings, on_pass=bar.advance)
+                row for path in options.models for row in verify(path, frozen, options.recordings, on_pass=bar.advance)
             ]
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")

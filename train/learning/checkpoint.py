@@ -218,7 +218,7 @@ def network_of(model: onnx.ModelProto) -> PatternNet:
     lacking = read_back(net, held)
     if lacking:
         more = f" and {len(lacking) - 1} more weights" if len(lacking) > 1 else ""
-        raise CheckpointError(f"the graph does not hold {lacking[0]}{more}: name its checkpoint")
+        raise CheckpointError(f"the graph does not hold {lacking[0]}{more}: only its checkpoint does")
     return net.eval()
 
 

@@ -61,10 +61,6 @@ class ContactMixture:
     means: NDArray[np.float64]  # (k, 1 + p, channels), of a middle pad, then the change by half a constant's range
     covariances: NDArray[np.float64]  # (k, channels, channels)
 
-    def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the means (k, channels) on a pad of these constants, (p,) over half of their ranges."""
-        return np.append(1.0, constants) @ self.means
-
     def model(
         self, widening: float = 1.0, bias: NDArray[np.floating] | None = None, constant_widening: float = 1.0
     ) -> ContactModel:

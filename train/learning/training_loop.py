@@ -90,7 +90,6 @@ class Trained:
 
     steps: int
     elapsed_s: float  # over all its parts
-    loss: float  # of the last batch
     course: Course
 
 
@@ -193,7 +192,6 @@ def train(
     started_s = kept_s - state["elapsed_s"]
     logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
     check_at = {round(recipe.steps * (i + 1) / _VALIDATIONS) for i in range(_VALIDATIONS)} if validate else set()
-    loss = torch.inf
     with closing(logged) as log, closing(drawn_ahead(batches, step, recipe.steps)) as drawn:
         while (progress := _progress(recipe, step, time.monotonic() - started_s)) < 1:
             rate = recipe.learning_rate * learning_rate_share(progress)
@@ -223,7 +221,7 @@ def train(
                 _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
                 kept_s = time.monotonic()
     net.eval()
-    return Trained(step, time.monotonic() - started_s, loss, course)
+    return Trained(step, time.monotonic() - started_s, course)
 
 
 Drawn = TypeVar("Drawn")

@@ -135,13 +135,8 @@ def fit_psf_net(
 ) -> list[float]:
     """Train the network from its first weights, fit k_scale, and return the loss of every epoch.
 
-    Args:
-        net: the network.
-        counts: (n, 3, rows, cols) zeroed.
-        depth: (n, H, W) in 0..1, 1 the surface's top.
-        indentation_mm: (n,), in [mm].
-        epochs: passes over the scans.
-        seed: of the weights and of the order of the scans.
+    Scans are zeroed counts (n, 3, rows, cols), with depth images (n, H, W) in 0..1, 1 the surface's top, and
+    indentations (n,). The seed is that of the weights and of the order of the scans.
     """
     scans, images = torch.as_tensor(counts, dtype=torch.float32), torch.as_tensor(depth, dtype=torch.float32)
     with torch.random.fork_rng():
