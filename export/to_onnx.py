@@ -127,15 +127,9 @@ def export(
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
     Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
-
-    Args:
-        checkpoint: NAME.pt of train.fit.
-        folder: of the model.
-        frozen: the test set, of the pad that the model is for.
-        calibration: training taps from which int8 ranges are measured; None for float32.
-        validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
-        trust: forward model and checks for the contract; None for none.
-        intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
+    The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
+    and confidence is fitted on `validation`. What is None or empty is left out; without `intervals` the deviations stay
+    as the checkpoint has them.
     """
     net, report = load_network(checkpoint)
     write_out(net)

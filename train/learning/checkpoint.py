@@ -195,11 +195,7 @@ def origin(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
-    """Return the metadata that identify a graph's network.
-
-    Raises:
-        CheckpointError: the metadata are missing.
-    """
+    """Return the metadata that identify a graph's network; CheckpointError if they are missing."""
     stated = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
     if stated is None:
         raise CheckpointError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
@@ -207,11 +203,7 @@ def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
 
 
 def network_of(model: onnx.ModelProto) -> PatternNet:
-    """Return the network of a float32 graph, in evaluation mode.
-
-    Raises:
-        CheckpointError: the graph does not identify its network, or lacks its weights.
-    """
+    """Return the network of a float32 graph, in evaluation mode; CheckpointError if it lacks the network's weights."""
     made = origin_of(model)
     net = build(made["network"], made["scale"], **made["options"])
     held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in model.graph.initializer}

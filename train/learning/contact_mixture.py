@@ -266,15 +266,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
-    parser.add_argument(
-        "--sensors",
-        type=Path,
-        help="presses of the sensors by which it is calibrated (default: made next to the presses)",
-    )
     options = parser.parse_args(arguments)
     try:
         mixture = fit_mixture(load_presses(options.presses))
-        presses = make_presses(CALIBRATION, options.sensors or options.presses.with_name("calibration.npz"))
+        presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
     except TrainError as error:
         sys.stderr.write(f"train.learning.contact_mixture: {error}\n")

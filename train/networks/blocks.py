@@ -32,11 +32,7 @@ class PatternNet(nn.Module):
     takes_poses: bool = False
 
     def take_over(self, start: "PatternNet") -> None:
-        """Copy another network's weights.
-
-        Raises:
-            RuntimeError, ValueError: they do not fit.
-        """
+        """Copy another network's weights; RuntimeError or ValueError if they do not fit."""
         self.load_state_dict(start.state_dict())
 
 
