@@ -1,4 +1,4 @@
-"""What a model's contract says of its error: on the frozen test set, and by its deviations (edge's expected_error)."""
+"""Errors in a model's contract: on the frozen test set, and as its deviations predict them (edge's expected_error)."""
 
 from collections.abc import Collection
 from typing import Final
