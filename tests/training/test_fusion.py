@@ -7,7 +7,7 @@ from press_samples import make_press_set
 
 from train.data.press_batches import PosedBatches, stated_poses
 from train.errors import DatasetError
-from train.networks.compact import CompactNet, compact_loss
+from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.fusion import FusionNet
 from train.networks.registry import grown
 
@@ -111,7 +111,7 @@ def test_every_parameter_has_a_gradient_with_one_tap_and_with_four():
     for given in ((1.0, 0, 0, 0), (0, 0, 0, 1.0)):
         net = FusionNet(4, 10, channels=16, blocks=2, known=presses.constants.shape[1] * 2 + 1).train()
         batch = PosedBatches(presses, given, 8, seed=1)(0)
-        compact_loss(net, batch).backward()
+        HeteroscedasticError().loss(net, batch).backward()
         assert all(part.grad is not None for part in net.parameters())
 
 

@@ -20,7 +20,7 @@ from train.learning.training_loop import (
     learning_rate_share,
     train,
 )
-from train.networks.blocks import PatternNet, pattern_loss
+from train.networks.blocks import PatternNet, RelativeError
 
 RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)
 
@@ -55,7 +55,7 @@ def weights(net):
 
 def trained(tmp_path, recipe=RECIPE, **options):
     net = new_net()
-    done = train(net, pattern_loss, batches, recipe, tmp_path / "net.resume", **options)
+    done = train(net, RelativeError(), batches, recipe, tmp_path / "net.resume", **options)
     return net, done
 
 
@@ -69,7 +69,7 @@ def test_training_lowers_the_loss(tmp_path):
     net, done = trained(tmp_path, replace(RECIPE, steps=200))
     batch = batches(999)
     assert done.steps == 200
-    assert pattern_loss(net, batch) < 0.3 * pattern_loss(new_net(), batch)
+    assert RelativeError().loss(net, batch) < 0.3 * RelativeError().loss(new_net(), batch)
     assert not net.training
 
 
@@ -92,10 +92,10 @@ def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, monkeypatch, 
         return batches(number)
 
     with pytest.raises(InterruptedError):
-        train(new_net(), pattern_loss, until_killed, RECIPE, tmp_path / "net.resume", validate=judged)
+        train(new_net(), RelativeError(), until_killed, RECIPE, tmp_path / "net.resume", validate=judged)
     torch.manual_seed(99)
     resumed = Map()
-    done = train(resumed, pattern_loss, recorded, RECIPE, tmp_path / "net.resume", validate=judged)
+    done = train(resumed, RelativeError(), recorded, RECIPE, tmp_path / "net.resume", validate=judged)
     assert seen == list(range(killed_at, 12))
     assert torch.equal(weights(whole), weights(resumed))
     assert done.course == uninterrupted.course and [point["step"] for point in done.course] == [2, 5, 7, 10, 12]
@@ -131,7 +131,7 @@ def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):
         return replace(batch, window=batch.window * torch.nan)
 
     with pytest.raises(DivergedError, match="step 0: lower the learning rate"):
-        train(net, pattern_loss, poisoned, RECIPE, tmp_path / "net.resume")
+        train(net, RelativeError(), poisoned, RECIPE, tmp_path / "net.resume")
     assert torch.equal(before, weights(net))
 
 
@@ -159,12 +159,12 @@ sys.path[:0] = ["tests/training", "tests/support"]
 from pathlib import Path
 from test_loop import batches, new_net, weights, RECIPE
 from train.learning.training_loop import leave_group, rank_and_world, train
-from train.networks.blocks import pattern_loss
+from train.networks.blocks import RelativeError
 net, used = new_net(), []
 def recorded(number):
     used.append(number)
     return batches(number)
-train(net, pattern_loss, recorded, RECIPE, Path(sys.argv[1]) / "net.resume")
+train(net, RelativeError(), recorded, RECIPE, Path(sys.argv[1]) / "net.resume")
 rank, world = rank_and_world()
 cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 print(json.dumps([rank, world, used, weights(net).tolist(), cores]), file=open(f"{sys.argv[1]}/rank{rank}.json", "w"))

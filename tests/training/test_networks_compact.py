@@ -5,7 +5,7 @@ import torch
 
 from train.data.press_batches import Batch
 from train.networks.blocks import relative_rms_error
-from train.networks.compact import TRACTION_SCALE, CompactNet, compact_loss, heteroscedastic_loss
+from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_traction_is_learned_where_it_is_known_and_light_pulls_count_as_firm_one
     net = CompactNet(1, 4, channels=16, blocks=1)
     pattern, _, traction = net(window(taps=1))
     truth, pulled = truth_like(pattern), torch.randn(traction.shape)
-    loss = compact_loss
+    loss = HeteroscedasticError().loss
     alone = float(loss(net, Batch(window(taps=1), truth)).detach())
     share = [
         float(loss(net, Batch(window(taps=1), truth, traction=(traction.detach() + pulled * size))).detach()) - alone

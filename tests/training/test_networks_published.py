@@ -1,13 +1,19 @@
+import copy
+
 import pytest
 import torch
+from torch import nn
 
+from train.data.press_batches import Batch
 from train.experiments.support.workbench import macs, parameters_count
-from train.networks.published import SeedNet
+from train.networks.blocks import relative_error
+from train.networks.published import SeedNet, SrganObjective
 from train.networks.registry import build, grown
 from train.networks.symmetric import write_out
 
 PUBLISHED = {
     "srcnn": (4.36, 6.96),
+    "srgan": (4.36, 6.96),
     "stsr": (4.584, 7.32),
     "mtsr2": (4.659, 7.44),
     "mtsr4": (4.811, 7.68),
@@ -41,7 +47,7 @@ def test_parameters_and_macs_are_the_published_ones(name):
     assert macs(net) / 1e9 == pytest.approx(giga_macs, abs=0.007)
 
 
-@pytest.mark.parametrize(("name", "scale"), [("stsr", 4), ("mtsr3", 2), ("srcnn", 3), ("mtsr7", 1)])
+@pytest.mark.parametrize(("name", "scale"), [("stsr", 4), ("mtsr3", 2), ("srcnn", 3), ("srgan", 2), ("mtsr7", 1)])
 def test_patterns_have_the_pattern_size_at_any_scale(name, scale):
     net = build(name, scale).eval()
     assert net.scale == scale
@@ -70,7 +76,7 @@ def test_what_is_out_of_range_is_refused(taps, scale, said):
         SeedNet(taps, scale)
 
 
-@pytest.mark.parametrize("name", ["stsr", "mtsr2", "srcnn", "compact-stsr"])
+@pytest.mark.parametrize("name", ["stsr", "mtsr2", "srcnn", "srgan", "compact-stsr"])
 def test_every_network_learns_in_low_precision(name):
     torch.manual_seed(2)
     net = build(name, 2).train()
@@ -91,7 +97,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 
 @pytest.mark.parametrize(
     ("start", "name", "scale"),
-    [("stsr", "mtsr3", 3), ("mtsr2", "mtsr2", 2), ("stsr", "stsr", 1)],
+    [("stsr", "mtsr3", 3), ("mtsr2", "mtsr2", 2), ("srcnn", "srgan", 2), ("stsr", "stsr", 1)],
 )
 def test_a_network_grown_from_another_computes_the_same(start, name, scale):
     torch.manual_seed(4)
@@ -118,3 +124,84 @@ def test_at_another_scale_a_compact_network_keeps_all_but_what_makes_pixels():
 def test_weights_that_do_not_fit_are_refused(start, name):
     with pytest.raises(ValueError, match=f"{name} at scale 2 cannot start from a SeedNet of"):
         grown(build(start, 2), name, 2)
+
+
+class Plain(nn.Module):
+    """A generator of one number."""
+
+    taps = 1
+
+    def __init__(self, value=0.1):
+        super().__init__()
+        self.value = nn.Parameter(torch.tensor(value))
+
+    def forward(self, window):
+        return self.value.expand(len(window), 8, 8)
+
+
+def patterns(count=6, seed=0):
+    return 0.01 + 0.3 * torch.rand(count, 8, 8, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_penalty_is_that_of_a_linear_critic():
+    # f(x) = w . x has the slope |w| everywhere: the loss is w . (false - true) + 10 (|w| - 1)^2.
+    class Linear(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = nn.Parameter(torch.full((8, 8), 0.5))
+
+        def forward(self, x):
+            return (x * self.weight).sum(dim=(1, 2))
+
+    objective = SrganObjective()
+    objective.critic = Linear()  # type: ignore[assignment]
+    false, true = patterns(seed=1), patterns(seed=2)
+    expected = 0.5 * (false - true).sum(dim=(1, 2)).mean() + 10 * (4.0 - 1) ** 2
+    assert torch.allclose(objective.critic_loss(false, true), expected, rtol=1e-4)
+
+
+def test_a_flat_critic_has_a_finite_gradient():
+    objective = SrganObjective()
+    with torch.no_grad():
+        for parameter in objective.critic.parameters():
+            parameter.zero_()
+    objective.critic_loss(patterns(seed=1), patterns(seed=2)).backward()
+    assert all(torch.isfinite(p.grad).all() for p in objective.critic.parameters() if p.grad is not None)
+
+
+def test_the_loss_is_the_error_less_a_share_of_the_critics_view():
+    truth, window, net = patterns(), torch.zeros(6, 3, 4, 4), Plain()
+    plain = SrganObjective(share=0.0).loss(net, Batch(window, truth))
+    assert torch.allclose(plain, relative_error(net(window), truth))
+    objective = SrganObjective(share=0.5)
+    size = truth.square().mean(dim=(1, 2), keepdim=True).sqrt()
+    expected = plain - 0.5 * objective.critic(net(window) / size).mean()
+    assert torch.allclose(objective.loss(net, Batch(window, truth)), expected)
+
+
+def test_network_and_critic_keep_out_of_each_others_weights():
+    objective, net = SrganObjective(), Plain()
+    critic = copy.deepcopy(objective.critic.state_dict())
+    objective.loss(net, Batch(torch.zeros(6, 3, 4, 4), patterns())).backward()
+    assert net.value.grad is not None
+    assert all(p.grad is None for p in objective.critic.parameters())
+    gradient = net.value.grad.clone()
+    objective.after_step()
+    assert torch.equal(net.value.grad, gradient)
+    assert not all(torch.equal(value, critic[name]) for name, value in objective.critic.state_dict().items())
+
+
+def test_a_run_cut_short_goes_on_as_if_it_were_not(tmp_path):
+    def train(objective, seeds):
+        for seed in seeds:
+            objective.loss(Plain(), Batch(torch.zeros(6, 3, 4, 4), patterns(seed=seed)))
+            objective.after_step()
+        return objective
+
+    whole = train(SrganObjective(seed=3), range(4))
+    torch.save(train(SrganObjective(seed=3), range(2)).state_dict(), tmp_path / "objective.pt")
+    resumed = SrganObjective(seed=8)
+    resumed.load_state_dict(torch.load(tmp_path / "objective.pt", weights_only=True))
+    train(resumed, range(2, 4))
+    ours, theirs = resumed.critic.state_dict(), whole.critic.state_dict()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)

@@ -35,8 +35,9 @@ from train.learning.training_loop import (
     train,
     wait_for_all,
 )
-from train.networks.blocks import PatternNet, pattern_loss
-from train.networks.compact import CompactNet, compact_loss
+from train.networks.blocks import Objective, PatternNet, RelativeError
+from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
 from train.networks.symmetric import read_back
 
@@ -107,7 +108,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses)
     done = train(
         net,
-        compact_loss if isinstance(net, CompactNet) else pattern_loss,
+        _objective(net, device, seed),
         batches,
         recipe,
         (resume_path := folder / f"{training.name}.resume"),
@@ -237,6 +238,12 @@ def _file_sha256(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise CheckpointError(f"{path}, to start from: {error.strerror or error}; train it first") from error
+
+
+def _objective(net: PatternNet, device: torch.device, seed: int) -> Objective:
+    if isinstance(net, CompactNet):
+        return HeteroscedasticError()
+    return SrganObjective(device, seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
 
 
 def _psnr(patterns: NDArray[np.float32], validation: FrozenSet) -> float:

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import torch
 from torch import distributed, nn
@@ -30,11 +30,10 @@ from edge.terminal.progress_bar import Progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
 from train.errors import TrainError
-from train.networks.blocks import Loss, PatternNet
+from train.networks.blocks import Objective, PatternNet
 
 Batches = Callable[[int], Batch]
 """Function from a number to its batch; the same number always gives the same batch."""
-Part = nn.Module | torch.optim.Optimizer
 Course = list[dict[str, float]]
 """Validation figures at some steps of a training."""
 
@@ -151,7 +150,7 @@ def learning_rate_share(progress: float) -> float:
 
 def train(
     net: PatternNet,
-    loss_of: Loss,
+    objective: Objective,
     batches: Batches,
     recipe: Recipe,
     resume_path: Path,
@@ -164,7 +163,7 @@ def train(
 
     Args:
         net: on any device; left in evaluation mode.
-        loss_of: loss function.
+        objective: loss function.
         batches: function from a number to its batch.
         recipe: hyperparameters.
         resume_path: file that keeps the state; the caller deletes it when the result is safe.
@@ -183,7 +182,7 @@ def train(
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     parallel = DistributedDataParallel(net) if world > 1 else net
-    parts: dict[str, Part] = {"net": net, "optimizer": optimizer}
+    parts = {"net": net, "optimizer": optimizer, "objective": objective}
     recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
     state = _restored(resume_path, parts, recipe_sha256, device)
     wait_for_all()  # the first process to finish may delete the state
@@ -199,7 +198,7 @@ def train(
                 group["lr"] = rate
             batch = next(drawn).share(rank, world, device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
-                descended = loss_of(parallel, batch)
+                descended = objective.loss(parallel, batch)
             optimizer.zero_grad()
             descended.backward()
             norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
@@ -207,6 +206,7 @@ def train(
             if not (isfinite(norm) and isfinite(loss)):
                 raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step}: lower the learning rate")
             optimizer.step()
+            objective.after_step()
             step += 1
             log.step(step, loss, rate)
             if validate and step in check_at and rank == 0:
@@ -281,7 +281,14 @@ def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
     return max(by_steps, float(by_time))
 
 
-def _restored(path: Path, parts: Mapping[str, Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
+class _Part(Protocol):
+    """Part of a run that has a state: network, optimizer, objective."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
+
+
+def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
     """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
     if not path.exists():
         return {"step": 0, "elapsed_s": 0.0, "course": []}
@@ -296,7 +303,7 @@ def _restored(path: Path, parts: Mapping[str, Part], recipe_sha256: str, device:
     return {"course": []} | state
 
 
-def _keep(path: Path, parts: Mapping[str, Part], facts: Mapping[str, Any]) -> None:
+def _keep(path: Path, parts: Mapping[str, _Part], facts: Mapping[str, Any]) -> None:
     """Keep the state of a run on disk, so that an interruption costs at most a minute."""
     state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
     write_in_place(

@@ -1,15 +1,13 @@
-"""Bases of all networks and losses; a loss is relative to each pattern's size, so light contacts count."""
+"""Bases of all networks and objectives; a loss is relative to each pattern's size, so light contacts count."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
 from train.data.press_batches import Batch
 
-Loss = Callable[[nn.Module, Batch], Tensor]
-"""Function from a network in training and a batch to a scalar."""
 _LEAST_TRUTH_MM: Final = 1e-4
 """Least RMS of a truth, in [mm]; smaller ones count as this, because a micrometre deep is no contact."""
 _LEAST_SHARE_SQUARED: Final = 1e-6
@@ -48,9 +46,30 @@ class Residual(nn.Module):
         return torch.relu(x + self.body(x))
 
 
-def pattern_loss(net: nn.Module, batch: Batch) -> Tensor:
-    """Return the loss of a network that predicts a pattern alone: the relative error."""
-    return relative_error(net(batch.window).float(), batch.pattern)
+class Objective:
+    """Loss function of a training. One with networks of its own, such as a discriminator, trains and keeps them."""
+
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
+        """Return the scalar loss of a batch."""
+        raise NotImplementedError
+
+    def after_step(self) -> None:
+        """Update the objective's own networks after the network has taken its step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all learned state."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore learned state."""
+
+
+class RelativeError(Objective):
+    """Objective of a network that predicts a pattern alone."""
+
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
+        """Return the relative error of the patterns."""
+        return relative_error(net(batch.window).float(), batch.pattern)
 
 
 def relative_error(patterns: Tensor, truth: Tensor) -> Tensor:

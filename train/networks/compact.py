@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from train.data.press_batches import Batch
-from train.networks.blocks import PatternNet, Residual, relative_rms_error, truth_size
+from train.networks.blocks import Objective, PatternNet, Residual, relative_rms_error, truth_size
 from train.networks.interval_correction import IntervalCorrection
 from train.networks.symmetric import Group, SymmetricConv2d, fields, scalars, vectors
 
@@ -248,15 +248,18 @@ class Seen(NamedTuple):
     traction: Tensor  # (n, 3, h, w) in [kPa]
 
 
-def compact_loss(net: nn.Module, batch: Batch) -> Tensor:
-    """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
-    posed = () if batch.poses is None else (batch.poses,)
-    pattern, deviation, traction = net(batch.window, batch.pad, *posed)
-    loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
-    if batch.traction is not None:
-        size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
-        loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
-    return loss
+class HeteroscedasticError(Objective):
+    """Objective of a network that predicts a pattern and its deviation: see `heteroscedastic_loss`."""
+
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
+        """Return the relative errors of patterns and tractions, and the likelihood loss of the deviations."""
+        posed = () if batch.poses is None else (batch.poses,)
+        pattern, deviation, traction = net(batch.window, batch.pad, *posed)
+        loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
+        if batch.traction is not None:
+            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
+            loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
+        return loss
 
 
 def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> Tensor:

@@ -1,25 +1,36 @@
-"""The published networks, to compare with: TactileSRCNN, STSR and MTSR-K.
+"""The published networks, to compare with: TactileSRCNN, TactileSRGAN, STSR and MTSR-K.
 
 STSR and MTSR-K: Wu and Liu 2024, Section V and Fig. 8; channels and biases follow from the parameter counts of the
 authors' code. TactileSRCNN: Wu, Liu and Zhang 2022, with three 3 x 3 convolutions before the blocks, which make the
 parameters and MACs of the later paper's table; the 2022 code has one.
+
+TactileSRGAN is TactileSRCNN trained against a discriminator. From the authors' code: a Wasserstein loss with gradient
+penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to the error.
+Chosen here: the discriminator's layers, which score patches and take any scale, without batch normalisation; and its
+input, patterns relative to their truth's size.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torch.nn import functional as F
 
-from train.networks.blocks import PatternNet, Residual
-from train.surfaces.poses import MAX_TAPS
+from train.data.press_batches import Batch
+from train.networks.blocks import Objective, PatternNet, Residual, relative_error, truth_size
 
 CHANNELS: Final = 64
 BLOCKS: Final = 6
+MAX_TAPS: Final = 7
 _MM_PER_UNIT: Final = 0.02
 """Size of an output of 1, in [mm]: the networks were made for patterns of up to 25, those here reach 0.5 mm."""
 _NORM_START: Final = 0.1
 """Initial scale and shift of batch normalisation, as in the authors' code."""
+_CRITIC_CHANNELS: Final = (32, 64, 128)
+_SLOPE: Final = 0.2
+_PENALTY: Final = 10.0
+_CRITIC_STEPS: Final = 2
+_TINY: Final = 1e-12
 
 
 class _PublishedNet(PatternNet):
@@ -114,6 +125,10 @@ class TactileSRCNN(_PublishedNet):
         return self._pattern(self.net(self._upsampled(window)))
 
 
+class TactileSRGAN(TactileSRCNN):
+    """Generator: TactileSRCNN with another training."""
+
+
 class _MultiScaleResidual(nn.Module):
     """3 x 3 and 5 x 5 paths, exchanged half-way, fused by a 1 x 1 convolution parallel to an identity path.
 
@@ -143,3 +158,87 @@ def _normed(inputs: int, outputs: int | None = None, kernel: int = 3, *, bias: b
     """Build a convolution, batch normalisation, and ReLU; the authors' blocks have a bias although it is redundant."""
     convolution = _plain(inputs, outputs, kernel, bias=bias)
     return nn.Sequential(convolution, nn.BatchNorm2d(convolution.out_channels), nn.ReLU())
+
+
+class Discriminator(nn.Module):
+    """Discriminator: a score without unit, higher for patterns that look more like true ones."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for inputs, outputs in zip((1, *_CRITIC_CHANNELS), _CRITIC_CHANNELS, strict=False):
+            layers += [_plain(inputs, outputs, bias=True), nn.LeakyReLU(_SLOPE)]
+            layers += [nn.Conv2d(outputs, outputs, 3, stride=2, padding=1), nn.LeakyReLU(_SLOPE)]
+        self.net = nn.Sequential(*layers, nn.Conv2d(_CRITIC_CHANNELS[-1], 1, 1))
+
+    def forward(self, patterns: Tensor) -> Tensor:
+        """Return the score (n,), the mean over patches of patterns (n, H, W)."""
+        return self.net(patterns[:, None]).mean(dim=(1, 2, 3))
+
+
+class SrganObjective(Objective):
+    """Error of the patterns, less a share of the score of a discriminator that is trained alongside.
+
+    Source: Gulrajani et al. 2017, Algorithm 1.
+    """
+
+    def __init__(
+        self, device: torch.device | str = "cpu", share: float = 1e-3, learning_rate: float = 1e-4, seed: int = 0
+    ) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.critic = Discriminator().to(device)
+        self._optimizer = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, betas=(0.0, 0.9))
+        self._share = share
+        self._rng = torch.Generator().manual_seed(seed)
+        self._seen: tuple[Tensor, Tensor] | None = None
+
+    def loss(self, net: nn.Module, batch: Batch) -> Tensor:
+        """Return the relative error, less a share of the discriminator's score of the patterns."""
+        patterns, truth = net(batch.window).float(), batch.pattern
+        size = truth_size(truth)
+        self._seen = (patterns.detach() / size, truth / size)
+        self.critic.requires_grad_(False)
+        return relative_error(patterns, truth) - self._share * self.critic(patterns / size).mean()
+
+    def after_step(self) -> None:
+        """Train the discriminator on the last batch of `loss`."""
+        if self._seen is None:
+            return
+        self.critic.requires_grad_(True)
+        for _ in range(_CRITIC_STEPS):
+            self._optimizer.zero_grad()
+            self.critic_loss(*self._seen).backward()
+            _average_gradients(self.critic)
+            self._optimizer.step()
+        self._seen = None
+
+    def critic_loss(self, false: Tensor, true: Tensor) -> Tensor:
+        """Return the loss of the discriminator, from patterns (n, H, W) relative to their truth's size."""
+        mix = torch.rand(len(true), 1, 1, generator=self._rng).to(true.device)
+        between = (mix * true + (1 - mix) * false).requires_grad_(True)
+        (slope,) = torch.autograd.grad(self.critic(between).sum(), between, create_graph=True)
+        steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # keeps the slope of the root finite at 0
+        penalty = (steepness - 1).square().mean()
+        return self.critic(false).mean() - self.critic(true).mean() + _PENALTY * penalty
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of the discriminator, its optimizer, and the random draws."""
+        states = {"critic": self.critic.state_dict(), "optimizer": self._optimizer.state_dict()}
+        return states | {"rng": self._rng.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state."""
+        self.critic.load_state_dict(state["critic"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self._rng.set_state(state["rng"].cpu())
+
+
+def _average_gradients(net: nn.Module) -> None:
+    """Average gradients over the processes of a run, because DDP does not support the gradient of a gradient."""
+    if not distributed.is_initialized():
+        return
+    for parameter in net.parameters():
+        if parameter.grad is not None:
+            distributed.all_reduce(parameter.grad)
+            parameter.grad /= distributed.get_world_size()

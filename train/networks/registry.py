@@ -15,8 +15,7 @@ from typing import Any, Final
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.fusion import FusionNet
-from train.networks.published import SeedNet, TactileSRCNN
-from train.surfaces.poses import MAX_TAPS
+from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRGAN
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 _WIDE: Final = {"channels": 64, "blocks": 6}
@@ -25,6 +24,7 @@ _SMALL: Final = {"channels": 32, "blocks": 4}
 
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
+    "srgan": (TactileSRGAN, {}),
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"compact-{name}": (CompactNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items()},
     **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},

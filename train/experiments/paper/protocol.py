@@ -37,8 +37,8 @@ SETS: Final = {
 }
 """Presses by the nominal pad, turned from tap to tap: of the 15 other surfaces, of those three, of random figures."""
 
-_SEED_MINUTES: Final = {"srcnn": 6.0, "stsr": 17.0}
-"""Training time of the paper's networks, in [min]: the STSR as long as the compact one."""
+_SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
+"""Training time of the paper's networks, in [min]: the STSR as long as the compact one; srgan on top of srcnn."""
 _SEED_MINUTES_MORE: Final = 4.0
 """Training time of every MTSR-K on top of the STSR, in [min]. All networks take two hours on two cores."""
 SEED_BATCH: Final = 16
@@ -105,7 +105,8 @@ def seed_size(network: str) -> Training:
         bf16=True,
         minutes=_SEED_MINUTES.get(network, _SEED_MINUTES_MORE),
     )
-    return Training(f"seed-{network}", network, recipe, start="seed-stsr" if starts else None)
+    start = {"srgan": "seed-srcnn"}.get(network, "seed-stsr" if starts else None)
+    return Training(f"seed-{network}", network, recipe, start=start)
 
 
 SEED_STSR_LONGER: Final = replace(
@@ -115,7 +116,7 @@ SEED_STSR_LONGER: Final = replace(
     start="seed-stsr",
 )
 """STSR trained on for as long as MTSR-2 is trained from it, so that the two differ by the second tap alone."""
-_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"))}
+_STARTS: Final = {start.name: start for start in (BASE, seed_size("stsr"), seed_size("srcnn"))}
 
 
 def trained(bench: Workbench, training: Training, data: PressSet, validation: FrozenSet) -> Method:

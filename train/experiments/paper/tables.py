@@ -32,6 +32,7 @@ from train.surfaces.poses import MAX_TAPS
 TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
     "bilinear": (18.10, 0.5663),
     "srcnn": (21.10, 0.7690),
+    "srgan": (21.54, 0.7876),
     "stsr": (22.45, 0.8170),
     "mtsr2": (23.80, 0.8954),
     "mtsr3": (23.73, 0.8907),
@@ -45,7 +46,7 @@ TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
 TABLE_4: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
 """Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""
 
-SEED_NETWORKS: Final = ("srcnn", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7")
+SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7")
 CLASSICAL: Final = ("bilinear", "bicubic", "linear map")
 COMPACT_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4", "mtsr7")
 COMPARED: Final = (
@@ -108,7 +109,7 @@ def _methods(
     """Yield each method with its name in the table and in the paper's; large networks are calibrated on few frames."""
     for method in classical_methods(bench, data, CLASSICAL):
         yield method.name, method.name, method
-    names = SEED_NETWORKS[1:3] if bench.quick else SEED_NETWORKS
+    names = SEED_NETWORKS[1:4] if bench.quick else SEED_NETWORKS
     networks = [(name, seed_size(name), thinned) for name in names]
     networks.append((SEED_STSR_LONGER.name.removeprefix("seed-"), SEED_STSR_LONGER, thinned))
     networks += [(f"compact {name}", compact(name), validation) for name in COMPACT_NETWORKS]
