@@ -105,7 +105,7 @@ def train(mesh: Path, out: Path, *, sequences: int, figures: int, steps: int, se
     fit([str(checkpoints), "--data", *data, *network])
     # python -m export.to_onnx ...; compares ONNX with torch. The error in it is on the frozen test set, letters and
     # shapes, so it is the network's on objects that it was not trained for.
-    export([str(checkpoints / f"{name}.pt"), "--out", str(checkpoints), "--batch", "any"])
+    export([str(checkpoints / f"{name}.pt"), "--out", str(checkpoints)])
     return checkpoints / f"{name}.onnx"
 
 

@@ -26,7 +26,7 @@ from edge.inference.contract import Contract
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import PatternCheck
 from edge.terminal.progress_bar import tracked
-from export.graphs.parity import FULL_RANGE_COUNTS, extreme_windows
+from export.parity import FULL_RANGE_COUNTS, extreme_windows
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ABSENT
@@ -40,11 +40,9 @@ from train.report import Report, Row
 SIZE: Final = 42
 CELL_MM: Final = 0.47
 INDENTATION_MM: Final = 0.3
-FAR_MM: Final = 1e3
-"""Depth outside the shape, in [mm]."""
+FAR_MM: Final = 1e3  # depth outside the shape, in [mm]
 RESIDUAL: Final = 1e-3
-WIDE: Final = 24
-"""Factor of a grid whose copies are farther away than any thickness requires."""
+WIDE: Final = 24  # factor of a grid whose copies are farther away than any thickness requires
 INT8_PRESS, INT8_BEYOND = 0.25, 1.05
 """Largest difference of int8 from float32 in any pixel, as a share of the largest value in float32: on presses, as
 `export.verify` has it, and on windows beyond any touch, where int8 saturates and the runtime believes no pattern."""
@@ -53,10 +51,8 @@ SAME: Final = 1e-5
 steps."""
 TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
 NO_TOUCH: Final = ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
-QUIET: Final = 1e-3
-"""The difference of int8 where nothing touches, as a share of full scale."""
-MOST_MM: Final = 5.0
-"""Bound of a pattern and its deviation in a record: the pad is 4.5 mm thick."""
+QUIET: Final = 1e-3  # the difference of int8 where nothing touches, as a share of full scale
+MOST_MM: Final = 5.0  # bound of a pattern and its deviation in a record: the pad is 4.5 mm thick
 THREADS: Final = 4
 TOGETHER: Final = 16
 REST: Final = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None]

@@ -1,59 +1,62 @@
-"""Checkpoints to ONNX: one file a model, fixed shapes, the contract inside, parity checked before it is written.
+"""Checkpoints to ONNX: one file a model, the contract inside, parity checked before it is written.
 
 python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr.pt --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --int8 data/gripped.npz --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
 
-With validation presses, deviations are corrected by region, so that their intervals hold; with --intervals, by window.
+A graph takes any number of windows in one run. With validation presses, deviations are corrected by region, so that
+their intervals hold; with --intervals, by window.
 """
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
+import onnx
 import torch
 
 from edge.errors import EdgeError
+from edge.evaluation.metrics import judge_model, mean_error
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
+from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust import Trust
 from edge.terminal.progress_bar import tracked
+from export.confidence import confidence_sets, judge_in_contract
 from export.errors import ExportError
-from export.graphs.graph import known_width, outputs, to_model
-from export.graphs.intervals import IntervalData
-from export.graphs.parity import check_parity
-from export.graphs.writing import Writer
-from export.quantisation.int8 import calibration_batch, convolutions, quantised
+from export.graph import outputs, to_model
+from export.int8 import calibration_batch, convolutions, quantised
+from export.parity import GraphRun, check_parity, run_network
+from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
 from train.data.paper_taps import paper_taps
 from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
-from train.learning.checkpoint import load_network
-from train.learning.expected_error_table import confidence_sets
-from train.learning.interval_fit import half_width_mm
-from train.learning.trust_limits import load_trust
+from train.learning.checkpoint import load_network, origin
+from train.learning.interval_fit import Run, conform, fit_correction, half_width_mm, readings_of_presses
 from train.networks.blocks import PatternNet
+from train.networks.compact import CompactNet
 from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
+from train.trust import load_trust
 
 OUTPUT_UNIT: Final = "mm"
-MOST_LOSS_DB: Final = 0.1
-"""Largest accepted loss by int8 on the frozen test set, in [dB]."""
+MOST_LOSS_DB: Final = 0.1  # largest accepted loss by int8 on the frozen test set, in [dB]
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
-MOST_COVERAGE_CHANGE: Final = 0.02
-"""Largest accepted change of the 90 % interval's coverage by int8."""
+MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interval's coverage by int8
 _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
-def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batch: int | str) -> Contract:
+def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
     """Return the contract of a network's graph for the pad of the test set, with its error still empty.
 
     Raises:
@@ -62,14 +65,13 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
     pad = pad_of(*frozen.newest.shape[-2:])
     example = torch.zeros(1, 3 * net.taps, pad.rows, pad.cols)
     given = outputs(net, example)
-    known = known_width(net)
     try:
         contact_level, training_sha256 = report["contact_level"], report["training_sha256"]
     except KeyError as error:
         raise CheckpointError(f"the checkpoint's .json has no {error}: train it with this release") from error
     return Contract(
         version=CONTRACT_VERSION,
-        batch=batch,
+        batch=ANY_BATCH,
         taps=net.taps,
         scale=net.scale,
         tap_order=TAP_ORDER,
@@ -88,8 +90,8 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
         training_sha256=training_sha256,
         test_set_sha256=frozen.sha256(),
         test_error={},
-        pad_inputs=tuple(input_scale()) if known else (),
-        takes_gains=bool(known),
+        pad_inputs=tuple(input_scale()) if net.known else (),
+        takes_gains=bool(net.known),
         traction_scale=given[2].shape[-1] // pad.cols if len(given) > 2 else None,
         takes_poses=net.takes_poses,
         reach_mm=REACH_MM if net.takes_poses else 0.0,
@@ -97,12 +99,23 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet, batc
     )
 
 
+@dataclass(frozen=True, slots=True)
+class IntervalData:
+    """Presses that make intervals; without those of training, corrections are by region and number of taps alone."""
+
+    validation: PressSet
+    training: PressSet | None = None
+
+    def conformed(self, net: CompactNet, run: Run) -> dict[str, list[float]]:
+        """Shift a corrected network's deviations until they hold for `run`, and return its levels; see `conform`."""
+        return conform(net, run, readings_of_presses(self.validation, net.taps, posed=net.takes_poses))
+
+
 def export(
     checkpoint: Path,
     folder: Path,
     frozen: FrozenSet,
     *,
-    batch: int | str = 1,
     calibration: PressSet | None = None,
     validation: Sequence[FrozenSet] = (),
     trust: Trust | None = None,
@@ -110,51 +123,68 @@ def export(
 ) -> str:
     """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
 
-    Parity is checked in float32, also for graphs that are then quantised.
-
-    Args:
-        checkpoint: NAME.pt of train.fit.
-        folder: of the model.
-        frozen: the test set, of the pad that the model is for.
-        batch: windows in one run, or ANY_BATCH.
-        calibration: training taps from which int8 ranges are measured; None for float32.
-        validation: sets on which confidence is fitted; without them, the contract's confidence stays empty.
-        trust: forward model and checks for the contract; None for none.
-        intervals: presses by which the intervals are corrected; None to leave them as the checkpoint has them.
+    Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
+    The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
+    and confidence is fitted on `validation`. What is None or empty is left out; without `intervals` the deviations stay
+    as the checkpoint has them.
     """
     net, report = load_network(checkpoint)
     write_out(net)
-    contract = contract_of(net, report, frozen, batch)
+    contract = contract_of(net, report, frozen)
     pad = pad_of(contract.rows, contract.cols)
-    level = contract.contact_level
-    if intervals is not None and contract.interval_factor is not None:
+    if intervals is not None and isinstance(net, CompactNet):
         report = {**report, "options": {**report["options"], "intervals": True}}
-    writer = Writer(folder, frozen, validation, report, trust)
-    if intervals is not None:
-        found = intervals.corrected(net, level)
-        net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-    traced = batch if batch == ANY_BATCH else 1  # a graph of any batch runs single windows as well
-    single = to_model(net, traced, pad)
-    parity = check_parity(net, single, frozen, contract)
-    if calibration is None:
-        model = single if batch == traced else to_model(net, batch, pad)
-        if model is not single:
-            check_parity(net, model, frozen, contract)
-        return writer.write(checkpoint.stem, model, single, contract, [f"parity {parity:.1e}"])
+        if intervals.training is None:
+            net.add_intervals().contact_level.fill_(contract.contact_level)
+        else:
+            fit_correction(net, intervals.training, contract.contact_level)
+        levels = intervals.conformed(net, lambda *given: run_network(net, *given))
+        contract = replace(contract, interval_levels=levels)
+    name, model = checkpoint.stem, to_model(net, pad)
+    facts = [f"parity {check_parity(net, model, frozen, contract):.1e}"]
+    if calibration is not None:
+        seen, in_float = calibration_batch(calibration, contract), model
+        name, model = name + INT8_SUFFIX, quantised(in_float, seen)
+        if intervals is not None and isinstance(net, CompactNet):
+            contract = replace(contract, interval_levels=intervals.conformed(net, GraphRun(model)))
+            model = quantised(to_model(net, pad), seen)
+        integer, convs = convolutions(model)
+        float_error = _error(in_float, contract, frozen)
+        contract = replace(contract, arithmetic="int8")
+        cost = _cost(float_error, _error(model, contract, frozen))
+        facts = [f"{integer} of {convs} convolutions in int8", *cost]
 
-    quantise = partial(quantised, seen=calibration_batch(calibration, contract))
-    integers = quantise(single)
-    if intervals is not None:
-        found = intervals.conformed(net, integers)
-        net, contract = found.net, replace(contract, interval_levels=found.interval_levels)
-        integers = quantise(to_model(net, traced, pad))
-    model = integers if batch == traced else quantise(to_model(net, batch, pad))
-    integer, convs = convolutions(model)
-    float_error = writer.error(single, contract)
-    contract = replace(contract, arithmetic="int8", test_error={}, confidence={})
-    cost = _cost(float_error, writer.error(integers, contract))
-    facts = [f"{integer} of {convs} convolutions in int8", *cost]
-    return writer.write(checkpoint.stem + INT8_SUFFIX, model, integers, contract, facts)
+    session = _session(model, contract)
+    facts = [*judge_in_contract(session, frozen, validation), *facts]
+    contract = session.contract
+    # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
+    checkable = contract.taps == 1 or contract.takes_poses
+    if trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
+        contract.trust.update(trust.to_json())
+    content = _content(model, contract, origin(report))
+    Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
+    write_in_place(folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
+    return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join(facts)}"
+
+
+def _error(model: onnx.ModelProto, contract: Contract, frozen: FrozenSet) -> dict[str, float]:
+    """Return the mean errors of a graph with all taps; empty if the test set is of another scale."""
+    return mean_error(judge_model(_session(model, contract), frozen)) if contract.scale == frozen.scale else {}
+
+
+def _session(model: onnx.ModelProto, contract: Contract) -> ModelSession:
+    with tempfile.TemporaryDirectory() as drafts:
+        draft = Path(drafts) / "draft.onnx"
+        draft.write_bytes(_content(model, contract))
+        return ModelSession(draft)
+
+
+def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, str] = MappingProxyType({})) -> bytes:
+    """Return a file's content, the same for the same model, contract and further metadata."""
+    del model.metadata_props[:]
+    for key, value in {**contract.to_metadata(), **stated}.items():
+        model.metadata_props.add(key=key, value=value)
+    return model.SerializeToString(deterministic=True)
 
 
 def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
@@ -170,17 +200,12 @@ def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> li
     return facts
 
 
-def _batch(text: str) -> int | str:
-    return text if text == ANY_BATCH else int(text)
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.to_onnx", description=(__doc__ or "").splitlines()[0])
     add = parser.add_argument
     add("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
     add("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
-    add("--batch", type=_batch, default=1, help=f"windows in one run (default: 1), or '{ANY_BATCH}' number of them")
     help_of_intervals = "training presses on which intervals are fitted"
     add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
     add("--trust", type=Path, metavar="FILE", help="checks of train.trust, with --validation, or those of a model")
@@ -209,7 +234,6 @@ def main(arguments: list[str] | None = None) -> None:
                 checkpoint,
                 options.out,
                 frozen,
-                batch=options.batch,
                 calibration=taps,
                 validation=validation,
                 trust=trust,

@@ -4,13 +4,13 @@ python -m export.verify edge/models/*.onnx
 
 Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings if available,
 and on extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network from which they were
-quantised. That network is restored from the float32 graph's own weights, or loaded from a checkpoint.
+quantised. That network is restored from the float32 graph's own weights.
 """
 
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,8 +29,7 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import Progress
 from export.errors import ExportError, ParityError
-from export.graphs.graph import contract_in, in_float, outputs
-from export.graphs.parity import (
+from export.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
     TOLERANCE,
@@ -40,16 +39,15 @@ from export.graphs.parity import (
     differences,
     extreme_windows,
     read_windows,
+    run_network,
 )
 from export.to_onnx import MOST_LOSS_DB
 from firmware_bridge.pad_geometry import AXES
 from train.data.real_grips import recorded_sets
 from train.errors import CheckpointError, TrainError
-from train.learning.checkpoint import load_network
+from train.learning.checkpoint import network_of, origin_of
 from train.networks.blocks import PatternNet
-from train.networks.graph_weights import network_of, origin_of
 
-_TORCH_BATCH: Final = 128
 _SCANS_APART: Final = 20
 BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.05)}
 """Largest relative difference from the network, in any pixel: on readings, and on windows beyond any touch.
@@ -58,8 +56,7 @@ Beyond any touch int8 saturates: it is off by the value itself, and the runtime 
 """
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "one tap", "recordings")
-PASSES: Final = 1 + len(LEVELS)
-"""Passes over all windows of a model: by torch, and at each level."""
+PASSES: Final = 1 + len(LEVELS)  # passes over all windows of a model: by torch, and at each level
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +84,13 @@ COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR chan
 def verify(
     path: Path,
     frozen: FrozenSet,
-    checkpoints: Path | None = None,
     recordings: Path | None = None,
     *,
     on_pass: Callable[[], object] = lambda: None,
 ) -> Iterator[Parity]:
     """Compare one model with its network at every level, on every kind of windows; `on_pass` is called PASSES times.
 
-    Without `checkpoints`, the folder of NAME.pt, the network is restored from NAME.onnx, that of NAME-int8.onnx too.
+    The network is restored from NAME.onnx, that of NAME-int8.onnx too.
     A model of another scale than the test set's is compared with its network, but not evaluated.
 
     Raises:
@@ -103,8 +99,8 @@ def verify(
     """
     model = _load(path)
     try:
-        contract = contract_in(model)
-        net = _network(path, model, contract, checkpoints)
+        contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+        net = _network(path, model, contract)
     except (ModelError, ExportError, CheckpointError) as error:
         raise type(error)(f"{path}: {error}") from error
     groups: dict[str, NDArray[np.float32]] = {"test set": read_windows(frozen, contract, None)}
@@ -113,7 +109,7 @@ def verify(
     if contract.takes_poses:
         groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
-    expected = {name: _run_torch(net, windows) for name, windows in groups.items()}
+    expected = {name: run_network(net, windows) for name, windows in groups.items()}
     on_pass()
     truth = frozen.patterns() if contract.scale == frozen.scale else None
     for level in LEVELS:
@@ -169,23 +165,15 @@ def _judge(
     return found, change_db, broken
 
 
-def _network(path: Path, model: onnx.ModelProto, contract: Contract, checkpoints: Path | None) -> PatternNet:
-    """Return a model's network, whose name and training hash must match."""
-    made = origin_of(model)["training_sha256"]
-    if checkpoints is not None:
-        source = checkpoints / f"{path.stem.removesuffix(INT8_SUFFIX)}.pt"
-        net, report = load_network(source)
-        trained = report.get("training_sha256")
-    else:
-        source = in_float(path)
-        if not source.exists():
-            raise ExportError(
-                f"the float32 model {source.name} is not in the folder of its int8 model: put it there, or name the "
-                "folder of its checkpoint with --checkpoints"
-            )
-        graph = _load(source)
-        net, trained = network_of(graph), origin_of(graph)["training_sha256"]
-    if trained != made or (net.taps, net.scale) != (contract.taps, contract.scale):
+def _network(path: Path, model: onnx.ModelProto, contract: Contract) -> PatternNet:
+    """Return a model's network, whose training hash must match."""
+    source = path.with_stem(path.stem.removesuffix(INT8_SUFFIX))
+    if not source.exists():
+        raise ExportError(f"the float32 model {source.name} is not in the folder of its int8 model: put it there")
+    graph = _load(source)
+    net = network_of(graph)
+    trained_alike = origin_of(graph)["training_sha256"] == origin_of(model)["training_sha256"]
+    if not trained_alike or (net.taps, net.scale) != (contract.taps, contract.scale):
         raise ExportError(f"{source} is of another training than the model: export the model again from it")
     return net
 
@@ -197,11 +185,6 @@ def _load(path: Path) -> onnx.ModelProto:
         raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
     except DecodeError as error:
         raise ModelError(f"{path}: not an ONNX model") from error
-
-
-def _run_torch(net: PatternNet, windows: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-    parts = [outputs(net, part) for part in torch.from_numpy(windows).split(_TORCH_BATCH)]
-    return [torch.cat(maps).numpy() for maps in zip(*parts, strict=True)]
 
 
 def table(rows: list[Parity]) -> str:
@@ -231,27 +214,20 @@ def _worst(rows: list[Parity]) -> list[Parity]:
     return kept
 
 
-def main(arguments: list[str] | None = None, environment: Mapping[str, str] = os.environ) -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
-    parser.add_argument("--checkpoints", type=Path, help="folder of NAME.pt (default: the graphs' own weights)")
-    folder = environment.get("TACTILE_RECORDINGS")
-    parser.add_argument(
-        "--recordings",
-        type=Path,
-        default=Path(folder) if folder else None,
-        help="folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)",
-    )
+    recordings = os.environ.get("TACTILE_RECORDINGS") or None
+    help_of_recordings = "folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)"
+    parser.add_argument("--recordings", type=Path, default=recordings, help=help_of_recordings)
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
     try:
         frozen = load_frozen_set(FROZEN)
         with Progress("verifying", len(options.models) * PASSES, "pass") as bar:
             rows = [
-                row
-                for path in options.models
-                for row in verify(path, frozen, options.checkpoints, options.recordings, on_pass=bar.advance)
+                row for path in options.models for row in verify(path, frozen, options.recordings, on_pass=bar.advance)
             ]
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")

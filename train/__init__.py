@@ -1,4 +1,4 @@
-"""The simulated sensor, its truth, and the networks trained on both. This package imports no ONNX."""
+"""The simulated sensor, its truth, and the networks trained on both."""
 
 from firmware_bridge.extras import need
 

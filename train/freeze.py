@@ -26,6 +26,7 @@ from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.demo import demo_recording
 from train.errors import TrainError
+from train.networks.symmetric import moved_scans
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances, apply_nuisances
 
@@ -89,10 +90,8 @@ def fit_classical(taps: PressSet, windows: int = CLASSICAL_WINDOWS) -> dict[str,
 
 def fit_taxels(taps: PressSet, windows: int = 2 * CLASSICAL_WINDOWS) -> dict[str, NDArray]:
     """Return covariances (kinds, 48, 48) of healthy taxels' readings, all x first, with the pad in all four turns."""
-    turned = [drawn(taps, windows)[0]]
-    while len(turned) < 4:
-        turned.append(quarter_turned(turned[-1]))
-    return {"covariances": fit_kinds(np.concatenate(turned))}
+    newest = drawn(taps, windows)[0]
+    return {"covariances": fit_kinds(np.concatenate([moved_scans(newest, turns) for turns in range(4)]))}
 
 
 def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.float32]:
@@ -123,12 +122,6 @@ def drawn(taps: PressSet, windows: int) -> tuple[NDArray[np.float32], NDArray[np
     index = np.random.default_rng(SEED).permutation(len(taps))[np.arange(windows) % len(taps)]
     newest = taps.with_taps(1).pick(index)
     return read_presses(newest, Nuisances(), SEED)[:, 0], newest.patterns.astype(np.float32)
-
-
-def quarter_turned(readings: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the same contacts on a pad turned clockwise: maps (n, 3, rows, cols) turn, and the shear with them."""
-    x, y, z = np.moveaxis(np.rot90(readings, 1, axes=(-2, -1)), -3, 0)
-    return np.stack([y, -x, z], axis=-3)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -7,18 +7,66 @@
 
 import argparse
 import json
+import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import onnx
+from google.protobuf.message import DecodeError
 
+from edge.errors import ModelError
+from edge.inference.contract import Contract
+from edge.inference.forward_model import ForwardModel, condensed, features, forward_model
+from edge.inference.small_network import small_network
+from edge.inference.trust import QUIET_UNITS, Trust
 from firmware_bridge.in_place import write_in_place
+from firmware_bridge.pad_geometry import AXES
+from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet, join_presses, load_presses
-from train.errors import DatasetError, TrainError
-from train.learning.contact_check import fit_contact_network
-from train.learning.tap_checks import fit_tap_network
-from train.learning.trust_limits import fit_forward_model
+from train.errors import CheckpointError, DatasetError, TrainError
+from train.learning.checks import contact_check, fit_contact_network, fit_tap_network, tap_check
+from train.physics.pad_draws import INPUTS, input_scale
+from train.physics.sensor_noise import Nuisances
+
+UNFAMILIAR: Final = 0.005
+"""Share of simulated contacts whose readings are said to be those of no contact."""
+FOREIGN: Final = 0.01
+"""Share of earlier taps that are dropped although they belong."""
+_RIDGE: Final = 1e-6
+
+
+def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
+    """Return the forward model and checks of a file of this command, or those of NAME.onnx with their limits.
+
+    Limits of the file's are set by `validation`, presses of several taps on pads of their own.
+
+    Raises:
+        CheckpointError: absent or damaged, or without presses to set limits by.
+    """
+    try:
+        if path.suffix == ".onnx":
+            return _trust_of(onnx.load(path, load_external_data=False))
+        fitted = json.loads(path.read_text())
+        forward = forward_model(fitted["forward"], len(INPUTS))
+        contact, tap = (small_network(fitted[name]) for name in ("contact", "tap"))
+    except (OSError, ValueError, KeyError, TypeError, DecodeError, ModelError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise CheckpointError(f"{path}: {reason}; make it with 'python -m train.trust {path} --data ...'") from error
+    if validation is None:
+        raise CheckpointError(f"{path}: its limits are set by presses: give --validation, or a model that has checks")
+    return Trust(forward, contact_check(contact, validation, UNFAMILIAR), tap_check(tap, validation, FOREIGN))
+
+
+def _trust_of(model: onnx.ModelProto) -> Trust:
+    contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
+    trust = contract.read_trust()
+    if trust is None:
+        raise ValueError("this model has no checks")
+    if (contract.pad_inputs, contract.counts_per_unit) != (tuple(input_scale()), COUNTS_PER_UNIT):
+        raise ValueError("this model has other inputs than a network of this release")
+    return trust
 
 
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
@@ -36,6 +84,33 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
         "tap": fit_tap_network(several, seed, max(20_000 // shorten, 1)).to_json(),
         "data_sha256": presses.sha256(),
     }
+
+
+def fit_forward_model(presses: PressSet) -> ForwardModel:
+    """Fit the operator to the newest press of each sequence, read without nuisances, by least squares.
+
+    Errors are relative to the amplitude. The noise is the deviation of x, y, z from drift, the earth's field and noise.
+    """
+    unit = np.array(COUNTS_PER_UNIT)
+    clean = (presses.counts[:, 0] / unit[:, None, None]).reshape(len(presses), -1)
+    z = clean.reshape(len(clean), len(AXES), -1)[:, AXES.index("z")]
+    size = np.sqrt((z**2).mean(axis=1))[:, None] + QUIET_UNITS
+    maps = zip(presses.patterns.astype(np.float32), presses.traction_kpa.astype(np.float32), strict=True)
+    inputs = condensed(np.stack([features(*one) for one in maps])) / size
+    constants = presses.constants.astype(np.float64)
+    columns = np.concatenate([inputs, *(inputs * constants[:, [number]] for number in range(len(INPUTS)))], axis=1)
+    normal = columns.T @ columns
+    normal += _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    weights = np.linalg.solve(normal, columns.T @ (clean / size))
+    operator = weights.reshape(1 + len(INPUTS), inputs.shape[1], -1).transpose(0, 2, 1)
+    left = (clean / size - columns @ weights).reshape(len(presses), len(AXES), -1)
+    usual = Nuisances()
+    drift = usual.thermal_drift_counts * np.array([1 / 8, 1 / 8, 1.0])
+    field = usual.earth_field_counts * math.sqrt(2 / 3)
+    noise = np.sqrt(drift**2 + field**2 + usual.noise_counts**2) / unit
+    model_error = np.sqrt(np.mean(left**2, axis=(0, 2)))
+    found = ForwardModel(operator.astype(np.float32), noise.astype(np.float32), model_error.astype(np.float32))
+    return forward_model(found.to_json(), len(INPUTS))  # as the contract holds it
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -83,7 +83,7 @@ class ModelSession:
             if self.contract.batch not in (1, ANY_BATCH):
                 raise ModelError(
                     f"contract key 'batch' is {self.contract.batch}, but here the number of windows changes from run "
-                    "to run: export it with --batch any"
+                    "to run: export it again"
                 )
             _check_tensors("input", self._session.get_inputs(), self.contract.input_shapes)
             _check_tensors("output", self._session.get_outputs(), self.contract.output_shapes)

@@ -24,17 +24,14 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
-from export.errors import ExportError, ParityError
-from export.graphs.graph import to_model
-from export.graphs.parity import GraphRun, differences, read_windows
+from export.errors import ParityError
+from export.parity import GraphRun, differences, read_windows
 from export.to_onnx import export, main
 from train.errors import CheckpointError
-from train.learning.checkpoint import infer, load_network
+from train.learning.checkpoint import infer, load_network, network_of, origin_of
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
-from train.networks.graph_weights import network_of, origin_of
 from train.networks.registry import build
-from train.networks.symmetric import write_out
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +53,7 @@ def session(folder):
 def traced(folder, monkeypatch):
     """The exported graph in place of one that is traced again, which takes seconds."""
 
-    def to_model(net, batch=1, pad=None):
+    def to_model(net, pad):
         model = onnx.load(folder / "plain" / "sure.onnx")
         del model.metadata_props[:]
         return model
@@ -153,7 +150,7 @@ def test_a_model_is_replaced_by_one_that_loads_and_stays_as_bak(folder, frozen, 
     path.write_bytes(b"the one before")
     refused = ModelError("it does not load")
     with monkeypatch.context() as unloadable, pytest.raises(ModelError, match="it does not load"):
-        unloadable.setattr("export.graphs.writing.load_session", lambda draft: (_ for _ in ()).throw(refused))
+        unloadable.setattr("export.to_onnx.load_session", lambda draft: (_ for _ in ()).throw(refused))
         export(folder / "sure.pt", tmp_path, frozen)
     assert path.read_bytes() == b"the one before" and [one.name for one in tmp_path.iterdir()] == ["sure.onnx"]
     export(folder / "sure.pt", tmp_path, frozen)
@@ -168,7 +165,7 @@ def test_a_graph_that_computes_something_else_is_not_written(folder, frozen, tmp
     for weight in model.graph.initializer:
         if weight.name.startswith(head) and weight.name.endswith(".bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) * np.float32(factor), weight.name))
-    monkeypatch.setattr(to_onnx, "to_model", lambda net, batch, pad: model)
+    monkeypatch.setattr(to_onnx, "to_model", lambda net, pad: model)
     output = {"leave": "pattern", "uncertainty": "deviation", "traction": "traction"}[head]
     with pytest.raises(ParityError, match=f"differ by .* in the {output}"):
         export(folder / "sure.pt", tmp_path, frozen)
@@ -181,20 +178,6 @@ def test_any_batch_is_one_run_of_many_windows(folder, frozen):
     windows = [session.contract.scale_window(window) for window in frozen.windows(2)[:3]]
     together = session.run_together(windows).copy()
     np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.night
-def test_a_fixed_batch_is_filled_and_cut(folder, session, frozen, tmp_path):
-    windows = read_windows(frozen, session.contract)[:7]
-    export(folder / "sure.pt", tmp_path, frozen, batch=3)
-    graphs = (GraphRun(onnx.load(place / "sure.onnx")) for place in (tmp_path, folder / "plain"))
-    for together, alone in zip(*(run(windows) for run in graphs), strict=True):
-        np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
-
-
-def test_a_batch_of_none_is_refused(folder):
-    with pytest.raises(ExportError, match="a batch of 0 asked for"):
-        to_model(write_out(load_network(folder / "sure.pt")[0]), batch=0)
 
 
 def test_a_published_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path_factory):

@@ -11,11 +11,11 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.onnx_session import ModelSession
 from export.to_onnx import export
 from export.verify import verify
-from train.learning.trust_limits import load_trust
-from train.networks.graph_weights import network_of
+from train.learning.checkpoint import network_of
 from train.networks.registry import build
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import REACH_MM
+from train.trust import load_trust
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_absent_taps_are_left_out(folder):
 
 @pytest.mark.night
 def test_in_integers_it_is_near_the_float(folder, tmp_path):
-    export(folder / "fused.pt", tmp_path, some_frames(), batch=ANY_BATCH, calibration=POSED_PRESSES)
+    export(folder / "fused.pt", tmp_path, some_frames(), calibration=POSED_PRESSES)
     integers, session = ModelSession(tmp_path / f"fused{INT8_SUFFIX}.onnx"), ModelSession(folder / "fused.onnx")
     for window, pose in zip(*windows_and_poses(), strict=True):
         pattern = session.run(window, poses=pose)
@@ -107,6 +107,6 @@ def test_checks_go_to_models_whose_taps_can_be_checked(folder, tmp_path):
     trust = load_trust(find_model("stsr-int8"))
     net = build("compact-mtsr4", 10, **OPTIONS)
     by_channels = save_checkpoint(tmp_path / "rows.pt", net, "compact-mtsr4", **OPTIONS)
-    export(by_channels, tmp_path, some_frames(), batch=ANY_BATCH, trust=trust)
+    export(by_channels, tmp_path, some_frames(), trust=trust)
     for path, checked in ((folder / "fused.onnx", True), (tmp_path / "rows.onnx", False)):
         assert (ModelSession(path).contract.read_trust() is not None) is checked

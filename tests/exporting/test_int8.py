@@ -10,8 +10,7 @@ from onnx import numpy_helper
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from export.errors import ExportError
-from export.quantisation.int8 import calibration_batch, convolutions, quantised
-from export.quantisation.integer_nodes import integer_nodes
+from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
 from train.data.press_batches import Batch
 
 

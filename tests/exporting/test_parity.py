@@ -16,7 +16,7 @@ from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from export import verify as verify_module
 from export.errors import ParityError
-from export.graphs.parity import (
+from export.parity import (
     LEVELS,
     GraphRun,
     accepted,
@@ -24,11 +24,10 @@ from export.graphs.parity import (
     extreme_windows,
     read_windows,
 )
-from export.quantisation.int8 import convolutions
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import PASSES, Parity, main, table, verify
 from train.errors import CheckpointError
-from train.networks.graph_weights import network_of
+from train.learning.checkpoint import network_of
 
 MODELS = [path.stem for path in bundled_models()]
 IN_FLOAT = [name for name in MODELS if not name.endswith("-int8")]
@@ -95,17 +94,6 @@ def test_on_the_whole_set_as_well(name):
     assert [row for row in rows(name, 1) if row.broken] == []
 
 
-@pytest.mark.parametrize("name", IN_INTEGERS)
-def test_most_convolutions_run_in_integers(name):
-    model, _ = graph_of(name)
-    integer, every = convolutions(model)
-    # Of the largest grid: all but the three that give the outputs.
-    # Of the network with poses what encodes earlier taps as well, and those of its graph of one tap.
-    assert (integer, every) == {"stsr-small-int8": (10, 22), "mtsr-int8": (18, 36)}.get(name, (14, 26))
-    assert convolutions(graph_of(name.removesuffix("-int8"))[0])[0] == 0
-    assert {output.type.tensor_type.elem_type for output in model.graph.output} == {onnx.TensorProto.FLOAT}
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_another_runtime_computes_the_same(name):
     """A model is portable only if two runtimes agree."""
@@ -158,7 +146,7 @@ def test_the_network_is_made_again_from_its_graph(name):
 def test_a_graph_without_its_weights_asks_for_the_checkpoint():
     model, _ = graph_of("stsr")
     model.graph.initializer[0].name = "folded"
-    with pytest.raises(CheckpointError, match=r"does not hold .* name its checkpoint"):
+    with pytest.raises(CheckpointError, match=r"does not hold .* only its checkpoint does"):
         network_of(model)
 
 

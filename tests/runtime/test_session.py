@@ -139,7 +139,7 @@ def test_one_thread_sequential_without_spinning():
             {"metadata": make_posed_contract(taps=4, batch=1).to_metadata()},
             r"states window .*\[1, 'taps', 3, 4, 4\], poses tensor\(float\) \[1, 'taps', 5\]",
         ),
-        ({"contract": make_contract(batch=3)}, r"'batch' is 3, .*: export it with --batch any"),
+        ({"contract": make_contract(batch=3)}, r"'batch' is 3, .*: export it again"),
         ({"metadata": {}}, r"graph\.onnx: contract key 'version' is missing"),
     ],
 )

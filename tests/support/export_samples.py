@@ -12,10 +12,8 @@ from press_samples import make_press_set
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import find_model
-from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
-from export.graphs.intervals import IntervalData
-from export.to_onnx import export
+from export.to_onnx import IntervalData, export
 from train.data.frozen_presses import freeze_presses
 from train.data.presses import PressSet
 from train.learning import interval_fit
@@ -55,7 +53,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory, make: Callable[[Path], o
 
 
 def small_models(folder: Path) -> None:
-    """Write sure.pt, sure.onnx with intervals, for any batch, and plain/sure.onnx without, for one window."""
+    """Write sure.pt, sure.onnx with intervals, and plain/sure.onnx without."""
     fit_network(SURE, PRESSES, some_frames(), folder)
     net, _ = load_network(folder / "sure.pt")
     with torch.no_grad():
@@ -70,14 +68,13 @@ def small_models(folder: Path) -> None:
 
 
 def export_with_intervals(checkpoint: Path, folder: Path, calibration: PressSet | None = None) -> None:
-    """Write NAME.onnx, or NAME-int8.onnx, for any batch."""
+    """Write NAME.onnx, or NAME-int8.onnx."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_fit, "_STEPS", 50)
         export(
             checkpoint,
             folder,
             some_frames(),
-            batch=ANY_BATCH,
             validation=[some_frames(2)],
             intervals=IntervalData(PRESSES, PRESSES),
             calibration=calibration,
@@ -121,4 +118,4 @@ def posed_models(folder: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_fit, "_STEPS", 50)
         intervals = IntervalData(POSED_PRESSES, POSED_PRESSES)
-        export(folder / "fused.pt", folder, some_frames(), batch=ANY_BATCH, intervals=intervals, trust=trust)
+        export(folder / "fused.pt", folder, some_frames(), intervals=intervals, trust=trust)

@@ -29,7 +29,8 @@ def mixture():
 def contacts(mixture, count, gains, constants, seed):
     rng = np.random.default_rng(seed)
     kind = rng.choice(2, count, p=mixture.share)
-    drawn = np.stack([rng.multivariate_normal(mixture.centres(constants)[k], mixture.covariances[k]) for k in kind])
+    centres = np.append(1.0, constants) @ mixture.means
+    drawn = np.stack([rng.multivariate_normal(centres[k], mixture.covariances[k]) for k in kind])
     drawn /= np.sqrt((drawn[:, Z] ** 2).mean(axis=1, keepdims=True))
     return (drawn * gains * rng.uniform(400, 700, (count, 1))).reshape(count, 3, 4, 4).astype(np.float32)
 

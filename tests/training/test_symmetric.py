@@ -16,7 +16,7 @@ from train.networks.symmetric import (
     write_out,
 )
 
-GROUPS = {"p1": 1, "p4": 4, "p4m": 8}
+GROUPS = {"p2": 2, "p4": 4, "p4m": 8}
 TOLERANCE = 1e-5
 
 
@@ -52,7 +52,7 @@ def layer_kinds(group):
 
 
 @pytest.mark.parametrize("kernel", [1, 3, 5])
-@pytest.mark.parametrize("kind", layer_kinds("p1"))
+@pytest.mark.parametrize("kind", layer_kinds("p2"))
 @pytest.mark.parametrize("group", GROUPS)
 def test_a_convolution_keeps_every_symmetry(group, kind, kernel):
     torch.manual_seed(0)
@@ -79,7 +79,7 @@ def test_what_points_to_the_right_points_up_after_a_quarter_turn_and_to_the_left
     assert (turned[0, 2] == 0.5).all() and (mirrored[0, 2] == 0.5).all()
 
 
-@pytest.mark.parametrize(("taps", "group"), [(1, "p4m"), (1, "p4"), (4, "p4"), (2, "p1")])
+@pytest.mark.parametrize(("taps", "group"), [(1, "p4m"), (1, "p4"), (4, "p4"), (2, "p2")])
 def test_the_whole_network_keeps_every_symmetry(taps, group):
     """Pattern and deviation move as they are, the traction's vectors turn, for any input about the pad."""
     torch.manual_seed(0)
@@ -141,4 +141,4 @@ def test_assigning_takes_the_nearest_symmetric_kernel(group):
         layer.assign(*before)
         torch.testing.assert_close(layer.weight, before[0])
         torch.testing.assert_close(layer.bias, before[1])
-        assert (torch.equal(layer.weight, weight)) == (group == "p1")
+        assert not torch.equal(layer.weight, weight)

@@ -10,8 +10,7 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
-from train.learning import tap_checks
-from train.learning.tap_checks import fit_tap_network, pair_features, relative, tap_check
+from train.learning.checks import fit_tap_network, pair_features, relative, strong_taps, tap_check
 
 TAPS = 4
 WIDE_MM = 4.0
@@ -52,7 +51,7 @@ def shares_caught(network, presses, spoil):
     """Return the share of earlier taps that a check at a share of false alarms catches, after `spoil` of a pair."""
     check = tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
     rng = np.random.default_rng(5)
-    readings, poses = tap_checks._strong(presses, 5)
+    readings, poses = strong_taps(presses, 5)
     pose = poses[:, 1]
     stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), (0.2, 1.0))
     pair, stated = spoil(readings[:, :2], stated)

@@ -15,21 +15,24 @@ from edge.inference.small_network import small_network
 from train import trust
 from train.data.press_batches import network_input, stated_poses
 from train.errors import CheckpointError, DatasetError
-from train.learning import contact_check, tap_checks
-from train.learning.contact_check import (
+from train.learning.checks import (
     SPOILINGS,
+    contact_check,
     drawn_readings,
     features_of,
     fit_classifier,
     in_contact,
     magnet_field,
     moved,
+    pair_features,
     spoiled,
+    strong_taps,
+    tap_check,
 )
-from train.learning.trust_limits import fit_forward_model, load_trust
 from train.networks.compact import CompactNet
 from train.networks.symmetric import symmetries
 from train.physics.pad_draws import INPUTS, input_scale
+from train.trust import fit_forward_model, fit_trust, load_trust
 
 SHORTEN = 1000
 
@@ -54,27 +57,24 @@ def path(presses, tmp_path_factory) -> Path:
 
 
 class TestWrongReadings:
-    @pytest.mark.parametrize("name", SPOILINGS)
-    def test_a_fault_changes_readings_and_leaves_those_it_was_given(self, name):
+    @pytest.mark.parametrize("spoil", SPOILINGS)
+    def test_a_fault_changes_readings_and_leaves_those_it_was_given(self, spoil):
         counts = readings()
         kept = counts.copy()
-        wrong = SPOILINGS[name](np.random.default_rng(1), counts)
-        assert np.array_equal(counts, kept) and wrong is not counts and not np.shares_memory(wrong, counts)
+        wrong = spoil(np.random.default_rng(1), counts)
+        assert np.array_equal(counts, kept) and not np.shares_memory(wrong, counts)
         assert wrong.shape == counts.shape and np.isfinite(wrong).all()
-        changed = (wrong != counts).any(axis=(1, 2, 3))
-        assert changed.mean() > 0.5
-        again = SPOILINGS[name](np.random.default_rng(1), counts)
-        assert np.array_equal(again, wrong)
+        assert (wrong != counts).any(axis=(1, 2, 3)).mean() > 0.5
+        assert np.array_equal(spoil(np.random.default_rng(1), counts), wrong)
 
-    def test_all_faults_occur_each_with_its_name(self):
+    def test_every_reading_gets_a_fault(self):
         counts = readings(90)
         kept = counts.copy()
-        wrong, names = spoiled(np.random.default_rng(0), counts)
+        wrong = spoiled(np.random.default_rng(0), counts)
         assert np.array_equal(counts, kept) and not np.shares_memory(wrong, counts)
-        assert {name: int((names == name).sum()) for name in SPOILINGS} == dict.fromkeys(SPOILINGS, 10)
-        turned = names == "axes turned"
-        assert np.array_equal(np.abs(wrong[turned]), np.abs(counts[turned]))
-        assert not np.array_equal(np.abs(wrong[~turned]), np.abs(counts[~turned]))
+        changed = (wrong != counts).any(axis=(1, 2, 3))
+        axes_turned = changed & (np.abs(wrong) == np.abs(counts)).all(axis=(1, 2, 3))
+        assert changed.mean() > 0.9 and axes_turned.sum() == 90 / len(SPOILINGS)
 
     def test_a_far_magnet_has_no_curl_on_the_pad(self):
         """Without currents, x changes along y as y does along x."""
@@ -99,19 +99,6 @@ class TestMoved:
         )
         assert agrees.any(axis=1).all() and agrees.any(axis=0).all()
         assert np.abs(plain[0] - plain[0].T).max() > 0.01  # moves can be told apart
-
-    def test_a_sequence_moves_as_a_whole_and_turns_alone_do_not_mirror(self):
-        windows = np.repeat(readings(64)[:, None], 3, axis=1)
-        kept = windows.copy()
-        found = moved(np.random.default_rng(3), windows, mirror=False)
-        assert np.array_equal(windows, kept)
-        assert np.array_equal(found[:, 0], found[:, 1]) and np.array_equal(found[:, 0], found[:, 2])
-        z = windows[:, 0, 2]
-        turns = [
-            np.array([np.array_equal(a, np.rot90(b, k)) for a, b in zip(found[:, 0, 2], z, strict=True)])
-            for k in range(4)
-        ]
-        assert np.logical_or.reduce(turns).all() and all(one.any() for one in turns)
 
 
 class TestClassifier:
@@ -156,7 +143,7 @@ class TestFile:
         assert load_trust(model).to_json() == loaded.to_json()
         with pytest.raises(CheckpointError, match="its limits are set by presses: give --validation"):
             load_trust(path)
-        again = trust.fit_trust(presses, seed=1, shorten=SHORTEN)
+        again = fit_trust(presses, seed=1, shorten=SHORTEN)
         assert again == fitted
 
     @pytest.mark.parametrize(
@@ -177,7 +164,7 @@ class TestFile:
 
     def test_presses_of_one_tap_cannot_tell_taps_apart(self):
         with pytest.raises(DatasetError, match="no sequences of several taps"):
-            trust.fit_trust(make_press_set(taps=1), seed=1, shorten=SHORTEN)
+            fit_trust(make_press_set(taps=1), seed=1, shorten=SHORTEN)
 
     def test_the_command_ends_in_a_line_without_its_data(self, tmp_path):
         with pytest.raises(SystemExit, match=r"trust: .*none\.npz"):
@@ -189,7 +176,7 @@ class TestLimits:
     @pytest.mark.parametrize("share", [0.02, 0.2])
     def test_contacts_exceed_theirs_by_the_share(self, path, presses, share):
         network = small_network(json.loads(path.read_text())["contact"])
-        check = contact_check.contact_check(network, presses, share, seed=5)
+        check = contact_check(network, presses, share, seed=5)
         counts, pads = drawn_readings(presses, 5)
         met = in_contact(counts)
         scores = np.array(network(features_of(counts[met], pads[met])))
@@ -198,10 +185,10 @@ class TestLimits:
     @pytest.mark.parametrize("share", [0.02, 0.2])
     def test_taps_exceed_theirs_by_the_share(self, path, presses, share):
         network = small_network(json.loads(path.read_text())["tap"])
-        check = tap_checks.tap_check(network, presses, share, seed=5)
-        readings, poses = tap_checks._strong(presses, 5)
+        check = tap_check(network, presses, share, seed=5)
+        readings, poses = strong_taps(presses, 5)
         pairs = [
-            tap_checks.pair_features(
+            pair_features(
                 readings[:, [0, earlier]],
                 stated_poses(np.random.default_rng(8), poses[:, [0, earlier]], (0.2, 1.0)),
             )

@@ -1,10 +1,13 @@
-"""Training of one network from its data to its checkpoint: NAME.pt (weights) with NAME.json (settings, figures)."""
+"""Training of one network from its data to its checkpoint: NAME.pt (weights) with NAME.json (settings, figures).
+
+A float32 ONNX graph is read like a checkpoint: it holds its network's weights, and its metadata say which one that is.
+"""
 
 import copy
 import hashlib
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +16,7 @@ import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
+from onnx import numpy_helper
 
 from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
@@ -33,13 +37,15 @@ from train.learning.training_loop import (
 )
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.networks.graph_weights import network_of, origin_of
 from train.networks.published import SrganObjective, TactileSRGAN
 from train.networks.registry import build, grown
+from train.networks.symmetric import read_back
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
 _INFERRED_AT_ONCE: Final = 128
 _GRAPH: Final = ".onnx"
+ORIGIN_KEY: Final = "tactile.origin"
+_STATED: Final = ("network", "scale", "options", "training_sha256")
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +188,31 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
             raise CheckpointError(f"{path} is no model to start from: {said}") from error
         raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
     return net.eval(), report
+
+
+def origin(report: Mapping[str, Any]) -> dict[str, str]:
+    """Return the metadata that identify a graph's network, from a checkpoint's report."""
+    return {ORIGIN_KEY: json.dumps({key: report[key] for key in _STATED}, sort_keys=True)}
+
+
+def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
+    """Return the metadata that identify a graph's network; CheckpointError if they are missing."""
+    stated = {entry.key: entry.value for entry in model.metadata_props}.get(ORIGIN_KEY)
+    if stated is None:
+        raise CheckpointError(f"metadata key '{ORIGIN_KEY}' is missing: export the model again")
+    return json.loads(stated)
+
+
+def network_of(model: onnx.ModelProto) -> PatternNet:
+    """Return the network of a float32 graph, in evaluation mode; CheckpointError if it lacks the network's weights."""
+    made = origin_of(model)
+    net = build(made["network"], made["scale"], **made["options"])
+    held = {weight.name: torch.from_numpy(numpy_helper.to_array(weight).copy()) for weight in model.graph.initializer}
+    lacking = read_back(net, held)
+    if lacking:
+        more = f" and {len(lacking) - 1} more weights" if len(lacking) > 1 else ""
+        raise CheckpointError(f"the graph does not hold {lacking[0]}{more}: only its checkpoint does")
+    return net.eval()
 
 
 def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:

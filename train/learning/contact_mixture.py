@@ -47,10 +47,8 @@ _SCALES: Final = (
 PASSES: Final = 3
 _COMPONENTS: Final = 48
 _ROUNDS: Final = 12
-_RIDGE: Final = 1e-4
-"""Variance added on each channel: a hundredth of the mean z."""
-_SOFT: Final = 2.0 * CHANNELS
-"""Presses of a middle pad that a component's slopes over each constant are drawn to."""
+_RIDGE: Final = 1e-4  # variance added on each channel: a hundredth of the mean z
+_SOFT: Final = 2.0 * CHANNELS  # presses of a middle pad that a component's slopes over each constant are drawn to
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +58,6 @@ class ContactMixture:
     share: NDArray[np.float64]  # (k,) of the components
     means: NDArray[np.float64]  # (k, 1 + p, channels), of a middle pad, then the change by half a constant's range
     covariances: NDArray[np.float64]  # (k, channels, channels)
-
-    def centres(self, constants: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the means (k, channels) on a pad of these constants, (p,) over half of their ranges."""
-        return np.append(1.0, constants) @ self.means
 
     def model(
         self, widening: float = 1.0, bias: NDArray[np.floating] | None = None, constant_widening: float = 1.0
@@ -270,15 +264,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
-    parser.add_argument(
-        "--sensors",
-        type=Path,
-        help="presses of the sensors by which it is calibrated (default: made next to the presses)",
-    )
     options = parser.parse_args(arguments)
     try:
         mixture = fit_mixture(load_presses(options.presses))
-        presses = make_presses(CALIBRATION, options.sensors or options.presses.with_name("calibration.npz"))
+        presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
     except TrainError as error:
         sys.stderr.write(f"train.learning.contact_mixture: {error}\n")

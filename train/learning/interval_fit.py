@@ -30,21 +30,17 @@ from train.networks.interval_correction import IntervalCorrection
 
 LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
-_PER_FAMILY: Final = 1000
-"""Training presses of each family: rare families weigh as much as frequent ones."""
-_SAMPLES: Final = 24
-"""Pixels of each region of a window."""
+_PER_FAMILY: Final = 1000  # training presses of each family: rare families weigh as much as frequent ones
+_SAMPLES: Final = 24  # pixels of each region of a window
 _PRESSES_AT_ONCE: Final = 512
-_ROUNDS: Final = 2
-"""Sensors that read each training press."""
+_ROUNDS: Final = 2  # sensors that read each training press
 _STEPS: Final = 2000
 _BATCH: Final = 512
 _RATE: Final = 5e-3
 _DECAY: Final = 0.1
 _LEAST_ERROR_MM: Final = 1e-6
 _LEAST_RATIO: Final = 1e-3
-_READINGS: Final = 3
-"""Sensors that read each validation press."""
+_READINGS: Final = 3  # sensors that read each validation press
 
 Run = Callable[
     [NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None], Sequence[NDArray[np.float32]]

@@ -32,13 +32,10 @@ from train.data.press_batches import Batch
 from train.errors import TrainError
 from train.networks.blocks import Objective, PatternNet
 
-Batches = Callable[[int], Batch]
-"""Function from a number to its batch; the same number always gives the same batch."""
-Course = list[dict[str, float]]
-"""Validation figures at some steps of a training."""
+Batches = Callable[[int], Batch]  # function from a number to its batch; the same number always gives the same batch
+Course = list[dict[str, float]]  # validation figures at some steps of a training
 
-_VALIDATIONS: Final = 5
-"""Number of validations over a run."""
+_VALIDATIONS: Final = 5  # number of validations over a run
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
@@ -89,7 +86,6 @@ class Trained:
 
     steps: int
     elapsed_s: float  # over all its parts
-    loss: float  # of the last batch
     course: Course
 
 
@@ -192,7 +188,6 @@ def train(
     started_s = kept_s - state["elapsed_s"]
     logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
     check_at = {round(recipe.steps * (i + 1) / _VALIDATIONS) for i in range(_VALIDATIONS)} if validate else set()
-    loss = torch.inf
     with closing(logged) as log, closing(drawn_ahead(batches, step, recipe.steps)) as drawn:
         while (progress := _progress(recipe, step, time.monotonic() - started_s)) < 1:
             rate = recipe.learning_rate * learning_rate_share(progress)
@@ -223,7 +218,7 @@ def train(
                 _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
                 kept_s = time.monotonic()
     net.eval()
-    return Trained(step, time.monotonic() - started_s, loss, course)
+    return Trained(step, time.monotonic() - started_s, course)
 
 
 Drawn = TypeVar("Drawn")

@@ -10,8 +10,7 @@ from train.data.press_batches import Batch
 
 _LEAST_TRUTH_MM: Final = 1e-4
 """Least RMS of a truth, in [mm]; smaller ones count as this, because a micrometre deep is no contact."""
-_LEAST_SHARE_SQUARED: Final = 1e-6
-"""Term added below the root, whose slope at 0 is unbounded."""
+_LEAST_SHARE_SQUARED: Final = 1e-6  # term added below the root, whose slope at 0 is unbounded
 
 
 class PatternNet(nn.Module):
@@ -20,19 +19,17 @@ class PatternNet(nn.Module):
     Attributes:
         taps: K.
         scale: pattern pixels per taxel pitch.
+        known: numbers that it takes of the pad's constants.
         takes_poses: True if it takes the poses of the taps as well, and any number of taps up to K.
     """
 
     taps: int
     scale: int
+    known: int = 0
     takes_poses: bool = False
 
     def take_over(self, start: "PatternNet") -> None:
-        """Copy another network's weights.
-
-        Raises:
-            RuntimeError, ValueError: they do not fit.
-        """
+        """Copy another network's weights; RuntimeError or ValueError if they do not fit."""
         self.load_state_dict(start.state_dict())
 
 

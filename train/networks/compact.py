@@ -30,12 +30,9 @@ _MOST_LOGIT: Final = 8.0
 """Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
 _LEAST_SHARE: Final = 1e-3
 """Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
-_TRACTION_KPA: Final = 30.0
-"""Traction of an output of 1 and a tap of amplitude 1, in [kPa]."""
-_TRACTION_SHARE: Final = 0.2
-"""Weight of the traction's relative error in the loss."""
-_LEAST_KPA: Final = 0.05
-"""Least RMS traction of a truth, in [kPa]; smaller ones count as this."""
+_TRACTION_KPA: Final = 30.0  # traction of an output of 1 and a tap of amplitude 1, in [kPa]
+_TRACTION_SHARE: Final = 0.2  # weight of the traction's relative error in the loss
+_LEAST_KPA: Final = 0.05  # least RMS traction of a truth, in [kPa]; smaller ones count as this
 
 
 class CompactNet(PatternNet):

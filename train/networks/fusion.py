@@ -26,22 +26,16 @@ from train.networks.compact import QUIET_UNITS, CompactNet, Seen, tap_amplitude
 from train.networks.symmetric import SymmetricConv2d, fields, scalars, vectors
 from train.surfaces.poses import ANGLE_STEP_DEG
 
-_CARRIED: Final = 48
-"""Channels that are carried between the taps' axes."""
-_HEADS: Final = 12
-"""Weights of each cell, one for every field of carried channels."""
-_CELLS: Final = 2
-"""Cells per taxel pitch, those of the trunk: readings hold no finer wave than two pitches."""
-_FIRST_REACH: Final = 0.5
-"""Distance in cells at which a weight has fallen to .6, before training."""
+_CARRIED: Final = 48  # channels that are carried between the taps' axes
+_HEADS: Final = 12  # weights of each cell, one for every field of carried channels
+_CELLS: Final = 2  # cells per taxel pitch, those of the trunk: readings hold no finer wave than two pitches
+_FIRST_REACH: Final = 0.5  # distance in cells at which a weight has fallen to .6, before training
 _LEAST_WEIGHT: Final = 1e-2
 _TERMS: Final = 4
 _CELL_MM: Final = USPA44.pitch_mm / _CELLS
-_APART: Final = 5
-"""Dimensions of a window whose taps have a dimension of their own."""
+_APART: Final = 5  # dimensions of a window whose taps have a dimension of their own
 _PLACE_MM: Final = 5.0
-_TURN_ERROR_DEG: Final = 5.0
-"""Lengths and angles that enter as 1."""
+_TURN_ERROR_DEG: Final = 5.0  # lengths and angles that enter as 1
 
 
 class FusionNet(CompactNet):

@@ -24,8 +24,7 @@ BLOCKS: Final = 6
 MAX_TAPS: Final = 7
 _MM_PER_UNIT: Final = 0.02
 """Size of an output of 1, in [mm]: the networks were made for patterns of up to 25, those here reach 0.5 mm."""
-_NORM_START: Final = 0.1
-"""Initial scale and shift of batch normalisation, as in the authors' code."""
+_NORM_START: Final = 0.1  # initial scale and shift of batch normalisation, as in the authors' code
 _CRITIC_CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
 _PENALTY: Final = 10.0

@@ -19,8 +19,7 @@ from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRG
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 _WIDE: Final = {"channels": 64, "blocks": 6}
-_SMALL: Final = {"channels": 32, "blocks": 4}
-"""A quarter of the work, for a smaller time budget."""
+_SMALL: Final = {"channels": 32, "blocks": 4}  # a quarter of the work, for a smaller time budget
 
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),

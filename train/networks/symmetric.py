@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-Group = Literal["p1", "p2", "p4", "p4m"]
-"""Symmetries: none, the half turn, which a pad of any rectangle has, the four quarter turns, or these and their mirror
-images."""
+Group = Literal["p2", "p4", "p4m"]
+"""Symmetries: the half turn, as any rectangle has it, the four quarter turns, or these and their mirror images."""
 
 _ELEMENTS: Final[dict[Group, tuple[tuple[int, bool], ...]]] = {
-    "p1": ((0, False),),
     "p2": ((0, False), (2, False)),
     "p4": tuple((turns, False) for turns in range(4)),
     "p4m": tuple((turns, mirrored) for mirrored in (False, True) for turns in range(4)),

@@ -20,11 +20,9 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
 from train.physics.tpsf import spread
 
-COUNTS_PER_UNIT: Final = 100.0
-"""Counts per unit of the network's input and loss."""
+COUNTS_PER_UNIT: Final = 100.0  # counts per unit of the network's input and loss
 _WIDTHS: Final = (256, 1024, 256)
-_SMALLEST: Final = 1e-6
-"""Least length: softplus of a very negative number is 0, and the lengths are divisors."""
+_SMALLEST: Final = 1e-6  # least length: softplus of a very negative number is 0, and the lengths are divisors
 _GAMMA_START: Final = 0.8
 _RATE: Final = 1e-3
 _GAMMA_HASTE: Final = 20.0
@@ -135,13 +133,8 @@ def fit_psf_net(
 ) -> list[float]:
     """Train the network from its first weights, fit k_scale, and return the loss of every epoch.
 
-    Args:
-        net: the network.
-        counts: (n, 3, rows, cols) zeroed.
-        depth: (n, H, W) in 0..1, 1 the surface's top.
-        indentation_mm: (n,), in [mm].
-        epochs: passes over the scans.
-        seed: of the weights and of the order of the scans.
+    Scans are zeroed counts (n, 3, rows, cols), with depth images (n, H, W) in 0..1, 1 the surface's top, and
+    indentations (n,). The seed is that of the weights and of the order of the scans.
     """
     scans, images = torch.as_tensor(counts, dtype=torch.float32), torch.as_tensor(depth, dtype=torch.float32)
     with torch.random.fork_rng():

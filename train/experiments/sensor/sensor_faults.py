@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
-from train.learning.contact_check import magnet_field
+from train.learning.checks import magnet_field
 from train.networks.symmetric import symmetries
 
 Counts = NDArray[np.float32]  # readings of one sensor, (n, 3, rows, cols), zeroed

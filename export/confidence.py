@@ -1,4 +1,4 @@
-"""Table from a network's deviations to its error (edge.inference.intervals), fitted on taps not trained on."""
+"""Errors in a model's contract: on the frozen test set, and as its deviations predict them."""
 
 from collections.abc import Collection
 from typing import Final
@@ -6,9 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.metrics import windows_of
+from edge.evaluation.metrics import judge_model, mean_error, windows_of
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.intervals import doubt
+from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
 from train.data.paper_taps import PaperTaps
@@ -19,6 +20,28 @@ from train.physics.sensor_noise import Nuisances
 BINS: Final = 10
 _SET_FORCES_N: Final = (5.0, 2.0, 1.0)
 """Set forces of the taps, in [N]: as on the frozen test set, and lighter ones, which carry less information."""
+
+
+def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Collection[FrozenSet]) -> list[str]:
+    """Put errors on the test set and confidence into a model's contract, and return the errors as text.
+
+    A model of another scale than the frozen set's is not evaluated.
+    """
+    contract = session.contract
+    parts = [f"x{contract.scale}"]
+    if contract.scale == frozen.scale:
+        for given in tracked(range(1, contract.taps + 1), "judging", "run"):
+            contract.test_error[str(given)] = mean_error(judge_model(session, frozen, given))
+        error = contract.test_error[str(contract.taps)]
+        parts.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")
+        if "coverage_90" in error:
+            parts.append(f"interval covers {error['coverage_90']:.1%}")
+    else:
+        parts.append(f"not evaluated, the test set is of x{frozen.scale}")
+    fitting = [one for one in validation if one.scale == contract.scale]
+    if fitting and session.deviation is not None:
+        contract.confidence.update(fit_confidence(session, fitting))
+    return parts
 
 
 def confidence_sets(validation: PaperTaps, scale: int) -> list[FrozenSet]:

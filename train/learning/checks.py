@@ -1,10 +1,11 @@
-"""Check that separates readings of contacts from others, and the training of the small networks of all checks.
+"""Checks of readings and of earlier taps: their small networks and limits.
 
-Readings that no contact makes: magnets near the pad, wrong maps and axes, taxels of another contact, wrong gains.
+One tells readings of a contact from those that none makes: magnets near the pad, wrong maps and axes, taxels of another
+contact, wrong gains. The other tells earlier taps of a contact from taps of another one or at another pose.
 """
 
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import pairwise, permutations
 from typing import Final
 
 import numpy as np
@@ -14,11 +15,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from edge.inference.small_network import SmallNetwork, small_network
-from edge.inference.trust import Check, contact_features
+from edge.inference.trust import Check, contact_features, pair_width, pose_tap_features
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.pattern_check import LEAST_COUNTS
 from firmware_bridge.pad_geometry import USPA44
-from train.data.press_batches import in_units, read_presses
+from train.data.press_batches import in_units, read_presses, stated_poses
 from train.data.presses import PressSet
 from train.networks.symmetric import moved_scans, symmetries
 from train.physics.pad_draws import known_numbers
@@ -110,33 +111,25 @@ def _wrong_gains(rng: np.random.Generator, counts: Counts) -> Counts:
     return (counts * (1 + _WRONG_GAINS * rng.standard_normal(counts.shape))).astype(np.float32)
 
 
-SPOILINGS: Final[dict[str, Spoiling]] = {
-    "a magnet near the pad": _near_magnet,
-    "taxels shuffled": _shuffled,
-    "two taxels exchanged": _two_exchanged,
-    "places turned or mirrored": _places_moved,
-    "axes exchanged": _axes_exchanged,
-    "axes turned": _axes_turned,
-    "a taxel of another contact": _one_of_another,
-    "half of another contact": _half_of_another,
-    "gains off by a quarter": _wrong_gains,
-}
-"""Ways in which readings are wrong, by name; each takes readings (n, 3, rows, cols) and leaves them as they are."""
+SPOILINGS: Final[tuple[Spoiling, ...]] = (
+    *(_near_magnet, _shuffled, _two_exchanged, _places_moved, _axes_exchanged, _axes_turned),
+    *(_one_of_another, _half_of_another, _wrong_gains),
+)
+"""Ways in which readings are wrong; each takes readings (n, 3, rows, cols) and leaves them as they are."""
 
 
-def spoiled(rng: np.random.Generator, counts: Counts) -> tuple[Counts, NDArray[np.str_]]:
-    """Return readings (n, 3, rows, cols) with one fault each, and the name of the fault (n,)."""
-    names = np.array(list(SPOILINGS))[rng.permutation(len(counts)) % len(SPOILINGS)]
+def spoiled(rng: np.random.Generator, counts: Counts) -> Counts:
+    """Return readings (n, 3, rows, cols) with one fault each."""
+    which = rng.permutation(len(counts)) % len(SPOILINGS)
     wrong = counts.copy()
-    for name, spoil in SPOILINGS.items():
-        wrong[names == name] = spoil(rng, counts[names == name])
-    return wrong, names
+    for number, spoil in enumerate(SPOILINGS):
+        wrong[which == number] = spoil(rng, counts[which == number])
+    return wrong
 
 
-_ROUNDS: Final = 5
-"""Readings of each press."""
-_WIDTHS: Final = (256, 128, 64)
-_WEIGHT_DECAY: Final = 0.03
+_CONTACT_ROUNDS: Final = 5  # readings of each press
+_CONTACT_WIDTHS: Final = (256, 128, 64)
+_CONTACT_WEIGHT_DECAY: Final = 0.03
 _CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
 _BATCH: Final = 512
 _LEARNING_RATE: Final = 4e-3
@@ -147,16 +140,17 @@ def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwor
     """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled."""
     rng = np.random.default_rng([seed, 3])
     right, wrong = [], []
-    for number in range(_ROUNDS):
+    for number in range(_CONTACT_ROUNDS):
         readings, pads = drawn_readings(presses, seed + number)
         strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
         readings, pads = moved(rng, readings[strong]), pads[strong]
         right.append(features_of(readings, pads))
         for _ in range(2):
-            faulty, _ = spoiled(rng, readings)
+            faulty = spoiled(rng, readings)
             changed = (faulty != readings).any(axis=(1, 2, 3))
             wrong.append(features_of(faulty[changed], pads[changed]))
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _WIDTHS, steps, seed, _WEIGHT_DECAY)
+    sides = np.concatenate(right), np.concatenate(wrong)
+    return fit_classifier(*sides, _CONTACT_WIDTHS, steps, seed, _CONTACT_WEIGHT_DECAY)
 
 
 def drawn_readings(presses: PressSet, seed: int) -> tuple[Counts, NDArray[np.float32]]:
@@ -178,9 +172,9 @@ def features_of(counts: Counts, pads: NDArray[np.float32]) -> NDArray[np.float32
     return np.concatenate([contact_features(tap, pad) for tap, pad in zip(in_units(counts), pads, strict=True)])
 
 
-def moved(rng: np.random.Generator, counts: Counts, *, mirror: bool = True) -> Counts:
-    """Turn each sequence of readings (n, ..., 3, rows, cols) as a whole, axes and all, and mirror half of them."""
-    which = rng.integers(8 if mirror else 4, size=len(counts))
+def moved(rng: np.random.Generator, counts: Counts) -> Counts:
+    """Turn each reading of (n, 3, rows, cols), axes and all, and mirror half of them."""
+    which = rng.integers(8, size=len(counts))
     result = counts.copy()
     for number in range(8):
         result[which == number] = moved_scans(counts[which == number], number)
@@ -204,6 +198,98 @@ def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float,
     readings, pads = drawn_readings(presses, seed)
     met = in_contact(readings)
     return limited(network, features_of(readings[met], pads[met]), false_alarms)
+
+
+_DEPTHS: Final = (0.85, 1.15)
+_TAP_ROUNDS: Final = 3  # readings of each sequence, each by another sensor, and half of them of mirror images
+_PAIRS: Final = 6  # pairs of taps of each reading of a sequence
+_TAP_WIDTHS: Final = (192, 96)
+_TAP_WEIGHT_DECAY: Final = 0.1
+_OFF_MM: Final = (1.5, 6.0)
+_OFF_DEG: Final = (10.0, 90.0)
+"""Bounds of the errors of a pose that is wrong, or a tap that is there although the pad did not move."""
+_FAR: Final = 3.0  # errors of a pose that is wrong, in stated deviations at least
+_USUAL: Final = (0.2, 1.0)
+_MIRROR: Final = 4  # number of the mirror image, left for right, among the symmetries
+_MIRRORED_POSE: Final = np.array([-1, 1, -1], dtype=np.float32)
+
+
+def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
+    """Fit the network to pairs of taps at poses as stated, and to others."""
+    rng = np.random.default_rng([seed, 7])
+    right, wrong = [], []
+    for number in range(_TAP_ROUNDS):
+        readings, poses = strong_taps(presses, seed + number, mirror=number % 2 == 1)
+        for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:_PAIRS]:
+            there = readings[:, [newest, earlier]].any(axis=(2, 3, 4)).min(axis=1)
+            pair = readings[there][:, [newest, earlier]]
+            pose = relative(poses[there, newest], poses[there, earlier])
+            stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1))
+            # What is astray in the network's training, by more than a few of its errors, is wrong here.
+            off = np.abs(stated[:, 1, :3] - pose)
+            near = (np.hypot(*off[:, :2].T) <= _FAR * stated[:, 1, 3]) & (off[:, 2] <= _FAR * stated[:, 1, 4])
+            right.append(pair_features(pair[near], stated[near]))
+            wrong += [pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _TAP_WIDTHS, steps, seed, _TAP_WEIGHT_DECAY)
+
+
+def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+    """Return the check whose limit a share of the earlier taps of these presses exceeds, with usual errors of poses."""
+    rng = np.random.default_rng([seed, 8])
+    readings, poses = strong_taps(presses, seed)
+    rows = []
+    for earlier in range(1, presses.taps):
+        there = readings[:, earlier].any(axis=(1, 2, 3))
+        pair, pose = readings[there][:, [0, earlier]], poses[there][:, earlier]
+        rows.append(pair_features(pair, stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), _USUAL)))
+    return limited(network, np.concatenate(rows), false_alarms)
+
+
+def pair_features(pairs: Counts, poses: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the features (n, inputs) of pairs of taps (n, 2, 3, rows, cols) in counts, with poses (n, 2, 5)."""
+    none = np.empty((0, pair_width(int(np.prod(pairs.shape[2:])))), np.float32)
+    return np.concatenate([none, *(pose_tap_features(*one) for one in zip(in_units(pairs), poses, strict=True))])
+
+
+def relative(newest: NDArray[np.floating], earlier: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return poses (n, 3) of earlier taps in newer ones' axes, both in the axes of a third; see `PadPose.seen_from`."""
+    turn = np.radians(newest[:, 2])
+    x, y = (earlier[:, :2] - newest[:, :2]).T
+    turned = (earlier[:, 2] - newest[:, 2] + 180) % 360 - 180
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x, turned], axis=1).astype(np.float32)
+
+
+def strong_taps(presses: PressSet, seed: int, *, mirror: bool = False) -> tuple[Counts, NDArray[np.float32]]:
+    """Return windows (n, K, 3, rows, cols) in counts whose taps are strong enough or absent, and their poses."""
+    readings, poses = read_presses(presses, Nuisances(), seed), presses.poses
+    if mirror:
+        readings, poses = moved_scans(readings, _MIRROR), poses * _MIRRORED_POSE
+    there = presses.counts.any(axis=(2, 3, 4))
+    strong = ((readings[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS) | ~there).all(axis=1)
+    return readings[strong], poses[strong]
+
+
+def _wrong(
+    rng: np.random.Generator, pair: Counts, pose: NDArray[np.float32], stated: NDArray[np.float32]
+) -> list[tuple[Counts, NDArray[np.float32]]]:
+    """Return pairs with another contact's tap, with a pose that is off, and with a pad that did not move."""
+    foreign = np.stack([pair[:, 0], pair[rng.permutation(len(pair)), 1]], axis=1)
+    way, sign = rng.uniform(0, 2 * np.pi, len(pair)), rng.choice([-1, 1], len(pair))
+    far_mm = np.maximum(rng.uniform(*_OFF_MM, len(pair)), _FAR * stated[:, 1, 3])
+    far_deg = np.maximum(rng.uniform(*_OFF_DEG, len(pair)), _FAR * stated[:, 1, 4])
+    which = rng.random((len(pair), 2)) < (0.7, 0.4)
+    which[~which.any(axis=1), 0] = True
+    shifted = stated.copy()
+    shifted[:, 1, 0] += np.where(which[:, 0], far_mm * np.cos(way), 0)
+    shifted[:, 1, 1] += np.where(which[:, 0], far_mm * np.sin(way), 0)
+    shifted[:, 1, 2] += np.where(which[:, 1], far_deg * sign, 0)
+    depth = rng.uniform(*_DEPTHS, (len(pair), 1, 1, 1)).astype(np.float32)
+    off_mm, off_deg = np.hypot(*pose[:, :2].T), np.abs(pose[:, 2])
+    moved = off_mm > np.maximum(_OFF_MM[0], _FAR * stated[:, 1, 3])
+    moved |= off_deg > np.maximum(_OFF_DEG[0], _FAR * stated[:, 1, 4])
+    still = np.stack([pair[:, 0], np.rint(pair[:, 0] * depth)], axis=1)
+    return [(foreign, stated), (pair, shifted), (still[moved], stated[moved])]
 
 
 def fit_classifier(

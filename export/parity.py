@@ -1,6 +1,6 @@
 """Parity between a graph and its network at every optimisation level of onnxruntime, with extreme windows."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +9,6 @@ import onnx
 import onnxruntime
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.contract import (
@@ -24,7 +23,8 @@ from edge.inference.contract import (
 )
 from edge.inference.onnx_session import LOG_FATAL_ONLY
 from export.errors import ParityError
-from export.graphs.graph import known_width, outputs
+from export.graph import outputs
+from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG
 
 LEVELS: Final = {
@@ -58,6 +58,7 @@ _DENORMAL_BITS: Final = 0x000116C2
 """Bits of 1e-40 in float32: written as a number it would be zero wherever a program has set denormals to zero."""
 PARITY_WINDOWS: Final = 100
 """Approximate number of frozen readings in the parity check; readings have no scale, so they fit every network."""
+_AT_ONCE: Final = 256  # windows of one run of a network
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +74,6 @@ class Difference:
     relative: float
 
 
-def batches(inputs: Mapping[str, NDArray[np.float32]], batch: int) -> Iterator[dict[str, NDArray[np.float32]]]:
-    """Yield inputs, (n, ...) each, in batches of one size; the last one is filled with the first windows."""
-    count = len(inputs[INPUT_NAME])
-    places = np.arange(count + -count % batch) % count
-    for first in range(0, len(places), batch):
-        yield {name: given[places[first : first + batch]] for name, given in inputs.items()}
-
-
 class GraphRun:
     """Graph in onnxruntime at one optimisation level, for comparison without a contract and bound arrays."""
 
@@ -93,10 +86,8 @@ class GraphRun:
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
         inputs = {given.name: given.shape for given in self._session.get_inputs()}
-        batch = inputs[INPUT_NAME][0]
         self._pad_width = inputs[PAD_NAME][1] if PAD_NAME in inputs else 0
         self._takes_poses = POSES_NAME in inputs
-        self._batch = batch if isinstance(batch, int) else 1
         self.outputs: list[str] = [output.name for output in self._session.get_outputs()]
 
     def __call__(
@@ -107,7 +98,7 @@ class GraphRun:
     ) -> list[NDArray[np.float32]]:
         """Return each output (n, ...) of windows (n, 3K, rows, cols) in network units, of pads (n, width) and poses.
 
-        Without pads no constants are stated, without poses they are the paper's schedule; the last batch is filled.
+        Without pads no constants are stated, without poses they are the paper's schedule. Windows are run one by one.
         """
         count = len(windows)
         inputs = {INPUT_NAME: windows}
@@ -118,8 +109,19 @@ class GraphRun:
             inputs[POSES_NAME] = scheduled if poses is None else poses
         if self._pad_width:
             inputs[PAD_NAME] = np.zeros((count, self._pad_width), np.float32) if pads is None else pads
-        runs = [self._session.run(None, given) for given in batches(inputs, self._batch)]
-        return [np.concatenate(maps)[:count] for maps in zip(*runs, strict=True)]
+        runs = [
+            self._session.run(None, {name: given[place : place + 1] for name, given in inputs.items()})
+            for place in range(count)
+        ]
+        return [np.concatenate(maps) for maps in zip(*runs, strict=True)]
+
+
+def run_network(net: PatternNet, *given: NDArray[np.float32] | None) -> list[NDArray[np.float32]]:
+    """Return each output of a network for windows, pads and poses, as a `GraphRun` does of its graph."""
+    parts = [None if one is None else torch.from_numpy(one).split(_AT_ONCE) for one in given]
+    count = max(len(part) for part in parts if part is not None)
+    runs = [outputs(net, *part) for part in zip(*(part or [None] * count for part in parts), strict=True)]
+    return [torch.cat(maps).numpy() for maps in zip(*runs, strict=True)]
 
 
 def differences(
@@ -184,23 +186,21 @@ def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:
     return poses
 
 
-def check_parity(net: nn.Module, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
+def check_parity(net: PatternNet, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
     """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
 
     Raises:
         ParityError: it is larger than TOLERANCE or EXTREME_TOLERANCE, or a value is not finite.
     """
     run = GraphRun(model)
-    width = known_width(net)
     largest = 0.0
     for windows, tolerance in (
         (read_windows(frozen, contract), TOLERANCE),
         (np.concatenate([*extreme_windows(contract).values()]), EXTREME_TOLERANCE),
     ):
-        pads = example_pads(len(windows), width) if width else None
+        pads = example_pads(len(windows), net.known) if net.known else None
         poses = example_poses(len(windows), contract) if contract.takes_poses else None
-        known = [None if given is None else torch.from_numpy(given) for given in (pads, poses)]
-        expected = [maps.numpy() for maps in outputs(net, torch.from_numpy(windows), *known)]
+        expected = run_network(net, windows, pads, poses)
         for difference in differences(run.outputs, expected, run(windows, pads, poses), contract.output_full_scale):
             most = accepted(difference.output, tolerance)
             if not difference.relative <= most:

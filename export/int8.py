@@ -1,0 +1,224 @@
+"""Graphs in 8-bit integers: unsigned activations, signed weights with a scale for each channel, float in and out.
+
+Ranges are percentiles over training taps: what lies beyond any touch saturates.
+
+Layers that take most of the time are quantised: the convolutions of the largest grid except for those of the outputs.
+Those of smaller grids, which read the taxels, stay in float: they take a tenth of the time, and no later layer
+recovers their losses. A network that takes poses also quantises what encodes its earlier taps, a third of
+its time with four taps, except for the convolutions of the inputs. Those that read logarithms stay in float: a step of
+their range is a factor.
+"""
+
+import contextlib
+import io
+import logging
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from onnx import NodeProto
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+
+from edge.inference.contract import INPUT_NAME, PAD_NAME, POSES_NAME, Contract
+from edge.inference.onnx_session import LOG_FATAL_ONLY
+from export.errors import ExportError
+from firmware_bridge.pad_geometry import AXES
+from train.data.press_batches import Batch
+from train.data.presses import PressSet
+from train.learning.checkpoint import batches_of
+from train.learning.training_loop import Recipe
+
+_PERCENTILE: Final = 99.999
+"""Percentage of a layer's values within its range; larger values are cut.
+
+With the whole range the bundled models lose .03 to .07 dB more, because a few large values make all steps coarser.
+"""
+_CALIBRATED_ON: Final = 512
+_FEWEST: Final = 32
+PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
+"""Operations that are quantised if any or all of their inputs are."""
+_COMPARING: Final = ("compare", "answer")
+"""Layers of a FusionNet that compare taps: in int8 they made a pattern 2.9 times its largest value too large on windows
+beyond any touch. In float int8 saturates there, for 5 % of the run time with four taps."""
+_RESHAPING: Final = {"Reshape", "Transpose", "Concat"}
+
+
+def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
+    """Draw windows with their pad inputs from training taps as in training, light contacts included.
+
+    Raises:
+        ExportError: there are too few sequences for meaningful ranges.
+    """
+    if len(taps) < _FEWEST:
+        raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
+    given = (1 / contract.taps,) * contract.taps
+    if contract.takes_poses:  # its batches have one number of taps each: all, of which some are left out below
+        given = (*[0.0] * (contract.taps - 1), 1.0)
+    recipe = Recipe(1, batch=min(len(taps), _CALIBRATED_ON), given=given)
+    batch = batches_of(taps, contract.scale, recipe, 0, posed=contract.takes_poses)(0)
+    if contract.takes_poses:
+        there = torch.arange(contract.taps) <= torch.arange(len(batch.window))[:, None] % contract.taps
+        batch = replace(batch, window=batch.window * there.repeat_interleave(len(AXES), dim=1)[:, :, None, None])
+    return batch
+
+
+class _Inputs(CalibrationDataReader):
+    def __init__(self, inputs: dict[str, NDArray[np.float32]]) -> None:
+        count = len(inputs[INPUT_NAME])
+        self._left = ({name: given[one : one + 1] for name, given in inputs.items()} for one in range(count))
+
+    def get_next(self) -> dict[str, NDArray[np.float32]] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return next(self._left, None)
+
+
+def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
+    """Return a float graph with quantise and dequantise nodes around all nodes that may be quantised.
+
+    Ranges are measured on the batch `seen`, light contacts included.
+
+    Raises:
+        ExportError: no node of the graph may be quantised.
+    """
+    nodes = integer_nodes(model)
+    if not nodes:
+        raise ExportError("no convolution of the graph may be quantised: export it without --int8")
+    with tempfile.TemporaryDirectory() as drafts, _quiet():
+        path = Path(drafts) / "int8.onnx"
+        quantize_static(
+            onnx.ModelProto.FromString(model.SerializeToString()),
+            path,
+            _Inputs(_inputs(model, seen)),
+            quant_format=QuantFormat.QDQ,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            per_channel=True,
+            op_types_to_quantize=["Conv", *PASSING_ON],
+            nodes_to_quantize=nodes,
+            calibrate_method=CalibrationMethod.Percentile,
+            extra_options={"CalibPercentile": _PERCENTILE},
+        )
+        integers = onnx.load(path)
+    onnx.checker.check_model(integers, full_check=True)
+    return integers
+
+
+def _inputs(model: onnx.ModelProto, seen: Batch) -> dict[str, NDArray[np.float32]]:
+    """Return the inputs of a graph for a batch, by name."""
+    inputs = {INPUT_NAME: seen.window.numpy()}
+    if takes_poses(model) and seen.poses is not None:
+        inputs[INPUT_NAME] = seen.window.unflatten(1, (-1, len(AXES))).numpy()
+        inputs[POSES_NAME] = seen.poses.numpy()
+    if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
+        inputs[PAD_NAME] = seen.pad.numpy()
+    return inputs
+
+
+def convolutions(model: onnx.ModelProto) -> tuple[int, int]:
+    """Return how many convolutions onnxruntime runs in int8 after optimising a graph, and their total number."""
+    with tempfile.TemporaryDirectory() as drafts:
+        path = Path(drafts) / "optimised.onnx"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = LOG_FATAL_ONLY
+        options.optimized_model_filepath = str(path)
+        onnxruntime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        optimised = onnx.load(path)
+    kinds = [node.op_type for node in optimised.graph.node if "Conv" in node.op_type]
+    return kinds.count("QLinearConv"), len(kinds)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[Any]:
+    """Silence the quantiser's messages, which advise steps that do not apply here."""
+    root, before = logging.getLogger(), logging.getLogger().level
+    root.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        root.setLevel(before)
+
+
+def takes_poses(model: onnx.ModelProto) -> bool:
+    """Return True if the graph has an input for poses."""
+    return any(given.name == POSES_NAME for given in model.graph.input)
+
+
+def integer_nodes(model: onnx.ModelProto) -> list[str]:
+    """Return the names of the nodes to quantise, in the graph's order."""
+    shapes = _shapes(model)
+    made_by = {name: node for node in model.graph.node for name in node.output}
+    convs = [node for node in model.graph.node if node.op_type == "Conv"]
+    most = max((_pixels(shapes, node) for node in convs), default=0)
+    costly = {node.name for node in convs if _pixels(shapes, node) >= most}
+    kept = _last_convolutions(model, made_by)
+    if takes_poses(model):
+        windows = _runs(shapes, convs[0])  # the newest taps enter first, one a window
+        costly |= {node.name for node in convs if _runs(shapes, node) != windows}
+        kept |= _first_convolutions(model) | {node.name for node in convs if _reads_logarithms(node, made_by)}
+        kept |= {node.name for node in convs if node.input[1].partition(".")[0] in _COMPARING}
+    chosen = {node.name for node in convs if node.name in costly - kept}
+    for node in model.graph.node:  # every node comes after those of its inputs
+        takes = [made_by[name].name for name in node.input if name in made_by]
+        if takes and node.op_type in PASSING_ON and PASSING_ON[node.op_type](name in chosen for name in takes):
+            chosen.add(node.name)
+    return [node.name for node in model.graph.node if node.name in chosen]
+
+
+def _first_convolutions(model: onnx.ModelProto) -> set[str]:
+    """Return the convolutions that see the inputs without another convolution in between."""
+    found: set[str] = set()
+    behind: set[str] = set()
+    for node in model.graph.node:
+        later = not behind.isdisjoint(node.input)
+        if node.op_type == "Conv" and not later:
+            found.add(node.name)
+        if later or node.op_type == "Conv":
+            behind.update(node.output)
+    return found
+
+
+def _last_convolutions(model: onnx.ModelProto, made_by: dict[str, NodeProto]) -> set[str]:
+    """Return the convolutions from which an output is computed without another convolution or a Gemm in between."""
+    found, behind = set(), [value.name for value in model.graph.output]
+    while behind:
+        node = made_by.get(behind.pop())
+        if node is None:
+            continue
+        if node.op_type == "Conv":
+            found.add(node.name)
+        elif node.op_type != "Gemm":  # a layer of its own, which sees what convolutions made
+            behind += node.input
+    return found
+
+
+def _reads_logarithms(node: NodeProto, made_by: dict[str, NodeProto]) -> bool:
+    """Return True if some input of a node is a logarithm, perhaps reshaped."""
+    before = [made_by[name] for name in node.input if name in made_by]
+    return any(
+        one.op_type == "Log" or (one.op_type in _RESHAPING and _reads_logarithms(one, made_by)) for one in before
+    )
+
+
+def _shapes(model: onnx.ModelProto) -> dict[str, list[int | str]]:
+    """Return the lengths of each value's dimensions, free ones by name."""
+    inferred = onnx.shape_inference.infer_shapes(model)
+    return {
+        value.name: [length.dim_param or length.dim_value for length in value.type.tensor_type.shape.dim]
+        for value in (*inferred.graph.value_info, *inferred.graph.output)
+    }
+
+
+def _pixels(shapes: dict[str, list[int | str]], node: NodeProto) -> int:
+    height, width = shapes[node.output[0]][-2:]
+    return int(height) * int(width)
+
+
+def _runs(shapes: dict[str, list[int | str]], node: NodeProto) -> int | str:
+    return shapes[node.output[0]][0]

@@ -1,1 +1,0 @@
-"""Networks in 8-bit integers: rounded in torch, trained a little more, quantised."""
