@@ -33,8 +33,7 @@ SURFACE: Final = "glyph:1"
 """A random figure, which no network was trained on: of those of the paper one tap shows nearly all."""
 FOREIGN: Final = "small circle"
 _PLACE_MM: Final = PLACES_MM["test"]
-ANGLE_DEG: Final = 30.0
-"""Angle of the last scored tap; each tap before is a step back, each later one a step on."""
+ANGLE_DEG: Final = 30.0  # angle of the last scored tap; each tap before is a step back, each later one a step on
 TAPS: Final = 4
 FORCE_N: Final = 5.0
 SCALE: Final = 10
@@ -43,10 +42,8 @@ REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
 MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30
 """Frames in which the magnet comes near, and in which it leaves, and for which it stays before the pad is tapped."""
-MAGNET_MM: Final = (150.0, 45.0)
-"""Distance at which it begins and ends, and at which it stays, in [mm]."""
-MAGNET_COUNTS: Final = 900.0
-"""Its largest count there, of any taxel and axis: half of that of the tap."""
+MAGNET_MM: Final = (150.0, 45.0)  # distance at which it begins and ends, and at which it stays, in [mm]
+MAGNET_COUNTS: Final = 900.0  # its largest count there, of any taxel and axis: half of that of the tap
 _REST_COUNTS: Final = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
@@ -58,12 +55,10 @@ OPTIONS_MM: Final = HALF_PITCH_MM * np.array(
 LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
 """Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps."""
 SPEED_MM_S: Final = 20.0
-FIGURE_MM: Final = 50.0
-"""Longest side of the long letter."""
+FIGURE_MM: Final = 50.0  # longest side of the long letter
 HALF_LENGTH_MM: Final = 30.0
 _RASTER_MM: Final = 0.05
-_DRAG_MM: Final = 0.3
-"""Movement of the object against the pad's face that friction carries while it slides, in [mm]."""
+_DRAG_MM: Final = 0.3  # movement of the object against the pad's face that friction carries while it slides, in [mm]
 _INDENTATION_MM: Final = (0.15, 0.4)
 _AT_ONCE: Final = 50
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")

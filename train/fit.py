@@ -33,8 +33,7 @@ GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.3, 0.
 """Share of windows with 1, 2, ... K taps; of batches, for a network that takes poses."""
 
 _KNOWN: Final = {"known": KNOWN}
-_COMPACT: Final = ("compact-", "small-", "fusion-")
-"""Networks that take constants of the pad and give deviations."""
+_COMPACT: Final = ("compact-", "small-", "fusion-")  # networks that take constants of the pad and give deviations
 
 
 def _trained_on(name: str, network: str, taps: int = 1) -> Training:

@@ -40,10 +40,8 @@ KINDS: Final = 16
 More kinds reduce it on figures, but not on contacts that vary little over the pad.
 """
 _PASSES: Final = 10
-_PARTS: Final = 40
-"""Parts in which scans are weighed, to use less than a gigabyte."""
-_LEAST_COUNTS: Final = 20.0
-"""Least RMS of a reading, below which noise would be scaled up, in [counts]."""
+_PARTS: Final = 40  # parts in which scans are weighed, to use less than a gigabyte
+_LEAST_COUNTS: Final = 20.0  # least RMS of a reading, below which noise would be scaled up, in [counts]
 _FELT: Final = 0.5
 _STRONG: Final = 0.9
 FIRST_FRAME: Final = 6

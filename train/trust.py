@@ -30,10 +30,8 @@ from train.learning.checks import contact_check, fit_contact_network, fit_tap_ne
 from train.physics.pad_draws import INPUTS, input_scale
 from train.physics.sensor_noise import Nuisances
 
-UNFAMILIAR: Final = 0.005
-"""Share of simulated contacts whose readings are said to be those of no contact."""
-FOREIGN: Final = 0.01
-"""Share of earlier taps that are dropped although they belong."""
+UNFAMILIAR: Final = 0.005  # share of simulated contacts whose readings are said to be those of no contact
+FOREIGN: Final = 0.01  # share of earlier taps that are dropped although they belong
 _RIDGE: Final = 1e-6
 
 
