@@ -31,31 +31,18 @@ from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, Baseli
 
 @dataclass
 class Watched:
-    """Data of a watch while the pads were free.
+    """Data of a watch while the pads were free."""
 
-    Attributes:
-        scans: of each sensor, in their order.
-        counters: of the link.
-        duration_s: length of the watch so far, in [s].
-        facts: of the line.
-        ids: the CAN ids that came; empty where the link sees none.
-        model: the id map that the user chose.
-        rate_hz: that a user expects of each sensor, in [Hz].
-        references: earlier baselines of the free pads, by sensor.
-        until_ns: end of the watch, on the clock of the scans in [ns]; None stands for the newest scan.
-        mountings: of the sensors, as far as they are available.
-    """
-
-    scans: dict[str, list[Scan]] = field(default_factory=dict)
-    counters: Mapping[str, int] = field(default_factory=dict)
-    duration_s: float = 0.0
-    facts: LineFacts = field(default_factory=LineFacts)
-    ids: frozenset[int] = frozenset()
-    model: ModelMap = USPA44_MAP
-    rate_hz: float | None = None
-    references: Mapping[str, Baseline] = field(default_factory=dict)
-    until_ns: int | None = None
-    mountings: Mapping[str, Mounting] = field(default_factory=dict)
+    scans: dict[str, list[Scan]] = field(default_factory=dict)  # of each sensor, in their order
+    counters: Mapping[str, int] = field(default_factory=dict)  # of the link
+    duration_s: float = 0.0  # length of the watch so far, in [s]
+    facts: LineFacts = field(default_factory=LineFacts)  # of the line
+    ids: frozenset[int] = frozenset()  # the CAN ids that came; empty where the link sees none
+    model: ModelMap = USPA44_MAP  # the id map that the user chose
+    rate_hz: float | None = None  # that a user expects of each sensor, in [Hz]
+    references: Mapping[str, Baseline] = field(default_factory=dict)  # earlier baselines of the free pads, by sensor
+    until_ns: int | None = None  # end of the watch, on the clock of the scans in [ns]; None stands for the newest scan
+    mountings: Mapping[str, Mounting] = field(default_factory=dict)  # of the sensors, as far as they are available
 
 
 _PRESSED: Final = (

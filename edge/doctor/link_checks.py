@@ -73,17 +73,11 @@ _TROUBLE: Final = ("overrun", "overflow", "error", "lost")
 
 @dataclass(frozen=True, slots=True)
 class LineFacts:
-    """Facts on the way to a sensor.
+    """Facts on the way to a sensor."""
 
-    Attributes:
-        port: of a serial adapter; None for other links.
-        baud: speed at which its line was opened, in bit/s.
-        latency_ms: time for which the adapter's driver holds bytes back; None where it is not shown.
-    """
-
-    port: str | None = None
-    baud: int | None = None
-    latency_ms: int | None = None
+    port: str | None = None  # of a serial adapter; None for other links
+    baud: int | None = None  # speed at which its line was opened, in bit/s
+    latency_ms: int | None = None  # time for which the adapter's driver holds bytes back; None where it is not shown
 
 
 def line_facts(link: Link) -> LineFacts:

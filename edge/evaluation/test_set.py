@@ -39,30 +39,18 @@ class FrozenSet:
 
     A frame's window is its own reading and the ends of the earlier taps, newest first. Contacts are flat, so a tap's
     truth is one map multiplied by the frame's indentation.
-
-    Attributes:
-        newest: (n, 3, rows, cols) int16, zeroed counts of the frame.
-        earlier: (taps, K-1, 3, rows, cols) int16, zeroed counts at the end of the earlier taps.
-        tap: (n,) index of the frame's tap; frames of a tap are not independent.
-        indentation_mm: (n,) float32, in [mm].
-        force_n: (n,) float32, in [N].
-        unit_patterns: (taps, H, W) float16, deformation per indentation.
-        touched: (taps, H, W) bool, pixels of which the surface touches at least half.
-        surface: (taps,) name of the surface.
-        angle_deg: (taps,) rotation of the pad, in [deg].
-        full_scale_mm: the patterns' declared full scale, in [mm].
     """
 
-    newest: NDArray[np.int16]
-    earlier: NDArray[np.int16]
-    tap: NDArray[np.int16]
-    indentation_mm: NDArray[np.float32]
-    force_n: NDArray[np.float32]
-    unit_patterns: NDArray[np.float16]
-    touched: NDArray[np.bool_]
-    surface: NDArray[np.str_]
-    angle_deg: NDArray[np.float32]
-    full_scale_mm: float
+    newest: NDArray[np.int16]  # (n, 3, rows, cols) int16, zeroed counts of the frame
+    earlier: NDArray[np.int16]  # (taps, K-1, 3, rows, cols) int16, zeroed counts at the end of the earlier taps
+    tap: NDArray[np.int16]  # (n,) index of the frame's tap; frames of a tap are not independent
+    indentation_mm: NDArray[np.float32]  # (n,) float32, in [mm]
+    force_n: NDArray[np.float32]  # (n,) float32, in [N]
+    unit_patterns: NDArray[np.float16]  # (taps, H, W) float16, deformation per indentation
+    touched: NDArray[np.bool_]  # (taps, H, W) bool, pixels of which the surface touches at least half
+    surface: NDArray[np.str_]  # (taps,) name of the surface
+    angle_deg: NDArray[np.float32]  # (taps,) rotation of the pad, in [deg]
+    full_scale_mm: float  # the patterns' declared full scale, in [mm]
 
     def __len__(self) -> int:
         return len(self.newest)

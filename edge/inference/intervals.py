@@ -93,15 +93,10 @@ pattern's RMS, and the share of the error that another tap takes away; no gain f
 
 
 class Expected(NamedTuple):
-    """Expected error of a pattern.
+    """Expected error of a pattern."""
 
-    Attributes:
-        rmse: RMS error over all its pixels, in its unit.
-        gain: share of it that another tap would take away; None if the network takes no further tap.
-    """
-
-    rmse: float
-    gain: float | None
+    rmse: float  # RMS error over all its pixels, in its unit
+    gain: float | None  # share of it that another tap would take away; None if the network takes no further tap
 
     @property
     def another_tap(self) -> bool | None:

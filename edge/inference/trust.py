@@ -27,15 +27,10 @@ _KEYS: Final = ("forward", "contact", "tap")
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Network that scores readings, and the score from which they are not believed.
+    """Network that scores readings, and the score from which they are not believed."""
 
-    Attributes:
-        network: higher scores are less familiar.
-        limit: score that one in a hundred simulated contacts exceeds.
-    """
-
-    network: SmallNetwork
-    limit: float
+    network: SmallNetwork  # higher scores are less familiar
+    limit: float  # score that one in a hundred simulated contacts exceeds
 
     def to_json(self) -> dict[str, Any]:
         """Return the check as JSON."""
@@ -112,17 +107,11 @@ def _put_shape(tap: NDArray[np.float32], place: NDArray[np.float32]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Content of a model's contract under `trust`.
+    """Content of a model's contract under `trust`."""
 
-    Attributes:
-        forward: explains readings by a pattern.
-        contact: tells readings that a contact makes from others.
-        tap: tells earlier taps of the same contact from others.
-    """
-
-    forward: ForwardModel
-    contact: Check
-    tap: Check
+    forward: ForwardModel  # explains readings by a pattern
+    contact: Check  # tells readings that a contact makes from others
+    tap: Check  # tells earlier taps of the same contact from others
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""

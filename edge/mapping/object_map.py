@@ -36,20 +36,13 @@ _HIGHEST: Final = 0.98  # share of the touched pixels that lie below the map's t
 
 @dataclass(frozen=True, slots=True)
 class MapLayers:
-    """Layers of a map, (H, W) each, x to the right and y down, NaN where nothing is known.
+    """Layers of a map, (H, W) each, x to the right and y down, NaN where nothing is known."""
 
-    Attributes:
-        height_mm: height against the map's top, which is 0, where the object was touched.
-        contact: probability that a press that covers it touches it.
-        coverage: patterns that covered it and were believed, counted as the taps that they are worth.
-        doubted: the same of patterns that were not believed, which no other layer holds.
-    """
-
-    height_mm: NDArray[np.float32]
-    contact: NDArray[np.float32]
+    height_mm: NDArray[np.float32]  # height against the map's top, which is 0, where the object was touched
+    contact: NDArray[np.float32]  # probability that a press that covers it touches it
     deviation_mm: NDArray[np.float32]
-    coverage: NDArray[np.float32]
-    doubted: NDArray[np.float32]
+    coverage: NDArray[np.float32]  # patterns that covered it and were believed, counted as the taps that they are worth
+    doubted: NDArray[np.float32]  # the same of patterns that were not believed, which no other layer holds
 
 
 @dataclass(slots=True)

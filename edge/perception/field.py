@@ -112,33 +112,19 @@ class Columns:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field of a result, in every output that holds it.
+    """One field of a result, in every output that holds it."""
 
-    Attributes:
-        name: in every output; ends with the unit if it has one.
-        kind: type of the value, or of each component of a vector.
-        attribute: dotted path from the result to the attribute that the value is made of.
-        text: description of the value, for the pages.
-        make: converts the attribute into the value, unless that is None; None takes it as it is.
-        decimals: decimals of a number in JSON.
-        parts: names of a vector's components, for outputs that hold them one by one.
-        json: converts the attribute into the JSON value, if `make` and `decimals` do not.
-        out: outputs that hold it.
-        byte: its first byte in a half of shared memory. The layout only grows at its end.
-        left_out: a record omits the key while the value is unknown.
-    """
-
-    name: str
-    kind: Kind
-    attribute: str
-    text: str
-    make: Function | None = None
-    decimals: int | None = None
-    parts: tuple[str, ...] = ()
-    json: Function | None = None
-    out: Out = Out.ALL
-    byte: int | None = None
-    left_out: bool = False
+    name: str  # in every output; ends with the unit if it has one
+    kind: Kind  # type of the value, or of each component of a vector
+    attribute: str  # dotted path from the result to the attribute that the value is made of
+    text: str  # description of the value, for the pages
+    make: Function | None = None  # converts the attribute into the value, unless that is None; None takes it as it is
+    decimals: int | None = None  # decimals of a number in JSON
+    parts: tuple[str, ...] = ()  # names of a vector's components, for outputs that hold them one by one
+    json: Function | None = None  # converts the attribute into the JSON value, if `make` and `decimals` do not
+    out: Out = Out.ALL  # outputs that hold it
+    byte: int | None = None  # its first byte in a half of shared memory. The layout only grows at its end.
+    left_out: bool = False  # a record omits the key while the value is unknown
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -23,19 +23,12 @@ WrenchOrigin = Literal["calibrated", "nominal"]
 
 
 class NextTap(NamedTuple):
-    """Proposal for the next tap.
+    """Proposal for the next tap."""
 
-    Attributes:
-        dx_mm: place of the pad along x in the newest tap's axes.
-        dy_mm: the same along y.
-        turn_deg: turn of the pad from the newest tap, from x to y.
-        target: the same pose in the object's plane.
-    """
-
-    dx_mm: float
-    dy_mm: float
-    turn_deg: float
-    target: PadPose | None = None
+    dx_mm: float  # place of the pad along x in the newest tap's axes
+    dy_mm: float  # the same along y
+    turn_deg: float  # turn of the pad from the newest tap, from x to y
+    target: PadPose | None = None  # the same pose in the object's plane
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,23 +29,14 @@ class Origin(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Taps that a pattern is due of.
+    """Taps that a pattern is due of."""
 
-    Attributes:
-        counts: (K, 3, rows, cols) in zeroed counts, newest tap first, zeros in place of missing ones.
-        taps: number of taps in it.
-        slots: places of these taps in the window of the sensor's tracker.
-        poses: (taps, 5) as model input; None for a model that takes no poses.
-        tap: number of the newest tap.
-        made_by: what distinguishes the pattern from others of the same readings and poses.
-    """
-
-    counts: NDArray[np.float32]
-    taps: int
-    slots: Sequence[int]
-    poses: NDArray[np.float32] | None
-    tap: int
-    made_by: Hashable
+    counts: NDArray[np.float32]  # (K, 3, rows, cols) in zeroed counts, newest tap first, zeros in place of missing ones
+    taps: int  # number of taps in it
+    slots: Sequence[int]  # places of these taps in the window of the sensor's tracker
+    poses: NDArray[np.float32] | None  # (taps, 5) as model input; None for a model that takes no poses
+    tap: int  # number of the newest tap
+    made_by: Hashable  # what distinguishes the pattern from others of the same readings and poses
 
 
 @dataclass

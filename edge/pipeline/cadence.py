@@ -280,15 +280,10 @@ RESTLESS_NS: Final = 1_000_000_000  # time after a contact, in [ns], during whic
 
 
 class Pace(NamedTuple):
-    """Times of reading, the same for all links.
+    """Times of reading, the same for all links."""
 
-    Attributes:
-        every_s: time between two reads, in [s]; 0: as scans come.
-        reads: number of reads after which bytes are made into scans.
-    """
-
-    every_s: float = 0.0
-    reads: int = 1
+    every_s: float = 0.0  # time between two reads, in [s]; 0: as scans come
+    reads: int = 1  # number of reads after which bytes are made into scans
 
 
 class PaceSetter:

@@ -70,17 +70,13 @@ def offsets_of(fields: tuple[tuple[str, str], ...]) -> dict[str, int]:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Places of all values for a sensor of rows x cols taxels and patterns of height x width pixels.
-
-    Attributes:
-        traction_shape: (3, h, w), where there is a traction.
-    """
+    """Places of all values for a sensor of rows x cols taxels and patterns of height x width pixels."""
 
     rows: int
     cols: int
     height: int
     width: int
-    traction_shape: tuple[int, int, int] | None = None
+    traction_shape: tuple[int, int, int] | None = None  # (3, h, w), where there is a traction
 
     @property
     def maps(self) -> dict[str, tuple[np.dtype, tuple[int, ...], int]]:

@@ -67,27 +67,16 @@ def _text(path: Path) -> str | None:
 
 
 class Found(NamedTuple):
-    """One port, adapter or network interface.
+    """One port, adapter or network interface."""
 
-    Attributes:
-        kind: kind of device, which determines its link.
-        path: path of a port; bus and address of a USB device; name of an interface.
-        usb_id: vendor and product, "0403:6015".
-        serial_number: serial number of the USB device.
-        looks_like: description of the device.
-        adapter: True if sensors are usually connected by such a device.
-        source: argument of --source that selects it.
-        problems: its problems with their remedies, a line each.
-    """
-
-    kind: Literal["serial", "gs_usb", "socketcan"]
-    path: str
-    usb_id: str | None
-    serial_number: str | None
-    looks_like: str
-    adapter: bool
-    source: str
-    problems: tuple[str, ...]
+    kind: Literal["serial", "gs_usb", "socketcan"]  # kind of device, which determines its link
+    path: str  # path of a port; bus and address of a USB device; name of an interface
+    usb_id: str | None  # vendor and product, "0403:6015"
+    serial_number: str | None  # serial number of the USB device
+    looks_like: str  # description of the device
+    adapter: bool  # True if sensors are usually connected by such a device
+    source: str  # argument of --source that selects it
+    problems: tuple[str, ...]  # its problems with their remedies, a line each
 
 
 def devices() -> tuple[list[Found], list[str]]:

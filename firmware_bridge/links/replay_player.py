@@ -20,23 +20,14 @@ JUMP_NS: Final = NS_PER_S // 3
 
 
 class PlayerState(NamedTuple):
-    """State of a player.
+    """State of a player."""
 
-    Attributes:
-        at_s: place of the newest scan, in [s] since the first of the recording.
-        length_s: place of the last scan.
-        speed: seconds of the recording in a second.
-        paused: True while nothing is played.
-        waiting: True until somebody looks.
-        rounds: complete rounds so far.
-    """
-
-    at_s: float
-    length_s: float
-    speed: float
-    paused: bool
-    waiting: bool
-    rounds: int
+    at_s: float  # place of the newest scan, in [s] since the first of the recording
+    length_s: float  # place of the last scan
+    speed: float  # seconds of the recording in a second
+    paused: bool  # True while nothing is played
+    waiting: bool  # True until somebody looks
+    rounds: int  # complete rounds so far
 
     @property
     def rests(self) -> bool:

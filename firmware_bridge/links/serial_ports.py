@@ -30,25 +30,16 @@ LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 
 
 class Port(NamedTuple):
-    """One serial port.
+    """One serial port."""
 
-    Attributes:
-        path: path of the port, such as /dev/ttyUSB0.
-        usb_id: vendor and product; None for a port that is not on USB.
-        serial_number: serial number of the USB device, which several ports may share.
-        description: description for the user; `product` and `manufacturer` are as the device reports them.
-        interface: port of a device with several ones, such as "1.0".
-        location: bus and sockets of the USB device, such as "1-2.3".
-    """
-
-    path: str
-    usb_id: tuple[int, int] | None
-    serial_number: str | None
-    description: str
+    path: str  # path of the port, such as /dev/ttyUSB0
+    usb_id: tuple[int, int] | None  # vendor and product; None for a port that is not on USB
+    serial_number: str | None  # serial number of the USB device, which several ports may share
+    description: str  # description for the user; `product` and `manufacturer` are as the device reports them
     product: str | None = None
     manufacturer: str | None = None
-    interface: str | None = None
-    location: str | None = None
+    interface: str | None = None  # port of a device with several ones, such as "1.0"
+    location: str | None = None  # bus and sockets of the USB device, such as "1-2.3"
 
     @property
     def identity(self) -> tuple[object, ...] | None:

@@ -26,23 +26,14 @@ _RULE: Final = "=" * 80
 
 
 class Field(NamedTuple):
-    """One field: a number, a text, or a message.
+    """One field: a number, a text, or a message."""
 
-    Attributes:
-        name: name of the field.
-        kind: name of its kind, such as "uint8", "string" or "std_msgs/Header".
-        number: encoding of a number, else None.
-        dtype: type of the numbers in an array, else None.
-        length: length of an array, 0 if it is variable; None for a single value.
-        message: type of a message, or of those in a sequence, else None.
-    """
-
-    name: str
-    kind: str
-    number: struct.Struct | None = None
-    dtype: np.dtype[Any] | None = None
-    length: int | None = None
-    message: "MessageType | None" = None
+    name: str  # name of the field
+    kind: str  # name of its kind, such as "uint8", "string" or "std_msgs/Header"
+    number: struct.Struct | None = None  # encoding of a number, else None
+    dtype: np.dtype[Any] | None = None  # type of the numbers in an array, else None
+    length: int | None = None  # length of an array, 0 if it is variable; None for a single value
+    message: "MessageType | None" = None  # type of a message, or of those in a sequence, else None
 
 
 class MessageType:

@@ -62,19 +62,12 @@ class Cycle(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ModelMap:
-    """Map from CAN ids to the taxels of sensors.
+    """Map from CAN ids to the taxels of sensors."""
 
-    Attributes:
-        name: name of the sensor model or layout.
-        geometry: geometry of each sensor.
-        taxels: CAN id -> (sensor, taxel).
-        triggered: True where the controller stays silent until it gets its `trigger_frame`.
-    """
-
-    name: str
-    geometry: SensorGeometry
-    taxels: Mapping[int, tuple[str, int]]
-    triggered: bool = False
+    name: str  # name of the sensor model or layout
+    geometry: SensorGeometry  # geometry of each sensor
+    taxels: Mapping[int, tuple[str, int]]  # CAN id -> (sensor, taxel)
+    triggered: bool = False  # True where the controller stays silent until it gets its `trigger_frame`
 
     def __post_init__(self) -> None:
         if not 0 < self.geometry.taxel_count <= MOST_TAXELS:

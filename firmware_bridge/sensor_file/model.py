@@ -75,27 +75,16 @@ class PadFrame:
 
 @dataclass(frozen=True)
 class SensorEntry:
-    """Properties of one sensor.
+    """Properties of one sensor."""
 
-    Attributes:
-        mounting: mounting of the sensor.
-        counts_per_newton: its summed z per [N].
-        baseline: counts of its free pad.
-        pad: constants and gains of the pad, measured or entered by hand.
-        learned: its gains as a running sensor has learned them from contacts.
-        assumed: those of PARTS that were never measured.
-        emulated: those of PARTS that were measured on an emulated sensor.
-        frame: place of the pad on the robot, entered by hand.
-    """
-
-    mounting: Mounting = field(default_factory=Mounting)
-    counts_per_newton: float | None = None
-    baseline: Baseline | None = None
-    pad: Pad | None = None
-    learned: Pad | None = None
-    assumed: frozenset[str] = frozenset()
-    emulated: frozenset[str] = frozenset()
-    frame: PadFrame | None = None
+    mounting: Mounting = field(default_factory=Mounting)  # mounting of the sensor
+    counts_per_newton: float | None = None  # its summed z per [N]
+    baseline: Baseline | None = None  # counts of its free pad
+    pad: Pad | None = None  # constants and gains of the pad, measured or entered by hand
+    learned: Pad | None = None  # its gains as a running sensor has learned them from contacts
+    assumed: frozenset[str] = frozenset()  # those of PARTS that were never measured
+    emulated: frozenset[str] = frozenset()  # those of PARTS that were measured on an emulated sensor
+    frame: PadFrame | None = None  # place of the pad on the robot, entered by hand
 
     @property
     def used_pad(self) -> Pad | None:
@@ -110,21 +99,13 @@ class SensorEntry:
 
 @dataclass(frozen=True)
 class SensorFile:
-    """Content of one sensor file.
+    """Content of one sensor file."""
 
-    Attributes:
-        model: name of the id map, one of ID_MAPS unless there is an `own_map`.
-        adapter: serial number of the USB adapter; None if it is not available.
-        sensors: entries by sensor name.
-        own_map: id map outside ID_MAPS, for a program's own pad; files cannot hold it.
-        path: file that it was read from; None without.
-    """
-
-    model: str = USPA44_MAP.name
-    adapter: str | None = None
-    sensors: Mapping[str, SensorEntry] = field(default_factory=dict)
-    own_map: ModelMap | None = None
-    path: Path | None = field(default=None, compare=False)
+    model: str = USPA44_MAP.name  # name of the id map, one of ID_MAPS unless there is an `own_map`
+    adapter: str | None = None  # serial number of the USB adapter; None if it is not available
+    sensors: Mapping[str, SensorEntry] = field(default_factory=dict)  # entries by sensor name
+    own_map: ModelMap | None = None  # id map outside ID_MAPS, for a program's own pad; files cannot hold it
+    path: Path | None = field(default=None, compare=False)  # file that it was read from; None without
 
     @property
     def mountings(self) -> dict[str, Mounting]:
