@@ -38,8 +38,7 @@ from edge.perception.wrench import Wrench
 from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import Latest
 from edge.pipeline.pose_queue import PoseQueue
-from edge.pipeline.pump import pump
-from edge.pipeline.result_stream import Stream
+from edge.pipeline.result_stream import Stream, pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import load_model, open_runtime
 from edge.pipeline.scan_reader import Source

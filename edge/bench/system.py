@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple, TextIO, TypeVar
 import numpy as np
 
 from edge.bench.options import BenchError
-from edge.pipeline.pump import uncollected
+from edge.pipeline.result_stream import uncollected
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines

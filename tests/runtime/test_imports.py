@@ -41,7 +41,7 @@ def test_no_module_of_the_runtime_loads_a_training_library():
         if path.stem != "__init__" and (find_spec("cyclonedds") or "ros2" not in path.parts)
     ]
     assert {"edge.cli.main", "edge.inference.onnx_session", "firmware_bridge.emulation.robot_main"} <= set(modules)
-    light = "edge.inference.contract", "edge.api", "edge.cli.main", "edge.pipeline.pump", "edge.sinks.registry"
+    light = "edge.inference.contract", "edge.api", "edge.cli.main", "edge.pipeline.result_stream", "edge.sinks.registry"
     first, every = run(
         f"import sys, {', '.join(light)}\nprint(*sys.modules)\nimport {', '.join(modules)}\nprint(*sys.modules)"
     )

@@ -5,7 +5,7 @@ import threading
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_scan
 
 from edge.perception.runtime import Runtime
-from edge.pipeline.pump import pump
+from edge.pipeline.result_stream import pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
 from firmware_bridge.zeroing.baseline import Baseline

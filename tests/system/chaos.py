@@ -33,7 +33,7 @@ from chaos_judge import RATE_HZ, REST_COUNTS, Judge, telling
 from chaos_wire import FaultyBus, Sent, stretches
 from numpy.typing import NDArray
 
-from edge.pipeline.pump import uncollected
+from edge.pipeline.result_stream import uncollected
 from edge.sinks.jsonl import PIPE_BYTES
 from edge.terminal.argument_types import whole
 from edge.terminal.progress_bar import tracked

@@ -19,7 +19,7 @@ from view_samples import HANDSHAKE, TIMEOUT_S, Mapped, Press, frame, get, live_p
 from websockets.exceptions import ConnectionClosed
 
 from edge.view import server
-from edge.view.static_page import SCRIPTS, load_page
+from edge.view.server import SCRIPTS, load_page
 
 __all__ = ["page"]
 TOKEN = "correct-horse-battery"

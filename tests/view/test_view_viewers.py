@@ -10,7 +10,7 @@ from edge_samples import wait_for
 from view_samples import HANDSHAKE, LONG_PING, Swallowing, frame, get, live_page, page, refused_with
 from websockets.sync.client import connect
 
-from edge.pipeline.pump import uncollected
+from edge.pipeline.result_stream import uncollected
 from edge.view import server
 from edge.view import viewers as attended
 from edge.view.viewers import MOST_CONNECTIONS, MOST_VIEWERS
