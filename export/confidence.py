@@ -6,8 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.metrics import judge_model, mean_error, windows_of
-from edge.evaluation.test_set import FrozenSet
+from edge.evaluation.test_set import FrozenSet, judge_model, mean_error, windows_of
 from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Model

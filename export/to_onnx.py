@@ -21,8 +21,7 @@ import onnx
 import torch
 
 from edge.errors import EdgeError
-from edge.evaluation.metrics import judge_model, mean_error
-from edge.evaluation.test_set import FrozenSet, load_frozen_set
+from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.inference.onnx_session import ModelSession, load_session

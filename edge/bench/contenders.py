@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError, UsageError
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
-from edge.evaluation.metrics import infer_with_intervals, judge, mean_error, volume_mm3
-from edge.evaluation.test_set import FrozenSet
+from edge.evaluation.metrics import volume_mm3
+from edge.evaluation.test_set import FrozenSet, infer_with_intervals, judge, mean_error
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44

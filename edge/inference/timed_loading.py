@@ -30,13 +30,8 @@ def within_limit(
 ) -> Made:
     """Do a part of loading a model on another thread, and return its value or raise its exception.
 
-    Abandoned work goes on until it ends, `give_up` ends it, or the program ends. See `unfinished_load`.
-
-    Args:
-        work: the part to do.
-        path: of the model, for the message.
-        stop: event that ends the wait early.
-        give_up: asks the work to end, and does not wait for it.
+    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends. See
+    `unfinished_load`.
 
     Raises:
         ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.

@@ -42,7 +42,7 @@ LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked:
 MOST_MISMATCH: Final = 0.8
 """Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
 one in 300 right ones."""
-MOST_DOUBT: Final = 0.61
+MOST_DOUBT: Final = 0.65
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
 With the other limits some 2 % of simulated contacts less than 30 % off are not believed, and three in ten of those more

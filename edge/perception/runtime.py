@@ -26,21 +26,13 @@ MOST_TOGETHER: Final = 4  # sensors whose patterns are made in one call: scans t
 
 
 class Runtime:
-    """Maker of one result per scan.
+    """Maker of one result per scan; `open_runtime` makes one, and describes the settings that are not listed here.
 
     Args:
-        model: the loaded model.
-        source: kind of source that the scans come from; every result carries it.
         estimator: of dead taxels, on the same grid; without it there is no pattern while a taxel is dead.
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
-        geometry: of the sensors; refused if the model was not trained for it.
-        baselines: stored ones by sensor name, as in `open_runtime`.
-        counts_per_newton: as in `open_runtime`; without it a force in newtons is the vendor's, if the scan has one.
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
-        pad: as in `open_runtime`. Counts per newton that it lacks are those above.
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
-        options: the other settings of `open_runtime`.
-        clock_ns: measures run time.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
 

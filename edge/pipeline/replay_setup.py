@@ -91,10 +91,7 @@ def open_recording(
 def recorded_baselines(text: str, known: SensorFile, rate_hz: float | None) -> tuple[dict[str, Baseline], list[str]]:
     """Return the baselines of FILE[,FILE], from where each pad is free and still, and notes where that is.
 
-    Args:
-        text: the files.
-        known: settings of the sensors.
-        rate_hz: scans a second of each sensor, where a file does not state it.
+    `rate_hz` is that of each sensor, where a file does not state it.
 
     Raises:
         BaselineRefusedError: a pad is nowhere free and still.

@@ -70,13 +70,8 @@ class McapScans(McapFile):
     ) -> None:
         """Begin the file; one that exists is left alone.
 
-        Without the mountings of the run, axes would point elsewhere when the file is played again.
-
-        Args:
-            path: of the file.
-            run: its offset is 0 where the time of recording is unknown, and None for the clocks as they are now.
-            facts: further metadata, by name.
-            clock_s: monotonic, in [s].
+        Without the mountings of the run, axes would point elsewhere when the file is played again. Its offset is 0
+        where the time of recording is unknown, and None for the clocks as they are now. `facts` are further metadata.
 
         Raises:
             SinkError: the file exists, or cannot be written.

@@ -52,14 +52,9 @@ class CanBusLink(Link):
         triggers: Sequence[CanFrame] = (),
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare a link; nothing is opened yet.
+        """Prepare a link to a channel such as "can0" of a python-can interface such as "socketcan"; opens nothing yet.
 
-        Args:
-            interface: interface of python-can, such as "socketcan".
-            channel: name of the channel on the interface, such as "can0".
-            model: map from CAN ids to taxels.
-            triggers: frames that wake older controllers, sent once after opening.
-            clock_ns: monotonic clock, in [ns].
+        `triggers` are frames that wake older controllers, sent once after opening.
 
         Raises:
             SourceError: python-can has no such interface, or this link does not support it.

@@ -50,16 +50,11 @@ def open_sources(
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> list[Link]:
-    """Create the links that `texts` name, not yet entered; a lost one is opened again.
+    """Create the links that `texts` name, not yet entered, as `open_source` does; a lost one is opened again.
 
-    Args:
-        texts: each one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4". Among several sources, those
-            without a name are called by their place, source1 and so on.
-        rate_hz: as in `open_source`.
-        demo_recording: as in `open_source`.
-        model: as in `open_source`.
-        give_up_s: longest outage of a source, in [s]; 0: its first loss is raised.
-        mountings: mountings of sensors, by name including that of their source.
+    Each text is one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4", also in `mountings`. Among several
+    sources, those without a name are called by their place, source1 and so on. `give_up_s` is the longest outage of a
+    source, in [s]; at 0 its first loss is raised.
 
     Raises:
         SourceError: no such form, or one name twice; and the other errors of `open_source`.

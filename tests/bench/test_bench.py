@@ -21,8 +21,7 @@ from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenanc
 from edge.bench.system import measured
 from edge.cli.main import main
 from edge.errors import ModelError
-from edge.evaluation.metrics import judge_model, mean_error
-from edge.evaluation.test_set import load_frozen_set
+from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 

@@ -26,7 +26,7 @@ from train.experiments.paper.force import (
 )
 from train.experiments.paper.protocol import classical_methods, mixed
 from train.experiments.support.workbench import Method
-from train.physics.sensor_noise import Nuisances
+from train.physics.sensor_noise import NAMES, Nuisances
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,8 @@ def _giving(patterns):
 
 
 COURSE = Course(20.0)
-GAINS = replace(Nuisances.none(), gain_spread=0.075)
+NONE = Nuisances().without(*NAMES)
+GAINS = replace(NONE, gain_spread=0.075)
 RAMP_N = 5.0 * COURSE.share
 
 
@@ -168,7 +169,7 @@ def test_a_course_presses_holds_releases_and_rests():
 
 
 def test_without_nuisances_a_press_and_its_release_read_alike(four):
-    scans = pressed(four, 0, COURSE, Nuisances.none())
+    scans = pressed(four, 0, COURSE, NONE)
     assert scans.force_n.max() == pytest.approx(5.0, rel=1e-5)
     assert loop_percent(scans.force_n, z_of(scans) / 1400, COURSE) < 0.2  # counts are whole
     np.testing.assert_allclose(scans.volume_mm3 / scans.volume_mm3.max(), scans.force_n / 5.0, atol=1e-5)
@@ -181,8 +182,8 @@ def test_without_nuisances_a_press_and_its_release_read_alike(four):
 
 
 def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind(four):
-    free = z_of(pressed(four, 0, COURSE, Nuisances.none()))
-    lagging = z_of(pressed(four, 0, COURSE, replace(Nuisances.none(), hysteresis=0.11)))
+    free = z_of(pressed(four, 0, COURSE, NONE))
+    lagging = z_of(pressed(four, 0, COURSE, replace(NONE, hysteresis=0.11)))
     press, hold, release, rest = (COURSE.phase == phase for phase in range(4))
     assert (lagging[press][5:] < free[press][5:]).all()
     assert np.corrcoef(lagging[hold][:40], np.arange(40))[0, 1] > 0.9  # it creeps up
@@ -190,12 +191,12 @@ def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind
     assert (lagging[release] > free[release])[-5:].all()
     assert lagging[rest][0] > 0
     assert lagging[rest][-1] < lagging[rest][0] / 2
-    scans = pressed(four, 0, COURSE, Nuisances.none())
+    scans = pressed(four, 0, COURSE, NONE)
     assert loop_percent(scans.force_n, lagging / 1400, COURSE) > loop_percent(scans.force_n, free / 1400, COURSE)
 
 
 def test_one_sensor_reads_the_course_and_the_earlier_taps(four):
-    clean = pressed(four, 0, COURSE, Nuisances.none()).windows[100]
+    clean = pressed(four, 0, COURSE, NONE).windows[100]
     read = pressed(four, 0, COURSE, GAINS).windows[100]
     clear = np.abs(clean).min(axis=0) > 200
     gain = np.where(clear, read / np.where(clear, clean, 1), 1)
@@ -203,7 +204,7 @@ def test_one_sensor_reads_the_course_and_the_earlier_taps(four):
     np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
     assert np.ptp(gain[0][clear]) > 0.05
     other = pressed(four, 1, COURSE, GAINS).windows[100]
-    other_clean = pressed(four, 1, COURSE, Nuisances.none()).windows[100]
+    other_clean = pressed(four, 1, COURSE, NONE).windows[100]
     both = clear & (np.abs(other_clean).min(axis=0) > 200)
     assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)
 

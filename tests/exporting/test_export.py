@@ -19,7 +19,7 @@ from export_samples import (
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.evaluation.metrics import infer_with_intervals, judge, mean_error
+from edge.evaluation.test_set import infer_with_intervals, judge, mean_error
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession

@@ -9,8 +9,7 @@ import pytest
 from onnx import numpy_helper
 
 from edge.errors import ModelError
-from edge.evaluation.metrics import judge_model
-from edge.evaluation.test_set import load_frozen_set
+from edge.evaluation.test_set import judge_model, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession

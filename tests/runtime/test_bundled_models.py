@@ -10,8 +10,7 @@ import pytest
 
 from edge.errors import WindowError
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.metrics import judge, judge_model, mean_error
-from edge.evaluation.test_set import load_frozen_set
+from edge.evaluation.test_set import judge, judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, POSED_MODEL, bundled_models, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.pipeline.runtime_setup import load_model

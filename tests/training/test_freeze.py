@@ -7,7 +7,7 @@ from press_samples import make_press_set
 
 from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.metrics import judge
+from edge.evaluation.test_set import judge
 from edge.inference.bundled import BUNDLE_DIR
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording

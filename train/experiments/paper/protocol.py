@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
-from edge.evaluation.metrics import judge
-from edge.evaluation.test_set import FrozenSet
+from edge.evaluation.test_set import FrozenSet, judge
 from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.metrics import judge
-from edge.evaluation.test_set import FrozenSet
+from edge.evaluation.test_set import FrozenSet, judge
 from edge.terminal.progress_bar import tracked
 from train.data.presses import PressSet, join_presses
 from train.errors import CheckpointError

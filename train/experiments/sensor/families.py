@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import Method, bilinear, fit_gain, fit_linear_map
-from edge.evaluation.metrics import judge, psnr_db
+from edge.evaluation.metrics import psnr_db
+from edge.evaluation.test_set import judge
 from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regions
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
