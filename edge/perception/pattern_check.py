@@ -45,7 +45,7 @@ one in 300 right ones."""
 MOST_DOUBT: Final = 0.65
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
-With the other limits some 2 % of simulated contacts less than 30 % off are not believed, and three in ten of those more
+With the other limits 2 to 3 % of simulated contacts less than 30 % off are not believed, and three in ten of those more
 than 50 % off: `python -m train.experiments trust-checks`."""
 _DOUBT_POWER: Final = 0.1
 """Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
