@@ -222,14 +222,8 @@ def examine(
 ) -> list[Finding]:
     """Watch free, still pads and report faults of sensor and adapter, as `edge-sr doctor` does without a person.
 
-    Args:
-        texts: as for `open_source`, but at most one; no other program may read it meanwhile.
-        sensor: as for `open_source`.
-        id_map: as for `open_source`.
-        rate_hz: expected rate of each sensor, in [Hz].
-        baselines: of the free pads, or their file; by default those of the sensor file.
-        duration_s: how long to watch, in [s].
-        stop: event that ends it early.
+    The source is one of `open_source`, which no other program may read meanwhile; `rate_hz` is expected of each sensor,
+    and `baselines` of the free pads, or their file, are by default those of the sensor file. `stop` ends it early.
 
     Raises:
         BridgeError: as for `open_source`; LinkLostError if the link is lost meanwhile.

@@ -21,12 +21,8 @@ def paired(
 
     Times are those of the scans on the bus, where the device states them. Each result is used once at most; of two that
     could follow, the nearer one is taken, which is known a period later. Results without a partner are left out. Those
-    of one sensor may come long before those of another, as they do from a loop that was held up.
-
-    Args:
-        results: of all these sensors, such as a stream or a list.
-        sensors: names of two or more sensors, such as "left/4" and "right/4".
-        apart_s: longest time from the first to the last result of a pair, in [s].
+    of one sensor may come long before those of another, as they do from a loop that was held up. `apart_s` is the
+    longest time from the first to the last result of a pair, in [s].
 
     Raises:
         UsageError: fewer than two sensors, one twice, or the time is out of range; while pairs are taken, no sensor
