@@ -1,7 +1,7 @@
-"""Contract between a trained model and the runtime, kept in the ONNX metadata; poses of taps as model input."""
+"""Contract between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
 from typing import Any, Final
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.intervals import is_confidence, is_interval_levels, is_number
+from edge.inference.pose_input import POSE_WIDTH
 from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
-from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 9
@@ -311,26 +311,3 @@ def _is_pad_input(value: Any) -> bool:
     name, centre, spread = value
     low, high = PAD_RANGES.get(name, (1.0, 0.0)) if isinstance(name, str) else (1.0, 0.0)
     return low <= centre <= high and spread >= LEAST_UNIT
-
-
-POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")
-"""Numbers of a row; those of the newest tap are all zero."""
-POSE_WIDTH: Final = len(POSE_KEYS)
-
-
-def pose_rows(poses: Sequence[PadPose]) -> NDArray[np.float32]:
-    """Return the poses (taps, 5) of taps as model input; the first is the newest."""
-    rows = np.zeros((len(poses), POSE_WIDTH), dtype=np.float32)
-    for row, pose in zip(rows[1:], poses[1:], strict=True):
-        seen = pose.seen_from(poses[0])
-        row[:] = (seen.x_mm, seen.y_mm, seen.turn_deg, seen.error_mm, seen.error_deg)
-    return rows
-
-
-def scheduled_rows(taps: int, angle_step_deg: float) -> NDArray[np.float32]:
-    """Return the poses (taps, 5) of taps by the paper's schedule: tap k before the newest is turned by k steps."""
-    rows = np.zeros((taps, POSE_WIDTH), dtype=np.float32)
-    turn_deg = angle_step_deg * np.arange(1, taps)
-    rows[1:, 2] = (turn_deg + 180) % 360 - 180
-    rows[1:, 3:] = PLACE_ERROR_MM, TURN_ERROR_DEG
-    return rows

@@ -21,14 +21,12 @@ from edge.inference.contract import (
     INPUT_NAME,
     OUTPUT_NAME,
     PAD_NAME,
-    POSE_KEYS,
-    POSE_WIDTH,
     POSES_NAME,
     TRACTION_NAME,
     Contract,
-    scheduled_rows,
 )
 from edge.inference.onnx_guard import read_model
+from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
 from edge.inference.timed_loading import within_limit
 from firmware_bridge.errors import harmless
 

@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.contract import Contract, pose_rows, scheduled_rows
+from edge.inference.contract import Contract
+from edge.inference.pose_input import pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.pattern_check import REPEATS

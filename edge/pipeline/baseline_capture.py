@@ -27,12 +27,8 @@ def take_baselines(
 ) -> dict[str, Baseline]:
     """Take the baselines of all sensors of a source, by name, from free, still pads; give up at the first refusal.
 
-    Args:
-        source: open; its scans meanwhile go nowhere else.
-        scans: number of complete scans to take the median of, 100 or more; of a recording 30 or more.
-        skip: scans of each sensor to leave out first.
-        stop: event that ends it early.
-        clock_s: monotonic, in [s].
+    The scans of the source go nowhere else meanwhile. The median is of so many complete `scans` of each sensor, 100 or
+    more, of a recording 30 or more, after those to `skip`; `stop` ends it early.
 
     Raises:
         BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.

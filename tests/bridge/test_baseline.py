@@ -220,6 +220,11 @@ def test_the_id_stands_for_sensor_counts_and_time():
     assert made().id == BASELINE.id == "d148ecd3"
 
 
+def test_one_that_has_drifted_keeps_its_id_and_goes_round_the_circle():
+    drifted = made().moved(np.full(REST.shape, 65_000.0))
+    assert drifted.id == made().id and drifted.counts == pytest.approx((REST + 65_000) % 65_536)
+
+
 def test_saved_baselines_come_back(tmp_path):
     path = tmp_path / "zero.json"
     saved = [made(), made(REST + 0.5, "6", 123.456), made(sensor="8", created_unix_s=float("nan"))]

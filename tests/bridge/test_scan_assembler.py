@@ -325,6 +325,12 @@ def test_before_the_period_is_known_gaps_of_stamps_tell_a_pause(stamped):
     assert [int(scan.fresh.sum()) for scan in scans] == ([16, 9] if stamped else [16, 16])
 
 
+def test_readings_of_a_broken_link_count_though_they_were_not_fed():
+    assembler = ScanAssembler(USPA44_MAP)
+    assembler.abandon("4", 5)
+    assert counters(assembler) == {"readings": 5, "abandoned": 5}
+
+
 def test_where_stamps_end_the_open_scan_ends_too():
     """Arrivals are on another clock, by which no pause between the two shows."""
     assembler = ScanAssembler(USPA44_MAP)
