@@ -10,6 +10,7 @@ from trust_samples import make_checked_contract, make_posed_trust, make_trusted_
 
 from edge.api import USPA44, ModelError, Pad
 from edge.inference.contract import CONTRACT_VERSION, MOST, Contract
+from firmware_bridge.scans.pad_constants import PAD_RANGES
 
 BROKEN_VALUES = {
     "version": 1,
@@ -53,14 +54,20 @@ def read(contract, **changes):
     "contract",
     [
         make_contract(scale=64, interval_levels={"50": [0.5, 0.6, 0.5, 0.4], "90": [1.6] * 4}),
-        make_contract(traction_scale=1),
+        make_contract(traction_scale=1, interval_factor=0.5, output_unit="m"),
         make_pad_contract(),
+        make_pad_contract(pad_inputs=tuple((name, high, 0.01) for name, (_, high) in PAD_RANGES.items())),
         make_trusted_contract(),
         make_posed_contract(),
     ],
 )
 def test_what_is_written_is_read(contract):
     assert read(contract) == contract
+
+
+def test_a_constant_without_an_interval_is_exact():
+    contract = make_pad_contract(pad_inputs=(("poisson", 0.45, 0.02),), takes_gains=False)
+    assert contract.pad_row(Pad(poisson=0.46)).tolist() == pytest.approx([0.5, 1])
 
 
 @pytest.mark.parametrize("key", [one.name for one in fields(Contract)])
