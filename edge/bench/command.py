@@ -15,7 +15,8 @@ from typing import Any, Final, TextIO
 import numpy as np
 
 from edge.bench import contenders
-from edge.bench.contenders import FORCE_RANGE_N, ErrorRow, Subject, error_rows, force_floor_percent
+from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
+from edge.bench.contenders import Subject
 from edge.bench.options import BenchError
 from edge.bench.provenance import provenance, this_machine, with_head
 from edge.bench.system import Page, line, show_system
@@ -206,7 +207,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 def _write(
     folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
 ) -> None:
-    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("contenders", "timing"))]
+    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing"))]
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:

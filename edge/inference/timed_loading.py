@@ -60,8 +60,5 @@ def within_limit(
 
 
 def unfinished_load() -> bool:
-    """Return whether an abandoned load still goes on; the program must then end by `os._exit`.
-
-    Otherwise onnxruntime may crash at exit, when it frees objects that the thread still uses.
-    """
+    """Return whether an abandoned load goes on; `os._exit` must end the program then, or onnxruntime may crash."""
     return any(thread.name == _THREAD for thread in threading.enumerate())

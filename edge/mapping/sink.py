@@ -81,15 +81,10 @@ class MapSink(Sink):
         origin: SourceKind | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Check that the files can be written.
+        """Check that the files can be written: layers and picture, on `close` and at a reset; later ones are numbered.
 
-        Args:
-            whole: the map to fuse into.
-            npz: file of the layers, written on `close`, and at a reset; later maps have a number in their names.
-            png: picture, written likewise.
-            show: called with the map's state a few times a second; it must not wait.
-            origin: kind of source that the scans come from, where results are of a recording; else that of the results.
-            clock_ns: monotonic, in [ns].
+        `show` is called with the map's state a few times a second and must not wait. `origin` is the kind of source
+        that the scans of a recording come from.
 
         Raises:
             SinkError: a file exists, or cannot be written.

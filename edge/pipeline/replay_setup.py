@@ -116,15 +116,11 @@ def free_baselines(
     opening: bool = False,
     rate_hz: float | None = None,
 ) -> dict[str, Baseline]:
-    """Return the baselines of the sensors without one that the recordings are free and still for, and note where.
+    """Return the baselines of sensors that have none in `known`, from where the recordings are free and still.
 
-    Args:
-        replay: of the recordings; gets a note for each sensor.
-        mountings: those of taxels that still have to be put in place.
-        known: baselines that there are.
-        opening: also of a stretch from which a live run would zero by itself: the first scans; to be kept, so that a
-            date is one that the recording states.
-        rate_hz: of the recordings, as the user gave it.
+    The replay gets a note for each sensor. `mountings` are those of taxels that still have to be put in place. With
+    `opening` the first scans count, too, from which a live run would zero by itself: for baselines that are kept, whose
+    date is one that the recording states.
     """
     baselines: dict[str, Baseline] = {}
     for recording in replay.recordings:

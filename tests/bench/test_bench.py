@@ -15,7 +15,8 @@ from edge_samples import ROOT, make_contract, write_model
 
 from edge.bench import command, system
 from edge.bench import provenance as reports
-from edge.bench.contenders import FORCE_RANGE_N, Subject, error_rows, force_error_percent, force_floor_percent, subjects
+from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
+from edge.bench.contenders import Subject, subjects
 from edge.bench.options import BenchError
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
 from edge.bench.system import measured
