@@ -177,7 +177,7 @@ class ModelSession:
             window: (taps, 3, rows, cols) float32, newest first, in network input units; 1 to K taps of a model that
                 takes poses, else K.
             pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
-            poses: (taps, 5) float32 as edge.inference.contract makes them, for a model that takes poses; by default
+            poses: (taps, 5) float32 as edge.inference.pose_input makes them, for a model that takes poses; by default
                 those of the paper's schedule, and zeros for taps of zeros.
 
         Returns:

@@ -78,7 +78,7 @@ def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -
 
     Args:
         window: (K, 3, rows, cols) in network units, newest tap first.
-        poses: (K, 5), as edge.inference.contract makes them.
+        poses: (K, 5), as edge.inference.pose_input makes them.
     """
     readings = window[0].size
     features = np.empty((len(window) - 1, pair_width(readings)), dtype=np.float32)

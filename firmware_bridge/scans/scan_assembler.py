@@ -234,7 +234,7 @@ class _Sensor:
         paused = gap_ns > wire.pause_ns
         # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
         if wire.gaps_ns is not None and (device is not None or not wire.order):
-            wire.follow_gap(gap_ns)
+            wire.follow_gap(gap_ns, taxel)
         closed: list[Scan] = []
         place = wire.places[taxel]
         if (paused or place != self._place + 1) and self._taxels:

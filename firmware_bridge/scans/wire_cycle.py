@@ -6,8 +6,9 @@ fragments; then its cycles are cut by pauses alone, until two in a row came in t
 sensor's.
 
 A pause within a cycle ends it where whole cycles may have been lost meanwhile, so from half a period on, of the shorter
-ones, as a lost cycle makes them longer. Until there are enough, the readings alone show the pauses; while the order is
-to be learnt, an eighth of a period is one. Limit: where nearly all cycles of the first eight are lost, two may mix.
+ones, as a lost cycle makes them longer. Until there are enough, the shortest time between two readings of one taxel is
+the period; while the order is to be learnt, an eighth of it is a pause. Limit: where nearly all cycles of the first
+eight are lost, two may mix.
 
 Arrivals show no pause within what was read in one piece. There a lost cycle shows by the count: cycles end a period
 apart, and a read only delays them. So one that ends late by most of a period may hold readings of two cycles, unless
@@ -59,6 +60,8 @@ class WireCycle:
         self.in_pieces = False
         self._length = len(order)
         self.gaps_ns: deque[int] | None = deque(maxlen=self._length)
+        self._cycle_ns, self._read_ns = self._length * LONGEST_PAUSE_NS, 0
+        self._read_at_ns: dict[int, int] = {}
         self.doubts = 0
         self._newest_order: tuple[int, ...] = ()
         self.period_ns: int | None = None
@@ -96,13 +99,22 @@ class WireCycle:
         before, self._paused_at = self._paused_at, place
         return paced and place != before
 
-    def follow_gap(self, gap_ns: int) -> None:
-        """Derive the limit of pauses from the gaps between readings, until cycles show the period."""
-        if self.gaps_ns is not None and 0 <= gap_ns <= LONGEST_PAUSE_NS:
-            self.gaps_ns.append(gap_ns)
-            shorter = sorted(self.gaps_ns)[: (len(self.gaps_ns) + 1) // 2]  # lost cycles make some of them longer
-            cycle_ns = sum(shorter) * self._length // len(shorter)
-            self.pause_ns = min(max(cycle_ns // (2 if self.order else 8), SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
+    def follow_gap(self, gap_ns: int, taxel: int) -> None:
+        """Derive the limit of pauses from the gap before a reading, until cycles show the period."""
+        if self.gaps_ns is None:
+            return
+        if not 0 <= gap_ns <= LONGEST_PAUSE_NS:
+            self._read_at_ns.clear()
+            return
+        self.gaps_ns.append(gap_ns)
+        self._read_ns += gap_ns
+        # From a taxel to the same one a period passes, or several where cycles were lost: the shortest time counts.
+        before_ns = self._read_at_ns.get(taxel)
+        self._read_at_ns[taxel] = self._read_ns
+        if before_ns is not None:
+            self._cycle_ns = min(self._cycle_ns, self._read_ns - before_ns)
+        cycle_ns = min(sum(self.gaps_ns) * self._length // len(self.gaps_ns), self._cycle_ns)
+        self.pause_ns = min(max(cycle_ns // (2 if self.order else 8), SHORTEST_PAUSE_NS), LONGEST_PAUSE_NS)
 
     def doubt(self) -> None:
         """Count a sign of another order."""
@@ -167,6 +179,8 @@ class WireCycle:
     def _measure(self) -> None:
         usual, count = sorted(self._intervals), len(self._intervals)
         shorter_ns = usual[count // 8]
+        if shorter_ns >= SHORTEST_PAUSE_NS:
+            self._cycle_ns = min(self._cycle_ns, shorter_ns)
         low_ns, high_ns = usual[count // 4], usual[count - 1 - count // 4]
         self.in_pieces = low_ns < SHORTEST_PAUSE_NS < high_ns // 2  # sooner than a bus carries a cycle
         # Lost cycles make some of them longer, so the middle half counts; but all do where many are read in one piece.
@@ -190,7 +204,8 @@ class WireCycle:
         self.places = {taxel: place for place, taxel in enumerate(order)} if order else _Nowhere()
         self.doubts = 0
         if not order:
-            self.gaps_ns = deque(maxlen=self._length)
+            self.gaps_ns, self._cycle_ns = deque(maxlen=self._length), self._length * LONGEST_PAUSE_NS
+            self._read_at_ns.clear()
             self.period_ns = self._ended_ns = None
             self._intervals.clear()
 

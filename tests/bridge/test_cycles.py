@@ -159,6 +159,18 @@ def test_no_scan_is_of_two_cycles_on_a_faulty_bus(reader, fault, share, rates_hz
     assert max(found.waits_ns) < LONGEST_WAIT_NS or reader is PLAIN_BURSTS
 
 
+@pytest.mark.parametrize("reader", [PLAIN, STAMPED, STAMPED_BURSTS, USB], ids=str)
+@pytest.mark.parametrize("group", [1, 2, 4, 8])
+def test_a_sensor_that_sends_its_taxels_in_groups_is_read_whole(reader, group):
+    frames = [
+        (cycle * 0.01 + place // group * 0.009 * group / 16 + place % group * 0.00013, frame)
+        for cycle in range(30)
+        for place, (_, frame) in enumerate(bus(30)[16 * cycle : 16 * cycle + 16])
+    ]
+    found = read(frames, reader)
+    assert found.mixed == 0 and found.whole >= 29  # the pauses within it are learnt from the first cycle
+
+
 @pytest.mark.parametrize("again", [False, True], ids=["opened", "opened again"])
 @pytest.mark.parametrize("reader", [STAMPED, STAMPED_BURSTS, USB], ids=str)
 @pytest.mark.parametrize("lost", [0, 1, 3, 5])
