@@ -42,11 +42,11 @@ LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked:
 MOST_MISMATCH: Final = 0.8
 """Mismatch from which a pattern does not explain its readings: nine in ten of another press's patterns exceed it, and
 one in 300 right ones."""
-MOST_DOUBT: Final = 0.65
+MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
-With the other limits 2 to 3 % of simulated contacts less than 30 % off are not believed, and three in ten of those more
-than 50 % off: `python -m train.experiments trust-checks`."""
+With the other limits 3 to 4 % of simulated contacts less than 30 % off are not believed, and a third of those more than
+50 % off: `python -m train.experiments trust-checks`."""
 _DOUBT_POWER: Final = 0.1
 """Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
 _MOST_CHECKERBOARD: Final = 0.9

@@ -59,8 +59,8 @@ class TestReasons:
             *((make_tap(z, x=0.6), {}, False, "unfamiliar") for z in (0.5, 2.0, 3.5)),  # whatever the force
             (make_tap(), {"factor": 2}, False, "unexplained"),
             # The lighter it is, the sooner it is told that the model is not sure.
-            *((make_tap(z), {"doubt": limit - 0.01}, True, None) for z, limit in ((0.2, 0.553), (3.0, 0.726))),
-            *((make_tap(z), {"doubt": limit + 0.01}, False, "uncertain") for z, limit in ((0.2, 0.553), (3.0, 0.726))),
+            *((make_tap(z), {"doubt": limit - 0.01}, True, None) for z, limit in ((0.2, 0.519), (3.0, 0.681))),
+            *((make_tap(z), {"doubt": limit + 0.01}, False, "uncertain") for z, limit in ((0.2, 0.519), (3.0, 0.681))),
         ],
     )
     def test_a_pattern_is_believed_or_not_for_a_reason(self, tap, how, trusted, reason):
