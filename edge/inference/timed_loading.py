@@ -30,8 +30,7 @@ def within_limit(
 ) -> Made:
     """Do a part of loading a model on another thread, and return its value or raise its exception.
 
-    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends. See
-    `unfinished_load`.
+    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends.
 
     Raises:
         ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.

@@ -45,8 +45,7 @@ one in 300 right ones."""
 MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
-With the other limits 3 to 4 % of simulated contacts less than 30 % off are not believed, and a third of those more than
-50 % off: `python -m train.experiments trust-checks`."""
+With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
 _DOUBT_POWER: Final = 0.1
 """Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
 _MOST_CHECKERBOARD: Final = 0.9

@@ -23,12 +23,9 @@ if TYPE_CHECKING:
 
 
 def load_model(model: str | Path, threads: int = 1, stop: threading.Event | None = None) -> "ModelSession":
-    """Load a model and its contract.
+    """Load a model, a file or a bundled one by its name, and its contract; mtsr2 to mtsr7 take as many taps at most.
 
-    Args:
-        model: a file, or the name of a bundled one; mtsr2 to mtsr7 take as many taps at most.
-        threads: number of threads that share the work of one run.
-        stop: event that ends the loading early.
+    `threads` share the work of one run, and `stop` ends the loading early.
 
     Raises:
         ModelError: the model does not exist or cannot be used; the message names the bundled ones or the fault.

@@ -56,12 +56,9 @@ class Controller(NamedTuple):
 
 
 def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
-    """Create the controllers that play these recordings on one bus.
+    """Create the controllers that play these recordings on one bus: each track is one.
 
-    Args:
-        recordings: each track is a controller.
-        can_ids: their ids, 0..15; by default 4, 6, 8, ...
-        rate_hz: scans a second of each; by default as recorded.
+    Their ids are 0..15, by default 4, 6, 8, ..., and their rates by default as recorded.
 
     Raises:
         ValueError: an id or the rate is invalid.

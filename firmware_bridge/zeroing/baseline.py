@@ -199,10 +199,7 @@ class BaselineEstimator:
 def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
     """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
-    Args:
-        path: path of the file.
-        baselines: one per sensor.
-        orders: order of the taxels of each sensor whose mounting differs from its id map.
+    `orders` are those of the taxels of each sensor whose mounting differs from its id map.
 
     Raises:
         ValueError: two baselines of one sensor.
@@ -235,11 +232,7 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orde
 
 
 def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Baseline]:
-    """Read baselines, by sensor.
-
-    Args:
-        path: path of the file.
-        orders: present order of the taxels, as in `save_baselines`.
+    """Read baselines, by sensor; `orders` are the present ones of the taxels, as in `save_baselines`.
 
     Raises:
         RecordingError: the file cannot be read, or is no baseline file, was changed by hand, or its taxels lay in
