@@ -45,6 +45,11 @@ def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
     assert Cadence(100).period_ns == followed(intervals_ms, rate_hz=100).period_ns == 10 * MS
 
 
+def test_a_pattern_is_late_after_one_period_and_not_before():
+    cadence = followed([10] * 9)
+    assert not cadence.late(10_000) and cadence.late(10_000.001) and not Cadence().late(1e9)
+
+
 @pytest.mark.parametrize(
     ("scans", "missed"),
     [

@@ -123,6 +123,16 @@ class TestLearner:
         drift[2] = 45 + np.random.default_rng(0).normal(0, 12, (4, 4))
         assert rms(np.log(taught(draw_contacts(70) + drift).gains)) < 0.03
 
+    def test_it_begins_at_measured_gains_and_stays_there(self):
+        gains = draw_gains()
+        start = Pad(gains=tuple(gains.tolist()), gain_half_widths=(0.02,) * GAINS)
+        learner = GainLearner(MODEL, start)
+        np.testing.assert_allclose(learner.gains, gains)
+        assert learner.pad().gains_certainty == pytest.approx(start.gains_certainty, abs=0.02)
+        learner = taught(draw_contacts(120, gains), start=start)
+        assert rms(np.log(learner.gains / gains)) < 0.015
+        assert learner.pad().gains_certainty == pytest.approx(start.gains_certainty, abs=1e-4), "and no surer"
+
     def test_the_bundled_model_is_read_and_another_file_named(self, tmp_path):
         model = load_contact_model(CONTACTS)
         assert len(model.means) >= 24 and CONTACTS.stat().st_size < 400_000
