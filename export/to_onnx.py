@@ -36,15 +36,16 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
 from train.data.paper_taps import paper_taps
-from train.data.press_batches import COUNTS_PER_UNIT
+from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
-from train.learning.checkpoint import load_network, origin
+from train.learning.checkpoint import load_network, origin, sensor_of
 from train.learning.interval_fit import Run, conform, fit_correction, half_width_mm, readings_of_presses
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.symmetric import write_out
 from train.physics.pad_draws import input_scale
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 from train.trust import load_trust
 
@@ -95,6 +96,7 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> C
         takes_poses=net.takes_poses,
         reach_mm=REACH_MM if net.takes_poses else 0.0,
         unposed_taps=1 if net.takes_poses else net.taps,
+        made_for={name: [*ends] for name, ends in sensor.made_for.items()} if (sensor := sensor_of(report)) else {},
     )
 
 
@@ -104,10 +106,12 @@ class IntervalData:
 
     validation: PressSet
     training: PressSet | None = None
+    sensor: OneSensor | None = None  # that reads them, instead of any
 
     def conformed(self, net: CompactNet, run: Run) -> dict[str, list[float]]:
         """Shift a corrected network's deviations until they hold for `run`, and return its levels; see `conform`."""
-        return conform(net, run, readings_of_presses(self.validation, net.taps, posed=net.takes_poses))
+        sensor = self.sensor
+        return conform(net, run, readings_of_presses(self.validation, net.taps, posed=net.takes_poses, sensor=sensor))
 
 
 def export(
@@ -209,6 +213,7 @@ def main(arguments: list[str] | None = None) -> None:
     add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
     add("--trust", type=Path, metavar="FILE", help="checks of train.trust, with --validation, or those of a model")
     add("--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training")
+    add("--test", type=Path, metavar="FILE", help="presses of a test set in place of the frozen one, for train.own")
     help_of_int8 = "write NAME-int8.onnx too, with ranges from these taps"
     add("--int8", type=Path, nargs="+", metavar="DATA", help=help_of_int8)
     options = parser.parse_args(arguments)
@@ -217,16 +222,20 @@ def main(arguments: list[str] | None = None) -> None:
     lines: list[str] = []
     try:
         options.out.mkdir(parents=True, exist_ok=True)
+        sensor = sensor_of(load_network(options.checkpoints[0])[1])
+        nuisances = Nuisances() if sensor is None else sensor.nuisances
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+        if options.test is not None:
+            frozen = freeze_presses(load_presses(options.test), SEED, nuisances).as_frozen_set()
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
         presses = intervals = None
         if options.validation is None:
             validation = confidence_sets(paper_taps("validation"), frozen.scale)
         else:
             presses = load_presses(options.validation)
-            validation = [freeze_presses(presses, SEED).as_frozen_set()]
+            validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
             training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
-            intervals = IntervalData(presses, training)
+            intervals = IntervalData(presses, training, sensor)
         trust = None if options.trust is None else load_trust(options.trust, presses)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(

@@ -1,6 +1,7 @@
 """Contract between a trained model and the runtime, kept in the ONNX metadata."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
@@ -39,6 +40,8 @@ OUTSIDE: Final = 1.5
 """Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
 DETERMINED: Final = 0.4
 """Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
+GAINS_CERTAINTY: Final = "gains_certainty"
+_LATER: Final = ("made_for",)  # keys that models of before lack
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
 
 Shape = tuple[Any, ...]
@@ -72,18 +75,19 @@ class Contract:
     pitch_mm: float
     arithmetic: str
     interval_factor: float | None
-    confidence: dict[str, dict[str, list[float]]] = field(repr=False)
+    confidence: dict[str, dict[str, list[float]]]
     training_sha256: str
     test_set_sha256: str
     test_error: dict[str, dict[str, float]]
     pad_inputs: tuple[tuple[str, float, float], ...] = ()
     takes_gains: bool = False
     traction_scale: int | None = None
-    trust: dict[str, Any] = field(default_factory=dict, repr=False)
+    trust: dict[str, Any] = field(default_factory=dict)
     interval_levels: dict[str, list[float]] = field(default_factory=dict)
     takes_poses: bool = False
     reach_mm: float = 0.0
     unposed_taps: int = 1
+    made_for: dict[str, list[float]] = field(default_factory=dict)  # bounds of one sensor's pad; empty for any sensor
 
     @property
     def window_shape(self) -> Shape:
@@ -147,7 +151,8 @@ class Contract:
         if type(version) is not int or version != CONTRACT_VERSION:
             expected = f"expected {CONTRACT_VERSION}: export the model again with this release"
             raise ModelError(f"contract key 'version' is {_shown(version)}, {expected}")
-        values = {one.name: _value(metadata, one.name) for one in fields(cls)}
+        values = {one.name: _value(metadata, one.name) for one in fields(cls) if one.name not in _LATER}
+        values |= {name: _value(metadata, name) for name in _LATER if KEY_PREFIX + name in metadata}
         _check(values)
         values["counts_per_unit"] = tuple(values["counts_per_unit"])
         values["pad_inputs"] = tuple(map(tuple, values["pad_inputs"]))
@@ -193,21 +198,31 @@ class Contract:
             constant whose interval is wide counts as unknown.
         """
         row = np.zeros(self.pad_width, dtype=np.float32)
-        known = {} if pad is None else pad.constants
+        if pad is None:
+            return row
         for index, (name, centre, spread) in enumerate(self.pad_inputs):
-            low, high = (0.0, 0.0) if pad is None else pad.intervals.get(name, (0.0, 0.0))
-            if name in known and (high - low) / 2 / LEVEL_90 <= DETERMINED * spread:
-                row[index] = (known[name] - centre) / spread
+            if (value := pad.constants.get(name)) is None:
+                continue
+            low, high = pad.intervals.get(name, (value, value))
+            if (high - low) / 2 / LEVEL_90 <= DETERMINED * spread:
+                row[index] = (value - centre) / spread
                 row[len(self.pad_inputs) + index] = 1
-        if self.takes_gains and pad is not None:
+        if self.takes_gains:
             row[-1] = pad.gains_certainty
         return row
 
     def is_outside(self, pad: Pad | None) -> bool:
         """Return whether a constant of a pad that the model takes is far outside of its range in training.
 
-        Where it has an interval, the whole interval must be.
+        Where it has an interval, the whole interval must be. Of a model for one sensor any other pad is outside.
         """
+        known = {} if pad is None else pad.constants | {GAINS_CERTAINTY: pad.gains_certainty}
+        for name, (least, most) in self.made_for.items():
+            low, high = (known.get(name, math.nan),) * 2
+            if pad is not None and name in pad.intervals:
+                low, high = pad.intervals[name]
+            if not (low <= most and high >= least):
+                return True
         for name, centre, spread in self.pad_inputs:
             if pad is not None and name in pad.constants:
                 low, high = pad.intervals.get(name, (pad.constants[name],) * 2)
@@ -289,12 +304,15 @@ def _rules(values: Mapping[str, Any]) -> Iterator[tuple[str, bool, str]]:
     scale, most = values["traction_scale"], MOST["scale"]
     is_scale = scale is None or _is_whole(scale, most)
     yield "traction_scale", is_scale, f"a whole number from 1 to {most}, or null for a model without traction"
-    numbers = len(AXES) * taxels * (scale or 0) ** 2
-    yield "traction_scale", numbers <= MOST_PIXELS, f"tractions of at most {MOST_PIXELS} numbers"
+    is_small = scale is None or len(AXES) * taxels * scale**2 <= MOST_PIXELS
+    yield "traction_scale", is_small, f"tractions of at most {MOST_PIXELS} numbers"
     yield "unposed_taps", _is_whole(values["unposed_taps"], values["taps"]), "a whole number from 1 to `taps`"
     least_mm = LEAST_UNIT if values["takes_poses"] else 0
     reach = f"a number from {LEAST_UNIT:g} for a model that takes poses, else 0"
     yield "reach_mm", _is_from(least_mm, values["reach_mm"]), reach
+    made_for = values.get("made_for", {})
+    is_made_for = isinstance(made_for, dict) and all(map(_are_bounds, made_for, made_for.values()))
+    yield "made_for", is_made_for, f"a map to two numbers, of names of: {', '.join((*PAD_RANGES, GAINS_CERTAINTY))}"
 
 
 def _is_whole(value: object, most: int) -> bool:
@@ -303,6 +321,12 @@ def _is_whole(value: object, most: int) -> bool:
 
 def _is_from(least: float, value: object) -> bool:
     return is_number(value) and value >= least
+
+
+def _are_bounds(name: object, value: Any) -> bool:
+    if name not in (*PAD_RANGES, GAINS_CERTAINTY) or not isinstance(value, list) or len(value) != 2:
+        return False
+    return all(map(is_number, value)) and value[0] <= value[1]
 
 
 def _is_pad_input(value: Any) -> bool:

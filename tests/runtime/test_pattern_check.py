@@ -270,6 +270,13 @@ class TestVerdict:
         pad = make_pad(pad=Pad(thickness_mm=thickness_mm))
         assert (pad.push(PRESS).untrusted_reason == "pad") is outside
 
+    @pytest.mark.parametrize(("pad", "outside"), [(None, True), (Pad(thickness_mm=4.5), False), (Pad(), True)])
+    def test_a_model_for_one_sensor_is_not_believed_on_another(self, pad, outside):
+        """Nor where no sensor file tells whose readings these are."""
+        model = FakeModel(make_trusted_contract(made_for={"thickness_mm": [4.4, 4.6]}))
+        result = make_pad(model, pad=pad).push(PRESS)
+        assert (result.untrusted_reason == "pad") is outside
+
     def test_an_odd_sensor_is_suspected_and_cleared_with_events(self):
         pad = make_pad()
 

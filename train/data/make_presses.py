@@ -77,7 +77,7 @@ def _part(folder: Path, number: int) -> Path:
 
 
 @contextmanager
-def _quiet_workers(jobs: int) -> Iterator[None]:
+def quiet_workers(jobs: int) -> Iterator[None]:
     """Start joblib's processes with SIGINT ignored, because Ctrl-C reaches them too and each would print a traceback.
 
     They inherit what is ignored; a mask is not enough, since joblib's tracker of resources lifts it. joblib replaces a
@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name.startswith(MESH):
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
-        with _quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
+        with quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
             made = make_presses(world, options.out, options.jobs)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")

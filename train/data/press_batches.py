@@ -3,7 +3,8 @@
 Batches for a network that takes poses have one number of taps each, and poses with errors of a stated size.
 """
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.physics.pad_draws import known_numbers
@@ -82,6 +84,35 @@ _NEW_SENSORS: Final = Nuisances(dead_taxels=0.02)
 _SURE: Final = 0.1  # standard deviation of a constant used as input, over its spread: error that calibration leaves
 
 
+@dataclass(frozen=True, slots=True)
+class OneSensor:
+    """The one sensor that a network is for.
+
+    Attributes:
+        row: what the network is told of it, as the runtime makes it from the sensor file, (KNOWN,).
+        gain_spread: spread that is left of its gains once readings were divided by them, over that of a new sensor.
+        made_for: bounds within which its constants and the certainty of its gains are known, by name, as in a contract.
+    """
+
+    row: tuple[float, ...]
+    gain_spread: float
+    made_for: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def nuisances(self) -> Nuisances:
+        """Nuisances of its readings once they were divided by its gains."""
+        return replace(Nuisances(), gain_spread=self.gain_spread * GAIN_SPREAD)
+
+    def rows(self, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+        """Return pad inputs (count, KNOWN): in most windows this row, in the others nothing."""
+        told = rng.random((count, 1)) < _TOLD
+        return (told * np.array(self.row)).astype(np.float32)
+
+
+_TOLD: Final = 0.75
+"""Share of windows in which a network of one sensor is told of it; in the others it has to know it by itself."""
+
+
 class PressBatches:
     """Batches of windows, pad inputs, and truth; windows of one tap are mirrored, half of them.
 
@@ -99,13 +130,14 @@ class PressBatches:
         batch: int,
         seed: int,
         nuisances: Nuisances = _NEW_SENSORS,
+        sensor: OneSensor | None = None,
     ) -> None:
         taps = len(given)
         self._presses = presses.with_taps(taps)
         whole = self._presses.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= taps)
         if not whole.any():
             raise _lacking(taps)
-        self._given, self._seed, self._nuisances = np.array(given), seed, nuisances
+        self._given, self._seed, self._nuisances, self._sensor = np.array(given), seed, nuisances, sensor
         batch = min(batch, len(presses))
         self._single = 0 if whole.all() else round(given[0] * batch)
         self._parts = ((np.flatnonzero(~whole), self._single), (np.flatnonzero(whole), batch - self._single))
@@ -116,7 +148,7 @@ class PressBatches:
         parts = [(rows, count, [self._seed, 0, at]) for at, (rows, count) in enumerate(self._parts) if count]
         index = np.concatenate([_rows_of_batch(number, *part) for part in parts])
         picked = self._presses.pick(index)
-        readings, certainty = read_by_many(rng, picked, self._nuisances)
+        readings, certainty = read_by_many(rng, picked, self._nuisances, self._sensor)
         taps = len(self._given)
         there = np.ones(len(index), dtype=np.int64)
         shares = self._given.copy()
@@ -124,7 +156,7 @@ class PressBatches:
         if self._single < len(index):
             there[self._single :] += rng.choice(taps, size=len(index) - self._single, p=shares / shares.sum())
         readings *= (np.arange(taps) < there[:, None])[..., None, None, None]
-        batch = _batch(rng, picked, readings, certainty)
+        batch = _batch(rng, picked, readings, certainty, self._sensor)
         if taps > 1:  # a mirrored pad would turn the other way from tap to tap
             return batch
         return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
@@ -135,12 +167,17 @@ def _lacking(taps: int) -> DatasetError:
 
 
 def _batch(
-    rng: np.random.Generator, presses: PressSet, readings: NDArray[np.float32], certainty: NDArray[np.float32]
+    rng: np.random.Generator,
+    presses: PressSet,
+    readings: NDArray[np.float32],
+    certainty: NDArray[np.float32],
+    sensor: OneSensor | None,
 ) -> Batch:
+    pads = known_of_pads(rng, presses.constants, certainty) if sensor is None else sensor.rows(rng, len(presses))
     return Batch(
         window=network_input(readings),
         pattern=torch.from_numpy(presses.patterns.astype(np.float32)),
-        pad=torch.from_numpy(known_of_pads(rng, presses.constants, certainty)),
+        pad=torch.from_numpy(pads),
         traction=torch.from_numpy(presses.traction_kpa.astype(np.float32)),
     )
 
@@ -161,13 +198,14 @@ def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[
 
 
 def read_by_many(
-    rng: np.random.Generator, presses: PressSet, nuisances: Nuisances
+    rng: np.random.Generator, presses: PressSet, nuisances: Nuisances, sensor: OneSensor | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return windows (n, K, 3, rows, cols) in counts, each of another sensor, and the certainty (n,) of its gains."""
     certainty = np.zeros(len(presses), dtype=np.float32)
     readings = np.empty_like(presses.counts)
-    ends = np.rint(np.cumsum([share for share, _ in _GAIN_SPREADS]) * len(presses)).astype(int)[:-1]
-    for part, (_, spread) in zip(np.split(rng.permutation(len(presses)), ends), _GAIN_SPREADS, strict=True):
+    spreads = _GAIN_SPREADS if sensor is None else ((1.0, sensor.gain_spread),)
+    ends = np.rint(np.cumsum([share for share, _ in spreads]) * len(presses)).astype(int)[:-1]
+    for part, (_, spread) in zip(np.split(rng.permutation(len(presses)), ends), spreads, strict=True):
         if len(part):
             certainty[part] = max(1 - spread, 0)
             new = Nuisances() if spread < 1 else nuisances
@@ -205,8 +243,10 @@ class PosedBatches:
         DatasetError: there are no presses of so many taps.
     """
 
-    def __init__(self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int) -> None:
-        self._presses, self._seed = presses, seed
+    def __init__(
+        self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int, sensor: OneSensor | None = None
+    ) -> None:
+        self._presses, self._seed, self._sensor = presses, seed, sensor
         self._given = np.array(given) / sum(given)
         there = presses.counts.any(axis=(2, 3, 4)).sum(axis=1)
         self._rows = [np.flatnonzero(there >= taps) for taps in range(1, len(given) + 1)]
@@ -225,7 +265,7 @@ class PosedBatches:
             rows = self._single
         picked = self._presses.pick(rng.choice(rows, self._batch, replace=len(rows) < self._batch))
         picked = _some_of(rng, picked, taps)
-        batch = _batch(rng, picked, *read_by_many(rng, picked, _NEW_SENSORS))
+        batch = _batch(rng, picked, *read_by_many(rng, picked, _NEW_SENSORS, self._sensor), self._sensor)
         batch = replace(batch, poses=torch.from_numpy(stated_poses(rng, picked.poses)))
         return batch.mirrored(torch.from_numpy(rng.random(len(picked)) < 0.5))
 

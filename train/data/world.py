@@ -44,6 +44,7 @@ class World:
     per_pad: int = 24  # sequences of one pad
     families: Mapping[str, float] = field(default_factory=lambda: dict(SHARES))  # frequency of families or figures
     spread: float = 1.0  # of the pads' constants, 1 for the whole ranges, 0 for the nominal pad
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=lambda: dict(RANGES))  # of the pads' constants
     seed: int = 1
     scale: int = SCALE  # pattern pixels per taxel pitch
     pad: str = USPA44.name  # model of the pads, one of firmware_bridge.pad_geometry.PADS
@@ -81,7 +82,7 @@ class World:
         """Return the configuration as read from JSON, with the ranges of the pads' constants and the meshes' hashes."""
         facts = asdict(self) | {
             "families": dict(self.families),
-            "ranges": {name: list(bounds) for name, bounds in RANGES.items()},
+            "ranges": {name: list(bounds) for name, bounds in self.ranges.items()},
             "inputs": list(INPUTS),
             "version": VERSION,
         }
@@ -100,7 +101,7 @@ class World:
 def solve_pad(world: World, number: int) -> PressSet:
     """Solve all sequences of one pad; the result does not depend on other pads."""
     rng = np.random.default_rng([world.seed, number])
-    pad = draw_pad(rng, world.spread) if world.spread else Pad()
+    pad = draw_pad(rng, world.spread, world.ranges) if world.spread else Pad()
     gripped = GrippedPad(replace(pad, model=world.pad))
     count = min(world.per_pad, world.count - number * world.per_pad)
     shares = np.array(list(world.families.values()), dtype=float)

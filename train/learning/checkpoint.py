@@ -22,7 +22,7 @@ from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.in_place import write_in_place
-from train.data.press_batches import Batch, PosedBatches, PressBatches, network_input
+from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatches, network_input
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
@@ -63,6 +63,7 @@ class Training:
     seed: int = 1  # of weights and draws
     options: dict[str, Any] = field(default_factory=dict)  # further arguments of the network's class
     keep: float = 0.0  # share of the weights it starts from in the final ones
+    sensor: OneSensor | None = None  # that it is for, None for any
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep < 1:
@@ -73,8 +74,9 @@ class Training:
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
         config = asdict(self)
-        if not self.keep:
-            del config["keep"]  # keeps the hash of networks that were trained before the option existed
+        for name in ("keep", "sensor"):  # keeps the hash of networks that were trained before these existed
+            if not config[name]:
+                del config[name]
         return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
 
 
@@ -105,7 +107,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     device = device_of_rank(rank)
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
-    batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses)
+    batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
     done = train(
         net,
         _objective(net, device, seed),
@@ -150,7 +152,9 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     return report
 
 
-def batches_of(data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: bool = False) -> Callable[[int], Batch]:
+def batches_of(
+    data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: bool = False, sensor: OneSensor | None = None
+) -> Callable[[int], Batch]:
     """Return batches for a recipe, whose taps were only turned unless they are posed.
 
     Raises:
@@ -161,8 +165,9 @@ def batches_of(data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: 
             f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others with --scale"
         )
     if posed:
-        return PosedBatches(data, recipe.given, recipe.batch, seed)
-    return PressBatches(data.only_turned() if len(recipe.given) > 1 else data, recipe.given, recipe.batch, seed)
+        return PosedBatches(data, recipe.given, recipe.batch, seed, sensor)
+    turned = data.only_turned() if len(recipe.given) > 1 else data
+    return PressBatches(turned, recipe.given, recipe.batch, seed, sensor=sensor)
 
 
 def _path_of(start: str, folder: Path) -> Path:
@@ -188,6 +193,12 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
             raise CheckpointError(f"{path} is no model to start from: {said}") from error
         raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
     return net.eval(), report
+
+
+def sensor_of(report: Mapping[str, Any]) -> OneSensor | None:
+    """Return the one sensor that a network is for, from a checkpoint's report; None if it is for any."""
+    stated = report.get("config", {}).get("sensor")
+    return None if stated is None else OneSensor(**stated)
 
 
 def origin(report: Mapping[str, Any]) -> dict[str, str]:

@@ -23,10 +23,11 @@ from edge.evaluation import metrics
 from edge.inference.intervals import REGIONS, regions
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import freeze_presses
-from train.data.press_batches import PosedBatches, PressBatches, network_input, stated_poses
+from train.data.press_batches import OneSensor, PosedBatches, PressBatches, network_input, stated_poses
 from train.data.presses import SEED, PressSet
 from train.networks.compact import CompactNet
 from train.networks.interval_correction import IntervalCorrection
+from train.physics.sensor_noise import Nuisances
 
 LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
@@ -82,18 +83,26 @@ class Readings:
         return network_input(windows).numpy()
 
 
-def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS, *, posed: bool = False) -> list[Readings]:
-    """Return presses as sensors of their own read them, with nothing and with everything known of each sensor."""
+def readings_of_presses(
+    presses: PressSet, taps: int, times: int = _READINGS, *, posed: bool = False, sensor: OneSensor | None = None
+) -> list[Readings]:
+    """Return presses as sensors of their own read them, with nothing and with everything known of each sensor.
+
+    Of `sensor` is known what its file states, and nothing.
+    """
     presses = presses if posed or taps == 1 else presses.only_turned()
     found = []
     for number in range(times):
-        frozen = freeze_presses(presses, SEED + number)
+        frozen = freeze_presses(presses, SEED + number, Nuisances() if sensor is None else sensor.nuisances)
         poses = None
         if posed:
             poses = stated_poses(np.random.default_rng(SEED + number), presses.with_taps(taps).poses)
         for known in (False, True):
-            windows = frozen.windows(taps, gains_known=known)
-            found.append(Readings(windows, frozen.pads(known=known), frozen.patterns(), poses))
+            windows = frozen.windows(taps, gains_known=known and sensor is None)
+            pads = frozen.pads(known=known)
+            if sensor is not None:
+                pads[:] = known * np.array(sensor.row)
+            found.append(Readings(windows, pads, frozen.patterns(), poses))
     return found
 
 

@@ -1,5 +1,6 @@
 """Pads: constants of a simulated sensor, drawn for each, and their form as inputs of a network."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -118,10 +119,10 @@ KNOWN: Final = 2 * len(INPUTS) + 1
 """Number of pad inputs of a network: values, a flag for each of them, and the certainty of the gains."""
 
 
-def draw_pad(rng: np.random.Generator, spread: float = 1.0) -> Pad:
+def draw_pad(rng: np.random.Generator, spread: float = 1.0, ranges: Mapping[str, tuple[float, float]] = RANGES) -> Pad:
     """Draw a pad with each constant within its range; a `spread` below 1 moves all towards the nominal pad."""
     drawn = {}
-    for name, bounds in RANGES.items():
+    for name, bounds in ranges.items():
         nominal = getattr(NOMINAL, name)
         drawn[name] = nominal + spread * (rng.uniform(*bounds) - nominal)
     return Pad(**drawn, uneven_mm=spread * rng.uniform(0, _UNEVEN_MM), seed=int(rng.integers(2**31)))

@@ -27,6 +27,7 @@ from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.runtime import Runtime
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.data.presses import load_presses
 from train.data.real_grips import Grip, loaded, neighbours_mean, recorded_grips, recordings_folder, z_of
@@ -51,12 +52,12 @@ class Played(NamedTuple):
     believed: NDArray[np.bool_]
 
 
-def play(grip: Grip, model: ModelSession, hidden: int | None = None) -> Played:
+def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | None = None) -> Played:
     """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
     name = grip.free.sensor
     estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
     options, free = RuntimeOptions(every_scan=True), {name: grip.free}
-    runtime = Runtime(model, source="replay", estimator=estimator, baselines=free, options=options)
+    runtime = Runtime(model, source="replay", estimator=estimator, baselines=free, pad=pad, options=options)
     series = ScanSeries(name, USPA44)
     none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
     patterns, believed = [], []

@@ -1,0 +1,131 @@
+"""A model for one sensor: what is known of it, what its network is told, and whether it is handed over."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_samples import make_contract, write_model
+from press_samples import make_press_set
+
+from edge.errors import ModelError
+from edge.inference.bundled import find_model
+from edge.inference.contract import Contract
+from edge.inference.onnx_session import ModelSession
+from firmware_bridge.scans.pad_constants import GAINS, Pad
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
+from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from train import own
+from train.data.press_batches import OneSensor, PressBatches
+from train.data.world import World, solve_pad
+from train.errors import DatasetError
+from train.own import OWN, UNLIKE, judged, knowledge_of, main
+from train.physics.pad_draws import KNOWN, RANGES
+from train.physics.sensor_noise import NAMES, Nuisances
+
+THICK = Pad(
+    thickness_mm=5.0,
+    intervals={"thickness_mm": (4.9, 5.1)},
+    shear_modulus_mpa=0.12,
+    gains=(1.0,) * GAINS,
+    gain_half_widths=(0.025,) * GAINS,
+)
+FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)})
+
+
+def test_pads_are_drawn_as_wide_as_what_is_not_known():
+    found = knowledge_of(FILE, None, None)
+    assert found.ranges["thickness_mm"] == (4.9, 5.1), "by its interval"
+    assert found.ranges["shear_modulus_mpa"] == pytest.approx((0.114, 0.126)), "a fifth where nobody said how well"
+    assert found.ranges["poisson"] == RANGES["poisson"]
+    low, high = found.ranges["counts_per_newton"]
+    assert low < 1100 < high and high - low == pytest.approx(0.2 * np.ptp(RANGES["counts_per_newton"]))
+    pads = solve_pad(World(count=2, per_pad=1, families={"flat": 1.0}, ranges=found.ranges), 0)
+    assert abs(4.5 + 0.9 * pads.constants[0, 0] - 5.0) <= 0.1
+    wider = found.widened()
+    assert wider["thickness_mm"] == pytest.approx((4.9 - 0.36, 5.1 + 0.36))
+    assert wider["poisson"][1] < 0.5 and wider["free_sides"][0] == 0
+    text = found.told()
+    assert "thickness_mm to 11%" in text and "gains to 1.5 %" in text and "not known: poisson, " in text
+
+
+@pytest.mark.parametrize(
+    ("names", "asked", "complaint"),
+    [
+        ("46", None, "has the sensors 4, 6: name one with --sensor"),
+        ("", None, "has the sensors none"),
+        ("4", "6", "--sensor 6: the sensor file has 4"),
+    ],
+)
+def test_which_sensor_is_said_in_a_line(names, asked, complaint):
+    with pytest.raises(DatasetError, match=complaint):
+        knowledge_of(SensorFile(sensors={name: SensorEntry() for name in names}), asked, None)
+
+
+def test_its_network_is_told_of_it_in_most_windows():
+    sensor = OneSensor(tuple(np.linspace(0.1, 1, KNOWN).tolist()), 0.2)
+    presses = make_press_set(count=64, taps=1)
+    presses.counts[:] = 4000
+    alone = Nuisances().without(*(name for name in NAMES if name != "gain_spread"))
+    batch = PressBatches(presses, (1.0,), 64, seed=1, nuisances=alone, sensor=sensor)(0)
+    told = batch.pad.numpy().any(axis=1)
+    assert 0.6 < told.mean() < 0.9 and np.allclose(batch.pad[told], sensor.row)
+    relative = np.abs(batch.window.numpy()) * np.array([500, 500, 1000])[:, None, None] / 4000
+    assert relative.std() == pytest.approx(0.2 * 0.075, rel=0.1)
+
+
+def test_what_its_model_is_made_for_is_what_is_known():
+    made_for = knowledge_of(FILE, "4", None).sensor().made_for
+    assert set(made_for) == {"thickness_mm", "shear_modulus_mpa", "counts_per_newton", "gains_certainty"}
+    contract = make_contract(made_for={name: [*ends] for name, ends in made_for.items()})
+    same = Pad(thickness_mm=5.05, shear_modulus_mpa=0.12, counts_per_newton=1100, gains=(1.0,) * GAINS)
+    assert not contract.is_outside(same)
+    for other in (
+        None,
+        Pad(),
+        replace(same, thickness_mm=5.2),
+        replace(same, thickness_mm=None),
+        replace(same, gains=None),
+        replace(same, thickness_mm=5.0, intervals={"thickness_mm": (5.2, 5.4)}),
+    ):
+        assert contract.is_outside(other)
+    assert not contract.is_outside(replace(same, intervals={"thickness_mm": (5.0, 5.4)})), "it may be the same"
+    assert Contract.from_metadata(contract.to_metadata()) == contract
+    assert Contract.from_metadata(make_contract().to_metadata()).made_for == {}
+    for damaged in ({"colour": [0, 1]}, {"poisson": [1, 0]}, {"poisson": [0.4]}, {"poisson": "0.4"}, []):
+        with pytest.raises(ModelError, match="contract key 'made_for' is"):
+            Contract.from_metadata(contract.to_metadata() | {"tactile.made_for": json.dumps(damaged)})
+
+
+def test_what_is_worse_is_not_handed_over(tmp_path):
+    """In place of an own model: a tiny one that knows nothing, and then the bundled one against itself."""
+    sets = {name: solve_pad(World(count=12, per_pad=12, seed=seed), 0) for seed, name in enumerate(("figures", UNLIKE))}
+    found = knowledge_of(FILE, "4", None)
+    tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
+    table, objection = judged(tiny, found, sets, [])
+    assert [line.split(" | ")[0] for line in table.splitlines()] == ["method", OWN, "stsr-int8", "bilinear"]
+    assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
+    _, objection = judged(ModelSession(find_model("stsr-int8")), found, sets, [])
+    assert objection is not None and UNLIKE not in objection, "no worse there"
+
+
+def test_bad_input_is_one_line(tmp_path, capsys):
+    assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "mine")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    save_sensor_file(tmp_path / "s.toml", FILE)
+    assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--mesh", str(tmp_path / "none.stl")]) == 1
+    assert capsys.readouterr().err.startswith("train.own: ")
+
+
+@pytest.mark.night
+def test_from_a_sensor_file_to_a_model(tmp_path, capsys, limits):
+    """In miniature it learns nothing, so it is not handed over; continued, it is judged again."""
+    limits(own, TRIED=48, JUDGED=24)
+    save_sensor_file(tmp_path / "s.toml", FILE)
+    for _ in range(2):
+        assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01"]) == 1
+        assert "not handed over: " in capsys.readouterr().out
+    assert not (tmp_path / "mine/mine.onnx").exists()
+    contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract
+    assert contract.made_for["thickness_mm"] == [4.9, 5.1] and contract.read_trust() is not None
+    assert contract.is_outside(None) and not contract.is_outside(THICK.behind(Pad(counts_per_newton=1100)))

@@ -1,0 +1,350 @@
+"""Train a model for one sensor, from what its sensor file says of it; handed over where it is the better one.
+
+    python -m train.own sensor.toml --out mine
+    python -m train.own sensor.toml --recordings trials --mesh part.stl --minutes 60 --out mine
+
+The bundled models are for any pad. One for a single pad is better by decibels, and worse than none on another pad: so
+its pads are drawn within what is known of the sensor, the less is known the wider, and the model says in its contract
+whose it is. Constants that the sensor file lacks are found in --recordings, a folder of TRIAL/xela_SENSOR.csv, as by
+train.identify.
+
+At the end it is compared with the bundled model, which is told the same, and with bilinear interpolation, on presses of
+pads like the sensor, of pads a little unlike it, and on the recordings. What loses is not handed over. The same command
+continues an interrupted run.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge.errors import EdgeError
+from edge.evaluation.classical_methods import fitted_methods
+from edge.evaluation.metrics import psnr_db
+from edge.inference.bundled import BUNDLE_DIR, CONTACTS, DEFAULT_MODEL, INT8_SUFFIX, POSED_MODEL, find_model
+from edge.inference.contract import GAINS_CERTAINTY
+from edge.inference.onnx_session import ModelSession, load_session
+from edge.perception.gain_learning import load_contact_model
+from firmware_bridge.errors import BridgeError
+from firmware_bridge.in_place import write_in_place
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
+from train.data.frozen_presses import freeze_presses
+from train.data.make_presses import make_presses, quiet_workers
+from train.data.press_batches import OneSensor
+from train.data.presses import SEED, PressSet
+from train.data.real_grips import Grip, recorded_grips
+from train.data.world import World, solve_pad
+from train.errors import DatasetError, TrainError
+from train.experiments.sensor.real import has_hole, play
+from train.families.catalogue import FIGURES, SHARES
+from train.fit import given_taps
+from train.identify import recorded_contacts
+from train.learning.checkpoint import Training, fit_network
+from train.learning.contact_mixture import learned
+from train.learning.training_loop import Recipe
+from train.physics.pad_draws import INPUTS, KNOWN, RANGES
+from train.report import bootstrap_interval
+from train.surfaces.meshes import mesh_name
+from train.surfaces.poses import MAX_TAPS
+
+_FIFTH: Final = 0.2
+"""Share of a constant's range within which it is taken as known where nobody said how well, and by which the pads
+differ that are a little unlike the sensor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """What is known of one sensor."""
+
+    name: str
+    pad: Pad  # as its sensor file has it, with what was learned and identified
+    ranges: Mapping[str, tuple[float, float]]  # of constants of pads like it
+
+    def sensor(self) -> OneSensor:
+        """Return what a network is told of it."""
+        certainty = self.pad.gains_certainty
+        made_for = {name: self.ranges[name] for name in self.pad.constants}
+        if certainty:
+            made_for[GAINS_CERTAINTY] = (max(certainty - _FIFTH, 0.0), 1.0)
+        row = ModelSession(find_model(DEFAULT_MODEL)).contract.pad_row(self.pad)
+        return OneSensor(tuple(row.tolist()), 1 - certainty, made_for)
+
+    def widened(self) -> Mapping[str, tuple[float, float]]:
+        """Return ranges of pads that lie up to a fifth of a constant's range outside of what is known."""
+        more = {name: _FIFTH * (high - low) for name, (low, high) in RANGES.items()}
+        return {name: _within(name, low - more[name], high + more[name]) for name, (low, high) in self.ranges.items()}
+
+    def told(self) -> str:
+        """Return it in a sentence."""
+        shares = {
+            name: (self.ranges[name][1] - self.ranges[name][0]) / (RANGES[name][1] - RANGES[name][0]) for name in INPUTS
+        }
+        known = ", ".join(f"{name} to {share:.0%}" for name, share in shares.items() if share < 1)
+        gains = (
+            f"gains to {7.5 * (1 - self.pad.gains_certainty):.1f} %" if self.pad.gains else "its gains are not known"
+        )
+        open_ = [name for name, share in shares.items() if share == 1]
+        more = f"; not known: {', '.join(open_)}" if open_ else ""
+        return f"sensor {self.name}: known of the range of its constants: {known or 'nothing'}; {gains}{more}"
+
+
+def _within(name: str, low: float, high: float) -> tuple[float, float]:
+    """Return bounds of a constant that a simulated pad may have."""
+    least, most = RANGES[name]
+    apart = most - least
+    return max(low, least - apart, 0.0), min(high, most + apart, 0.4999 if name == "poisson" else np.inf)
+
+
+def knowledge_of(file: SensorFile, name: str | None, recordings: Path | None) -> Knowledge:
+    """Return what a sensor file and recordings tell of a sensor; the name may be left out of a file of one.
+
+    Raises:
+        DatasetError: no such sensor, several of them, or recordings that cannot be read.
+    """
+    names = ", ".join(file.sensors) or "none"
+    if name is None and len(file.sensors) != 1:
+        raise DatasetError(f"the sensor file has the sensors {names}: name one with --sensor")
+    name = name or next(iter(file.sensors))
+    if name not in file.sensors:
+        raise DatasetError(f"--sensor {name}: the sensor file has {names}")
+    entry = file.sensors[name]
+    pad = entry.used_pad or Pad()
+    if entry.counts_per_newton is not None and pad.counts_per_newton is None:
+        pad = replace(pad, counts_per_newton=entry.counts_per_newton)
+    if recordings is not None:
+        contacts = {one.removeprefix("xela_"): counts for one, counts in recorded_contacts(recordings).items()}
+        if name not in contacts:
+            raise DatasetError(f"{recordings} has recordings of {', '.join(contacts)}, none of sensor {name}")
+        pad = learned(contacts[name], load_contact_model(CONTACTS)).pad().behind(pad)
+    ranges = dict(RANGES)
+    for constant, value in pad.constants.items():
+        apart = _FIFTH * (RANGES[constant][1] - RANGES[constant][0]) / 2
+        ranges[constant] = _within(constant, *pad.intervals.get(constant, (value - apart, value + apart)))
+    return Knowledge(name, pad, ranges)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Amount of work of a training."""
+
+    presses: int
+    steps: int
+
+    def line(self, press_s: float, step_s: float) -> str:
+        """Return how long it takes, in a line."""
+        parts = (self.presses * press_s / 60, self.steps * step_s / 60, REST_S / 60)
+        return (
+            f"about {sum(parts):.0f} minutes: {parts[0]:.1f} for {self.presses} presses, {parts[1]:.1f} for "
+            f"{self.steps} steps, {parts[2]:.1f} to export and to compare"
+        )
+
+
+REST_S: Final = 150.0  # of two cores, to export and to compare
+TRIED: Final = 96  # presses and steps by which their time is measured
+SIMULATING: Final = 0.25  # share of the time for presses, up to
+MOST_PRESSES: Final = 24_000
+
+
+def planned(minutes: float, press_s: float, step_s: float) -> Plan:
+    """Return as many presses and steps as take so long, with the times of one."""
+    left_s = max(60 * minutes - REST_S, 0)
+    presses = min(int(SIMULATING * left_s / press_s), MOST_PRESSES)
+    return Plan(max(presses, TRIED), max(int((left_s - presses * press_s) / step_s), 1))
+
+
+def tried(world: World, folder: Path) -> tuple[float, float]:
+    """Return how long a press takes with all processors, and a step of training, in [s]."""
+    small = replace(world, count=2 * TRIED, per_pad=TRIED)
+    unseen = solve_pad(small, 0)  # which also loads what is loaded once
+    begun_s = time.monotonic()
+    presses = solve_pad(small, 1)
+    press_s = (time.monotonic() - begun_s) / TRIED / len(os.sched_getaffinity(0))
+    training = replace(_training("tried", OneSensor((0.0,) * KNOWN, 1.0), 1, TRIED // 4), start=None)
+    with tempfile.TemporaryDirectory(dir=folder) as drafts:
+        report = fit_network(training, presses, freeze_presses(unseen, SEED).as_frozen_set(), Path(drafts))
+    return press_s, report["elapsed_s"] / report["steps"]
+
+
+def _training(name: str, sensor: OneSensor, taps: int, steps: int) -> Training:
+    several = taps > 1
+    network, start = ("fusion-mtsr7", "mtsr.onnx") if several else ("compact-stsr", "stsr.onnx")
+    recipe = Recipe(steps, learning_rate=2e-3, given=given_taps(MAX_TAPS) if several else (1.0,), bf16=True)
+    return Training(name, network, recipe, start=start, options={"known": KNOWN}, sensor=sensor)
+
+
+class Judged(NamedTuple):
+    """Comparison of a model with others."""
+
+    table: str
+    objection: str | None  # why it is not handed over
+
+
+def judged(own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet], grips: Sequence[Grip]) -> Judged:
+    """Compare a model with the bundled one, told the same, and with bilinear interpolation.
+
+    Args:
+        own: the model.
+        knowledge: of its sensor.
+        sets: presses that it was not trained on, by what they are; the last are of pads a little unlike the sensor.
+        grips: recordings of the sensor that holds flat faces, which cover its pad.
+    """
+    bundled = ModelSession(find_model(POSED_MODEL if own.contract.takes_poses else DEFAULT_MODEL))
+    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled}
+    bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
+    cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
+    times_us: dict[str, list[float]] = {name: [] for name in models}
+    objections = []
+    for what, presses in sets.items():
+        frozen = freeze_presses(presses, SEED + 1, sensor.nuisances)
+        windows, truth = frozen.windows(1), frozen.patterns()
+        patterns = {name: np.empty_like(truth) for name in models} | {"bilinear": bilinear(windows[:, 0])}
+        for number, window in enumerate(windows):
+            for name, model in models.items():  # in turn, so that both meet the same machine
+                row, scaled = model.contract.pad_row(knowledge.pad), model.contract.scale_window(window)
+                begun_ns = time.perf_counter_ns()
+                patterns[name][number] = model.run(scaled, row)
+                times_us[name].append((time.perf_counter_ns() - begun_ns) / 1000)
+        errors = {name: psnr_db(made, truth, own.contract.output_full_scale) for name, made in patterns.items()}
+        for name, values in errors.items():
+            cells[name].append(f"{values.mean():.2f}")
+            gained = errors[OWN] - values
+            low, high = bootstrap_interval(gained, presses.pad)
+            if name != OWN and (high < 0 if what == UNLIKE else low <= 0):
+                objections.append(f"on {what} it is {gained.mean():+.2f} dB ({low:+.2f} to {high:+.2f}) to {name}")
+    holes = {}
+    for name, model in models.items() if grips else ():
+        played = [play(grip, model, pad=knowledge.pad).patterns for grip in grips]
+        drawn = np.concatenate([made[np.isfinite(made).all(axis=(1, 2))] for made in played])
+        holes[name] = float(has_hole(drawn).mean())
+        cells[name].append(f"{holes[name]:.1%}")
+    if grips and holes[OWN] > holes[bundled.name]:
+        objections.append(
+            f"on the recordings {holes[OWN]:.1%} of its patterns have holes, {holes[bundled.name]:.1%} of "
+            f"{bundled.name}'s: the sensor is not what the sensor file says; lay a weight on it with edge-sr doctor"
+        )
+    names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
+    lines = [" | ".join(("method", *names, "run time [us]"))]
+    for name, row in cells.items():
+        run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
+        lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
+    return Judged("\n".join(lines), "; ".join(objections) or None)
+
+
+OWN: Final = "this model"
+UNLIKE: Final = "pads a fifth unlike it"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; 0 when a model was handed over, 1 where not, 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _train(options)
+    except (TrainError, BridgeError, EdgeError) as error:
+        sys.stderr.write(f"train.own: {error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("train.own: interrupted; the same command continues\n")
+        return 130
+
+
+def _train(options: argparse.Namespace) -> int:
+    out: Path = options.out
+    work = out / "work"
+    work.mkdir(parents=True, exist_ok=True)
+    knowledge = knowledge_of(load_sensor_file(options.sensor_file), options.sensor, options.recordings)
+    _say(knowledge.told())
+    families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
+    world = World(families=families, ranges=knowledge.ranges, seed=options.seed, taps=options.taps)
+    plan = _plan(options, world, work)
+    even = replace(world, families=dict.fromkeys(families, 1.0), count=JUDGED, per_pad=6, begun=0.0)
+    sets = {
+        "validation": even,
+        "test": even,
+        "all families": even,
+        "figures": replace(even, families=dict.fromkeys(FIGURES, 1.0)),
+        UNLIKE: replace(even, ranges=knowledge.widened()),
+    }
+    made = {}
+    with quiet_workers(-1):
+        presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
+        for number, (what, of) in enumerate(sets.items(), 1):
+            path = work / f"{what.replace(' ', '-')}.npz"
+            made[what] = make_presses(replace(of, seed=options.seed + 1000 * number), path)
+    name, sensor = out.resolve().name, knowledge.sensor()
+    frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
+    report = fit_network(_training(name, sensor, options.taps, plan.steps), presses, frozen, work)
+    _say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
+    bundled = find_model(POSED_MODEL if options.taps > 1 else DEFAULT_MODEL)
+    path = _exported(work, name, bundled)
+    grips = [] if options.recordings is None else recorded_grips(options.recordings)
+    grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
+    verdict = judged(ModelSession(path), knowledge, {what: made[what] for what in list(sets)[2:]}, grips)
+    _say(verdict.table)
+    if verdict.objection is not None:
+        _say(f"not handed over: {verdict.objection}")
+        return 1
+    handed = out / f"{name}.onnx"
+    write_in_place(handed, lambda draft: draft.write_bytes(path.read_bytes()), load_session)
+    _say(f"from now on: edge-sr --sensor {options.sensor_file} --model {handed}")
+    return 0
+
+
+JUDGED: Final = 480  # presses of each set that nothing is trained on
+
+
+def _exported(work: Path, name: str, bundled: Path) -> Path:
+    """Return the model of a checkpoint in 8-bit integers, or in float32 where they would cost too much."""
+    # A command of its own: the export is the floor above, and needs the memory that training leaves.
+    command = [sys.executable, "-m", "export.to_onnx", work / f"{name}.pt", "--out", work, "--trust", bundled]
+    command += ["--validation", work / "validation.npz", "--test", work / "test.npz"]
+    for suffix, more in ((INT8_SUFFIX, ["--int8", work / "presses.npz"]), ("", [])):
+        if subprocess.run([*map(str, [*command, *more])], check=False).returncode == 0:
+            return work / f"{name}{suffix}.onnx"
+    raise TrainError("the export has failed; the lines above say why")
+
+
+def _plan(options: argparse.Namespace, world: World, work: Path) -> Plan:
+    """Return the plan of an earlier run with the same time, or one by the speed of this machine."""
+    path = work / "plan.json"
+    asked = {"minutes": options.minutes, "taps": options.taps}
+    if path.exists() and (kept := json.loads(path.read_text()))["asked"] == asked:
+        return Plan(kept["presses"], kept["steps"])
+    press_s, step_s = tried(world, work)
+    plan = planned(options.minutes, press_s, step_s)
+    _say(plan.line(press_s, step_s))
+    path.write_text(json.dumps({"asked": asked, "presses": plan.presses, "steps": plan.steps}) + "\n")
+    return plan
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m train.own", description=(__doc__ or "").splitlines()[0])
+    add = parser.add_argument
+    add("sensor_file", type=Path, metavar="SENSOR.toml", help="sensor file, as edge-sr doctor --out writes it")
+    add("--out", type=Path, required=True, help="folder for everything; its name is the model's")
+    add("--sensor", metavar="NAME", help="which sensor of the file (default: its only one)")
+    add("--recordings", type=Path, metavar="FOLDER", help="grips of flat faces, to find constants and to judge by")
+    add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
+    add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
+    add("--minutes", type=float, default=20.0, help="about how long all takes (20)")
+    add("--taps", type=int, default=1, help="taps of each sequence; more than 1 trains mtsr instead of stsr (1)")
+    add("--seed", type=int, default=1, help="seed of everything random (1)")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
