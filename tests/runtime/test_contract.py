@@ -9,7 +9,9 @@ from pose_samples import make_posed_contract
 from trust_samples import make_checked_contract, make_posed_trust, make_trusted_contract
 
 from edge.api import USPA44, ModelError, Pad
-from edge.inference.contract import CONTRACT_VERSION, MOST, Contract
+from edge.inference.bundled import find_model
+from edge.inference.contract import CONTRACT_VERSION, Contract
+from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import PAD_RANGES
 
 BROKEN_VALUES = {
@@ -60,6 +62,7 @@ def read(contract, **changes):
         make_pad_contract(pad_inputs=tuple((name, high, 0.01) for name, (_, high) in PAD_RANGES.items())),
         make_trusted_contract(),
         make_posed_contract(),
+        make_contract(made_for={"thickness_mm": [4.9, 5.1], "gains_certainty": [1.0, 1.0]}),
     ],
 )
 def test_what_is_written_is_read(contract):
@@ -68,6 +71,7 @@ def test_what_is_written_is_read(contract):
 
 def test_a_constant_without_an_interval_is_exact():
     contract = make_pad_contract(pad_inputs=(("poisson", 0.45, 0.02),), takes_gains=False)
+    assert contract.pad_row(None).tolist() == [0, 0]
     assert contract.pad_row(Pad(poisson=0.46)).tolist() == pytest.approx([0.5, 1])
 
 
@@ -112,6 +116,13 @@ def test_another_version_is_named_not_what_it_lacks(version):
         ("interval_levels", '{"100": [1, 1, 1, 1]}', "for each percentage a positive number"),
         ("interval_levels", '{"most": [1, 1, 1, 1]}', "for each percentage a positive number"),
         ("interval_levels", '{"90": [1, 1, 1, "1"]}', "for each percentage a positive number"),
+        *(
+            ("made_for", text, "a map to two numbers, of names of: thickness_mm, .*, gains_certainty")
+            for text in (
+                *('{"colour": [0, 1]}', '{"poisson": [0.4]}', '{"poisson": [0.4, 0.45, 0.5]}'),
+                *('{"poisson": ["0.4", 0.5]}', '{"poisson": "0.4"}', "[]", '{"poisson": {"0": 0, "1": 1}}'),
+            )
+        ),
         ("tap_order", f'"{"x" * 98}"', "x', expected"),  # a hundred characters of it are shown
         ("tap_order", f'"{"x" * 99}"', r"x\.\.\., expected"),
     ],
@@ -130,8 +141,7 @@ POSED = {"takes_poses": "true"}
     [
         *(
             (SMALL | {key: str(most)}, {key: str(most + 1)}, f"1 to {most}")
-            for key, most in MOST.items()
-            if key != "scale"
+            for key, most in {"batch": 1024, "taps": 64, "rows": 64, "cols": 64}.items()
         ),
         (SMALL | {"scale": "256"}, {"scale": "257"}, "1 to 256"),
         ({"rows": "64", "cols": "64", "scale": "16"}, {"scale": "17"}, "patterns of at most 1048576 pixels"),
@@ -183,6 +193,31 @@ def test_a_sensor_that_the_model_was_not_trained_for_is_refused(change):
 def test_a_pad_far_outside_the_training_is_told(pad, outside):
     """The sample was trained on pads of 4.5 mm, half a millimetre either way."""
     assert make_pad_contract().is_outside(pad) is outside
+
+
+@pytest.mark.parametrize(
+    ("pad", "outside"),
+    [
+        (None, True),
+        (Pad(), True),
+        (Pad(thickness_mm=4.9), False),
+        (Pad(thickness_mm=5.1), False),
+        (Pad(thickness_mm=4.89), True),
+        (Pad(thickness_mm=5.11), True),
+        (Pad(thickness_mm=5.2, intervals={"thickness_mm": (5.1, 5.3)}), False),
+        (Pad(thickness_mm=5.0, intervals={"thickness_mm": (5.2, 5.4)}), True),
+    ],
+)
+def test_any_other_pad_is_outside_for_a_model_of_one_sensor(pad, outside):
+    assert make_contract(made_for={"thickness_mm": [4.9, 5.1]}).is_outside(pad) is outside
+    gains = {"gains": (1.0,) * 48, "gain_half_widths": (0.0,) * 48}
+    of_gains = make_contract(made_for={"gains_certainty": [0.5, 1.0]})
+    assert of_gains.is_outside(pad) and not of_gains.is_outside(Pad(**gains))
+
+
+def test_a_bundled_model_has_this_contract():
+    contract = ModelSession(find_model("stsr-int8")).contract
+    assert not contract.takes_poses and contract.made_for == {} and not contract.is_outside(None)
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,9 @@ EQUIVALENT: dict[str, dict[str, str]] = {
     },
     "contract": {
         "_is_pad_input: 1.0 -> 2.0": "the range of no constant, whose lowest value is above its highest",
+        "_rules: len(AXES) * taxels * scale ** 2 <= MOST_PIXELS -> len(AXES) * taxels * scale ** 2 < MOST_PIXELS": (
+            "a number of three axes is no power of two"
+        ),
         "_is_pad_input: return False -> return None": "its caller asks for nothing but whether it is true",
     },
     "drift": {
