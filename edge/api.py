@@ -70,6 +70,7 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_base
 if TYPE_CHECKING:
     from edge.doctor.examine import examine
     from edge.mapping.sink import MapSink, ObjectMap
+    from edge.perception.patches import Patch, PatchEvent, PatchEvents, patches
     from edge.pipeline.array_results import infer
     from edge.pipeline.baseline_capture import take_baselines
     from edge.pipeline.pairing import paired
@@ -82,6 +83,10 @@ _ON_USE: Final = {
     "examine": "edge.doctor.examine",
     "MapSink": "edge.mapping.sink",
     "ObjectMap": "edge.mapping.sink",
+    "Patch": "edge.perception.patches",
+    "PatchEvent": "edge.perception.patches",
+    "PatchEvents": "edge.perception.patches",
+    "patches": "edge.perception.patches",
     "infer": "edge.pipeline.array_results",
     "take_baselines": "edge.pipeline.baseline_capture",
     "paired": "edge.pipeline.pairing",
@@ -121,6 +126,9 @@ __all__ = [
     "ObjectMap",
     "Pad",
     "PadPose",
+    "Patch",
+    "PatchEvent",
+    "PatchEvents",
     "PoseQueue",
     "PoseSource",
     "RecordingError",
@@ -158,6 +166,7 @@ __all__ = [
     "open_sink",
     "open_source",
     "paired",
+    "patches",
     "pump",
     "save_baselines",
     "take_baselines",

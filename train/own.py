@@ -40,7 +40,7 @@ from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from train.data.frozen_presses import freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
-from train.data.press_batches import OneSensor
+from train.data.press_batches import OneSensor, stated_poses
 from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, recorded_grips
 from train.data.world import World, solve_pad
@@ -206,13 +206,15 @@ def judged(own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet]
     objections = []
     for what, presses in sets.items():
         frozen = freeze_presses(presses, SEED + 1, sensor.nuisances)
-        windows, truth = frozen.windows(1), frozen.patterns()
+        windows, truth = frozen.windows(presses.taps), frozen.patterns()
+        poses = stated_poses(np.random.default_rng(SEED), presses.poses)
         patterns = {name: np.empty_like(truth) for name in models} | {"bilinear": bilinear(windows[:, 0])}
         for number, window in enumerate(windows):
             for name, model in models.items():  # in turn, so that both meet the same machine
                 row, scaled = model.contract.pad_row(knowledge.pad), model.contract.scale_window(window)
+                taken = poses[number] if model.contract.takes_poses else None
                 begun_ns = time.perf_counter_ns()
-                patterns[name][number] = model.run(scaled, row)
+                patterns[name][number] = model.run(scaled, row, taken)
                 times_us[name].append((time.perf_counter_ns() - begun_ns) / 1000)
         errors = {name: psnr_db(made, truth, own.contract.output_full_scale) for name, made in patterns.items()}
         for name, values in errors.items():
