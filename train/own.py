@@ -64,7 +64,7 @@ differ that are a little unlike the sensor."""
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """What is known of one sensor."""
+    """Facts of one sensor, and how surely they are known."""
 
     name: str
     pad: Pad  # as its sensor file has it, with what was learned and identified
@@ -182,14 +182,16 @@ def _training(name: str, sensor: OneSensor, taps: int, steps: int) -> Training:
     return Training(name, network, recipe, start=start, options={"known": KNOWN}, sensor=sensor)
 
 
-class Judged(NamedTuple):
+class Comparison(NamedTuple):
     """Comparison of a model with others."""
 
     table: str
     objection: str | None  # why it is not handed over
 
 
-def judged(own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet], grips: Sequence[Grip]) -> Judged:
+def compared(
+    own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet], grips: Sequence[Grip]
+) -> Comparison:
     """Compare a model with the bundled one, told the same, and with bilinear interpolation.
 
     Args:
@@ -232,14 +234,14 @@ def judged(own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet]
     if grips and holes[OWN] > holes[bundled.name]:
         objections.append(
             f"on the recordings {holes[OWN]:.1%} of its patterns have holes, {holes[bundled.name]:.1%} of "
-            f"{bundled.name}'s: the sensor is not what the sensor file says; lay a weight on it with edge-sr doctor"
+            f"{bundled.name}'s: the sensor is not as in the sensor file; lay a weight on it with edge-sr doctor"
         )
     names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
     lines = [" | ".join(("method", *names, "run time [us]"))]
     for name, row in cells.items():
         run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
         lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
-    return Judged("\n".join(lines), "; ".join(objections) or None)
+    return Comparison("\n".join(lines), "; ".join(objections) or None)
 
 
 OWN: Final = "this model"
@@ -268,7 +270,7 @@ def _train(options: argparse.Namespace) -> int:
     families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
     world = World(families=families, ranges=knowledge.ranges, seed=options.seed, taps=options.taps)
     plan = _plan(options, world, work)
-    even = replace(world, families=dict.fromkeys(families, 1.0), count=JUDGED, per_pad=6, begun=0.0)
+    even = replace(world, families=dict.fromkeys(families, 1.0), count=COMPARED, per_pad=6, begun=0.0)
     sets = {
         "validation": even,
         "test": even,
@@ -290,7 +292,7 @@ def _train(options: argparse.Namespace) -> int:
     path = _exported(work, name, bundled)
     grips = [] if options.recordings is None else recorded_grips(options.recordings)
     grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
-    verdict = judged(ModelSession(path), knowledge, {what: made[what] for what in list(sets)[2:]}, grips)
+    verdict = compared(ModelSession(path), knowledge, {what: made[what] for what in list(sets)[2:]}, grips)
     _say(verdict.table)
     if verdict.objection is not None:
         _say(f"not handed over: {verdict.objection}")
@@ -301,7 +303,7 @@ def _train(options: argparse.Namespace) -> int:
     return 0
 
 
-JUDGED: Final = 480  # presses of each set that nothing is trained on
+COMPARED: Final = 480  # presses of each set that nothing is trained on
 
 
 def _exported(work: Path, name: str, bundled: Path) -> Path:
@@ -312,7 +314,7 @@ def _exported(work: Path, name: str, bundled: Path) -> Path:
     for suffix, more in ((INT8_SUFFIX, ["--int8", work / "presses.npz"]), ("", [])):
         if subprocess.run([*map(str, [*command, *more])], check=False).returncode == 0:
             return work / f"{name}{suffix}.onnx"
-    raise TrainError("the export has failed; the lines above say why")
+    raise TrainError("the export has failed; see the lines above")
 
 
 def _plan(options: argparse.Namespace, world: World, work: Path) -> Plan:
@@ -339,7 +341,7 @@ def _parser() -> argparse.ArgumentParser:
     add("sensor_file", type=Path, metavar="SENSOR.toml", help="sensor file, as edge-sr doctor --out writes it")
     add("--out", type=Path, required=True, help="folder for everything; its name is the model's")
     add("--sensor", metavar="NAME", help="which sensor of the file (default: its only one)")
-    add("--recordings", type=Path, metavar="FOLDER", help="grips of flat faces, to find constants and to judge by")
+    add("--recordings", type=Path, metavar="FOLDER", help="grips of flat faces, to find constants and to compare by")
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
     add("--minutes", type=float, default=20.0, help="about how long all takes (20)")

@@ -142,7 +142,7 @@ def _labelled(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], int]:
 
 
 class PatchEvent(NamedTuple):
-    """What has happened to a contact: its number since the start, and the patch; of an end the last that was there."""
+    """Change of a contact: its number since the start, and its patch; of an end the last one."""
 
     kind: PatchEventKind
     number: int

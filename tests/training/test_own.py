@@ -14,7 +14,7 @@ from train import own
 from train.data.press_batches import OneSensor, PressBatches
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.own import OWN, UNLIKE, judged, knowledge_of, main
+from train.own import OWN, UNLIKE, compared, knowledge_of, main
 from train.physics.pad_draws import KNOWN, RANGES
 from train.physics.sensor_noise import NAMES, Nuisances
 
@@ -82,10 +82,10 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     sets = {name: solve_pad(World(count=12, per_pad=12, seed=seed), 0) for seed, name in enumerate(("figures", UNLIKE))}
     found = knowledge_of(FILE, "4", None)
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
-    table, objection = judged(tiny, found, sets, [])
+    table, objection = compared(tiny, found, sets, [])
     assert [line.split(" | ")[0] for line in table.splitlines()] == ["method", OWN, "stsr-int8", "bilinear"]
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
-    _, objection = judged(ModelSession(find_model("stsr-int8")), found, sets, [])
+    _, objection = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
 
 
@@ -100,7 +100,7 @@ def test_bad_input_is_one_line(tmp_path, capsys):
 @pytest.mark.night
 def test_from_a_sensor_file_to_a_model(tmp_path, capsys, limits):
     """In miniature it learns nothing, so it is not handed over; continued, it is judged again."""
-    limits(own, TRIED=48, JUDGED=24)
+    limits(own, TRIED=48, COMPARED=24)
     save_sensor_file(tmp_path / "s.toml", FILE)
     for _ in range(2):
         assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01"]) == 1
