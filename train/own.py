@@ -267,6 +267,11 @@ def _train(options: argparse.Namespace) -> int:
     work.mkdir(parents=True, exist_ok=True)
     knowledge = knowledge_of(load_sensor_file(options.sensor_file), options.sensor, options.recordings)
     _say(knowledge.told())
+    if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
+        raise DatasetError(
+            "nothing is known of this sensor, and a model for any sensor is there: lay a weight on it with "
+            "edge-sr doctor, let edge-sr learn its gains from contacts, or find constants by --recordings"
+        )
     families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
     world = World(families=families, ranges=knowledge.ranges, seed=options.seed, taps=options.taps)
     plan = _plan(options, world, work)

@@ -92,6 +92,9 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
 def test_bad_input_is_one_line(tmp_path, capsys):
     assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "mine")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry()}))
+    assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine")]) == 1
+    assert capsys.readouterr().err.startswith("train.own: nothing is known of this sensor, ")
     save_sensor_file(tmp_path / "s.toml", FILE)
     assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--mesh", str(tmp_path / "none.stl")]) == 1
     assert capsys.readouterr().err.startswith("train.own: ")
