@@ -97,16 +97,12 @@ def test_two_fingers_are_compared(cook):
     assert len(out) > 100 and max(apart_ms) <= 20 and all("counts more" in line for line in out)
 
 
-def test_the_axis_of_a_contact(cook):
-    recipe, out = cook("Orientation of a contact")
-    assert out and all(re.fullmatch(r"\d+ deg, [\d.]+ times as long as wide", line) for line in out)
-    y, x = np.indices((40, 40)) - 19.5
-    for angle_deg in (0, 30, 90, 150):
-        angle = np.radians(angle_deg)
-        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-        bar = ((abs(along) < 15) & (abs(across) < 5)).astype(np.float32)
-        found_deg, ratio = recipe.axis_of(bar)
-        assert abs((found_deg - angle_deg + 90) % 180 - 90) < 1 and ratio == pytest.approx(3, rel=0.1)
+def test_separate_contacts_begin_and_end(cook):
+    _, out = cook("Separate contacts, and slip")
+    told = [re.fullmatch(r"contact (\d+): (begin|move|slip|end), -?\d+ deg, \d+ x \d+ mm", line) for line in out]
+    kinds = [one[2] for one in told if one]
+    assert kinds.count("begin") >= kinds.count("end") >= 4
+    assert all(told) or {line for line, one in zip(out, told, strict=True) if not one} == {"more than one contact"}
 
 
 def test_a_log_has_every_scan(cook, tmp_path):
