@@ -29,11 +29,6 @@ from firmware_bridge.poses import POSE_FIELDS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
 
-FOLLOW: Final = "follow"
-INTERRUPTED: Final = 130
-MOVE_SCANS: Final = 10  # scans of the free pad while the robot moves to a tap that was asked for
-LONGEST_WAIT_SCANS: Final = 500  # scans after which a robot that is not asked any more taps by the recording
-_STOP_POLL_S: Final = 0.05
 _OPTIONS: Final = ("tap", "option_counts", "option_pose")
 
 
@@ -65,7 +60,7 @@ class Robot:
         number = 0
         while number < len(track.counts):
             if number in self._taps and self._steered:
-                moving = track.counts[number - MOVE_SCANS : number]
+                moving = track.counts[number - 10 : number]  # the free pad, while the robot moves to the tap
                 option = yield from self._waits(moving)
                 self._asked.clear()
                 if option is not None:
@@ -82,7 +77,7 @@ class Robot:
         """Take lines that ask for the next tap."""
         *lines, self._partial = (self._partial + text).split(b"\n")
         for asked in map(json.loads, lines):
-            if asked == FOLLOW:
+            if asked == "follow":
                 self._steered = True
             else:
                 self._asked.append(asked)
@@ -97,7 +92,7 @@ class Robot:
 
     def _waits(self, free: NDArray[np.int32]) -> Generator[NDArray[np.int32], None, int | None]:
         """Yield scans of the free pad until a tap is asked for, and return its number; None for the recording's."""
-        for scan in range(LONGEST_WAIT_SCANS):
+        for scan in range(500):  # a robot that is not asked any more taps by the recording
             if self._asked:
                 place = self._asked.popleft()
                 if place is None:
@@ -123,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = {"rate_hz": options.rate_hz, "loop": options.loop}
         _play(robot, Emulator([recording], **settings, on_scan=robot.state, played=robot.played))
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return 130
     except (BridgeError, ValueError) as error:
         parser.error(str(error))
     return 0
@@ -135,7 +130,7 @@ def _play(robot: Robot, emulator: Emulator) -> None:
     with emulator:
         sys.stdout.write(f"{emulator.port}\n")
         sys.stdout.flush()
-        while not emulator.wait(_STOP_POLL_S):
+        while not emulator.wait(0.05):
             if select.select([0], [], [], 0)[0]:
                 text = os.read(0, 4096)
                 if not text:

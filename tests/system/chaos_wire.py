@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.emulator_thread import EmulatorThread
-from firmware_bridge.emulation.pty_port import PseudoPort
+from firmware_bridge.emulation.pty_port import EmulatorThread, PseudoPort
 from firmware_bridge.emulation.xela_controller import SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -230,7 +229,7 @@ class FaultyBus:
         on_sent: Callable[[Sent, int], object] = lambda sent, now_ns: None,
     ) -> None:
         """Prepare to play; `on_sent` gets each frame whose line goes out whole, just before it does, with the time."""
-        self.line = PseudoPort(link, seed=seed)
+        self.line = PseudoPort(link)
         self.begun = Counter[str]()
         self.handed = self.foreign = self.unread_bytes = self.openings = 0
         self.back_ns: list[int] = []
@@ -340,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     try:
-        played = controllers_of([load_recording(path) for path in options.file], [], options.rate_hz)
+        played = controllers_of([load_recording(path) for path in options.file], options.rate_hz)
         faults = stretches(options.faults, options.seed)
     except ValueError as error:
         parser.error(str(error))

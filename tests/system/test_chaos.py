@@ -10,7 +10,7 @@ from chaos_judge import HELD_CYCLES, Judge, telling
 from chaos_wire import NAMES, FaultyBus, Sent, numbered, stretches
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.emulator_thread import EmulatorThread
+from firmware_bridge.emulation.pty_port import EmulatorThread
 from firmware_bridge.emulation.xela_controller import bus_timeline, controllers_of
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -119,7 +119,7 @@ def test_a_leak_is_seen_in_minutes():
 
 def test_a_recording_is_played_among_faults_for_a_program_of_ones_own(tmp_path):
     recording = make_recording(100)
-    frames = bus_timeline(controllers_of([recording], [], 400), jitter_s=0.0, seed=1, loop=True)
+    frames = bus_timeline(controllers_of([recording], 400), jitter_s=0.0, seed=1, loop=True)
     bus = FaultyBus(numbered(frames), stretches("lost=.5@0+60", 1), 1, tmp_path / "port")
     with EmulatorThread([bus]), SlcanSerialLink(str(tmp_path / "port")) as link:
         scans = []

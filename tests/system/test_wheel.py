@@ -97,7 +97,6 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert not (packages / "edge" / "bench").exists()
     emulation = {path.stem for path in (packages / "firmware_bridge" / "emulation").glob("[!_]*.py")}
     assert emulation == {
-        "emulator_thread",
         "pty_port",
         "robot_main",
         "slcan_emulator",
