@@ -126,7 +126,6 @@ def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
 
 LONG_UNREAD_NS: Final = 50_000_000
 """Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
-WAITED_NS: Final = 1_000_000  # duration of a read, in [ns], above which no data was waiting when it began
 
 
 class Unread:
@@ -144,7 +143,7 @@ class Unread:
         """Note that data came during a read from `begun_ns` to `ended_ns`, in [ns] of monotonic time."""
         if self.empty_ns is not None and begun_ns - self.empty_ns > LONG_UNREAD_NS:
             return  # the process stalled: until all data is read, the duration of a read is no evidence
-        if ended_ns - begun_ns > WAITED_NS:
+        if ended_ns - begun_ns > 1_000_000:  # so no data was waiting when it began
             self.empty_ns = begun_ns
 
     def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:

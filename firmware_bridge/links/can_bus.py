@@ -21,19 +21,12 @@ from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 
-SEND_TIMEOUT_S: Final = 1.0
-TICK_NS: Final = 1_000
-
 PRETENDED: Final = ("virtual", "udp_multicast")
-_WITHOUT_BITRATE: Final = (*PRETENDED, "socketcan")
-"""Interfaces without a bitrate of their own: it is set elsewhere, or does not exist."""
 _NOT_THROUGH_PYTHON_CAN: Final = {
     "slcan": "use slcan:PORT: python-can's waits 2 s, carries 32 scans a second at its usual speed, and one byte of "
     "noise ends it",
     "gs_usb": "use gs_usb:SERIAL: python-can's never sees that the adapter was unplugged or has lost frames",
 }
-# Some of python-can's interfaces let through every error that a missing or incomplete driver causes.
-_NO_DRIVER: Final = (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError)
 
 
 class CanBusLink(Link):
@@ -54,11 +47,8 @@ class CanBusLink(Link):
     ) -> None:
         """Prepare a link to a channel such as "can0" of a python-can interface such as "socketcan"; opens nothing yet.
 
-        `triggers` are frames that wake older controllers, sent once after opening.
-
-        Raises:
-            SourceError: python-can has no such interface, or this link does not support it.
-            DeviceError: python-can is not installed.
+        `triggers` are frames that wake older controllers, sent once after opening. It raises SourceError for an
+        interface that python-can or this link does not support, and DeviceError where python-can is not installed.
         """
         self.name = f"can:{interface}:{channel}"
         pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
@@ -76,7 +66,7 @@ class CanBusLink(Link):
         self._scans = ScanAssembler(model)
         self._errors = BusErrors()
         self._unread = Unread()
-        self._device_clock = DeviceClock(TICK_NS, None)
+        self._device_clock = DeviceClock(1_000, None)
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)
         self._bus: Any = None
@@ -95,7 +85,7 @@ class CanBusLink(Link):
         try:
             for frame in self._triggers:
                 message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-                self._bus.send(message, timeout=SEND_TIMEOUT_S)
+                self._bus.send(message, timeout=1.0)
         except (self._can.CanError, OSError) as error:
             self._close()
             raise DeviceError(f"{self.name}: does not send frames: {error}") from error
@@ -165,16 +155,20 @@ class CanBusLink(Link):
         return self._scans.feed_frame(frame, time_ns, device)
 
     def _open(self) -> Any:
-        settings: dict[str, Any] = {} if self._interface in _WITHOUT_BITRATE else {"bitrate": BITRATE_BIT_S}
+        settings: dict[str, Any] = {}
+        channel: str | int = self._channel
         if self._interface == "socketcan":  # the kernel filters; on other interfaces a filter costs more than it saves
             settings["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
-        numbered = self._channel.isascii() and self._channel.isdigit() and self._interface not in _WITHOUT_BITRATE
-        channel = int(self._channel) if numbered else self._channel
+        elif self._interface not in PRETENDED:  # the others have no bitrate of their own
+            settings["bitrate"] = BITRATE_BIT_S
+            if self._channel.isascii() and self._channel.isdigit():
+                channel = int(self._channel)
         try:
             return self._can.Bus(channel=channel, interface=self._interface, ignore_config=True, **settings)
         except (self._can.CanError, OSError) as error:
             raise DeviceError(f"{self.name}: {_reason(error)}") from error
-        except _NO_DRIVER as error:
+        # Some interfaces let through every error that a missing or incomplete driver causes.
+        except (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError) as error:
             raise DeviceError(
                 f"{self.name}: cannot be opened, is its driver installed and the channel's name right? {error}"
             ) from error
@@ -186,8 +180,7 @@ class CanBusLink(Link):
 
 
 def _python_can() -> ModuleType:
-    # Its problems arrive as exceptions; its log would repeat them on stderr.
-    logging.getLogger("can").addHandler(logging.NullHandler())
+    logging.getLogger("can").addHandler(logging.NullHandler())  # its problems arrive as exceptions as well
     try:
         import can
     except ImportError as error:

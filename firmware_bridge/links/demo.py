@@ -16,9 +16,7 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
 
-START_TIMEOUT_S: Final = 20.0
 END_TIMEOUT_S: Final = 5.0
-_READ_BYTES: Final = 1 << 16
 
 
 class DemoLink(Link):
@@ -40,19 +38,12 @@ class DemoLink(Link):
         self._counts: dict[str, int] = {}
 
     def __enter__(self) -> Self:
-        rate = [] if self._rate_hz is None else ["--rate-hz", str(self._rate_hz)]
-        loop = ["--loop"] if self._loop else []
+        command = [sys.executable, "-m", "firmware_bridge.emulation.robot_main"]
+        command += [] if self._rate_hz is None else ["--rate-hz", str(self._rate_hz)]
+        command += ["--loop"] if self._loop else []
         # A session of its own: Ctrl-C is for this process, which must close the link before the emulator ends.
         self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "firmware_bridge.emulation.robot_main",
-                *rate,
-                *loop,
-                "--",
-                self._recording,
-            ],
+            [*command, "--", self._recording],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -98,7 +89,7 @@ class DemoLink(Link):
         stdout = None if self._process is None else self._process.stdout
         if stdout is None or not select.select([stdout], [], [], 0)[0]:
             return []
-        *lines, self._partial = (self._partial + os.read(stdout.fileno(), _READ_BYTES)).split(b"\n")
+        *lines, self._partial = (self._partial + os.read(stdout.fileno(), 1 << 16)).split(b"\n")
         return [_timed_pose(line) for line in lines]
 
     def steer(self) -> Callable[[PadPose | None], None]:
@@ -131,13 +122,13 @@ class DemoLink(Link):
 def _await_port(process: subprocess.Popen[bytes]) -> str:
     if process.stdout is None or process.stderr is None:
         raise ValueError("the emulator's output is not a pipe")
-    readable, _, _ = select.select([process.stdout], [], [], START_TIMEOUT_S)
+    readable, _, _ = select.select([process.stdout], [], [], 20)
     port = process.stdout.readline().decode().strip() if readable else ""
     if port:
         return port
     process.kill()
     last_words = process.stderr.read().decode().strip().rpartition("\n")[2]
-    raise DeviceError(f"the emulator did not start: {last_words or f'silent for {START_TIMEOUT_S:.0f} s'}")
+    raise DeviceError(f"the emulator did not start: {last_words or 'silent for 20 s'}")
 
 
 def _timed_pose(line: bytes) -> TimedPose:

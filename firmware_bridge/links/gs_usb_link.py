@@ -26,17 +26,9 @@ from firmware_bridge.scans.scan import Scan
 INTERFACE: Final = 0
 CHANNEL: Final = 0
 ENDPOINT_IN: Final = 0x81
-ENDPOINT_OUT: Final = 0x02
-USUAL_PACKET_BYTES: Final = 64
 REQUEST_TIMEOUT_MS: Final = 1000
-QUIET_MS: Final = 20
-"""Silence after which a stopped channel is empty, in [ms]: frames left in the adapter follow each other much faster."""
 MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
-
-_BUSY = (
-    "end the program that holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
-)
 
 
 class GsUsbLink(Link):
@@ -59,15 +51,10 @@ class GsUsbLink(Link):
         backend: IBackend | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare a link; nothing is opened yet.
+        """Prepare a link to the adapter with a serial number or at a place such as "1-2.3", for None the only one.
 
-        Args:
-            wanted: serial number of the adapter, or its place such as "1-2.3"; None for the only one there is. Once it
-                was open, only that adapter is opened again, or with a place the one that is there.
-            model: map from CAN ids to taxels.
-            triggers: frames that wake older controllers, sent once after opening.
-            backend: backend of pyusb; by default libusb.
-            clock_ns: monotonic clock, in [ns].
+        Once it was open, only that adapter is opened again, or with a place the one that is there. `triggers` are
+        frames that wake older controllers, sent once after opening, and `backend` is one of pyusb, by default libusb.
         """
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
@@ -84,7 +71,7 @@ class GsUsbLink(Link):
         self._unread = Unread()
         self._device: usb.core.Device | None = None
         self._driver_detached = False
-        self._packet = array.array("B", bytes(USUAL_PACKET_BYTES))
+        self._packet = array.array("B", bytes(64))
 
     def __enter__(self) -> Self:
         with self._counting:
@@ -176,7 +163,7 @@ class GsUsbLink(Link):
         interface = usb.util.find_descriptor(configuration, bInterfaceNumber=INTERFACE)
         endpoint = usb.util.find_descriptor(interface, bEndpointAddress=ENDPOINT_IN)
         packet_bytes = getattr(endpoint, "wMaxPacketSize", 0) & 0x7FF
-        self._packet = array.array("B", bytes(packet_bytes or USUAL_PACKET_BYTES))
+        self._packet = array.array("B", bytes(packet_bytes or 64))
 
     def _start(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
@@ -190,13 +177,13 @@ class GsUsbLink(Link):
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
             data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)
-            device.write(ENDPOINT_OUT, data, REQUEST_TIMEOUT_MS)
+            device.write(0x02, data, REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.MODE, gs_usb.mode(started=False))
         with suppress(usb.core.USBTimeoutError):
-            for _ in range(MOST_OLD_TRANSFERS):
-                device.read(ENDPOINT_IN, self._packet, QUIET_MS)
+            for _ in range(MOST_OLD_TRANSFERS):  # frames left in the adapter follow each other within 20 ms
+                device.read(ENDPOINT_IN, self._packet, 20)
 
     def _release(self, device: usb.core.Device) -> None:
         with suppress(usb.core.USBError):
@@ -222,7 +209,10 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
         return f"no permission: {udev_rule(described.usb_id)}"
     if code == errno.EBUSY:
         held = ", ".join(holders(f"/dev/bus/usb/{described.bus:03d}/{described.address:03d}"))
-        return f"in use{f' by {held}' if held else ''}: {_BUSY}"
+        return (
+            f"in use{f' by {held}' if held else ''}: end the program that holds it, such as another edge-sr or "
+            "candump; sudo ip link set can0 down frees the kernel's"
+        )
     if code == errno.ETIMEDOUT:
         return f"does not answer: unplug it and plug it in again ({described})"
     if code is None:

@@ -68,15 +68,10 @@ class ReplayLink(Link):
         clock: Clock = time.monotonic_ns,
         sleep: Sleep = time.sleep,
     ) -> None:
-        """Load the recordings.
+        """Load the recordings, from their paths or in memory.
 
-        Args:
-            paths: paths of the recordings; or recordings, already in memory.
-            rate_hz: scans a second of each sensor, also of one with recorded times if paced; by default the recorded
-                times, else the recorded rate.
-            paced: True plays at that speed, from now on; else each `read` returns a scan at its recorded time.
-            clock: monotonic clock in [ns].
-            sleep: sleeps for a time in [s].
+        They are played by their recorded times, else at their recorded rate, or at `rate_hz` scans a second of each
+        sensor. If `paced`, that is so from now on; else each `read` returns a scan at its recorded time.
 
         Raises:
             RecordingError: a file cannot be used.
@@ -119,16 +114,9 @@ class ReplayLink(Link):
         ]
         self.states_poses = bool(self._pose_lanes)
         self._poses: list[TimedPose] = []
-        due_ns, lane, row = (
-            np.concatenate(one)
-            for one in zip(
-                *(
-                    (due_times_ns, np.full(len(due_times_ns), number), np.arange(len(due_times_ns)))
-                    for number, (_, due_times_ns) in enumerate(lanes)
-                ),
-                strict=True,
-            )
-        )
+        due_ns = np.concatenate([times_ns for _, times_ns in lanes])
+        lane = np.concatenate([np.full(len(times_ns), number) for number, (_, times_ns) in enumerate(lanes)])
+        row = np.concatenate([np.arange(len(times_ns)) for _, times_ns in lanes])
         order = np.lexsort((lane, due_ns))
         self._due_ns, self._lane, self._row = due_ns[order], lane[order], row[order]
         self._place = 0

@@ -26,15 +26,11 @@ from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PR
 from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.schedule import NS_PER_S, SERVER_QUIET_S
 
-DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0
 REOPENING_S: Final = 1.0  # time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer
-FIRST_MESSAGE_S: Final = 0.5  # wait for the first message, in [s]: a server greets at once; no message is no error
 ANSWER_S: Final = 1.0
 """Time-out of a ping, in [s]: a link read by itself reports a pulled cable, or a server that hangs, after 1.75 s
 without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
-CLOSING_S: Final = 0.2
-MOST_WAITING: Final = 64  # most messages of one read; later ones wait for the next
 
 
 class ServerAddress(NamedTuple):
@@ -59,16 +55,7 @@ class XelaServerLink(Link):
     def __init__(
         self, url: str, *, geometry: SensorGeometry = USPA44, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        """Prepare a link; nothing is opened yet.
-
-        Args:
-            url: ws://HOST[:PORT].
-            geometry: geometry of the sensors; others of the server are left out.
-            clock_ns: monotonic clock, in [ns].
-
-        Raises:
-            SourceError: no such URL.
-        """
+        """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL."""
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
@@ -95,7 +82,7 @@ class XelaServerLink(Link):
         self._connection = self._connect()
         self._received_ns = self._clock_ns()
         try:
-            self._first = self._take(FIRST_MESSAGE_S)
+            self._first = self._take(0.5)  # a server greets at once; no message is no error
         except BaseException:
             self.__exit__()
             raise
@@ -133,7 +120,7 @@ class XelaServerLink(Link):
             return scans
         try:
             try:
-                for _ in range(MOST_WAITING):
+                for _ in range(64):  # later messages wait for the next read
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
                     self._received_ns, self._pong = self._clock_ns(), None
@@ -180,7 +167,7 @@ class XelaServerLink(Link):
                 proxy=None,
                 compression=None,
                 open_timeout=opening_s,
-                close_timeout=CLOSING_S,
+                close_timeout=0.2,
                 ping_interval=None,
                 max_size=LONGEST_MESSAGE_BYTES,
             )
@@ -194,7 +181,7 @@ def server_address(url: str) -> ServerAddress:
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, DEFAULT_PORT if parts.port is None else parts.port
+        host, port = parts.hostname, 5000 if parts.port is None else parts.port
     except ValueError as error:
         raise SourceError(f"address of the xela_server is {url!r}, {expected}: {error}") from error
     if parts.scheme == "wss":

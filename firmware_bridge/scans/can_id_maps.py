@@ -23,10 +23,8 @@ from numpy.typing import NDArray
 from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
 from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 
-PAYLOAD_BYTES: Final = 8
 CONTROLLERS: Final = range(16)
-SDAS: Final = 8  # number of data lines that an id of layout C can name, with TAXELS_OF_SDA taxels on each
-TAXELS_OF_SDA: Final = 16
+
 BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from
 _unpack_packed = struct.Struct(">HxHHHx").unpack_from
@@ -99,7 +97,7 @@ class ModelMap:
 def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
     """Decode the reading in a frame, None if the frame is not one of this model's."""
     place = model.taxels.get(frame.can_id)
-    if place is None or frame.extended or frame.remote or len(frame.data) != PAYLOAD_BYTES:
+    if place is None or frame.extended or frame.remote or len(frame.data) != 8:
         return None
     return Reading(*place, *_unpack_xyz(frame.data, 1))
 
@@ -126,12 +124,11 @@ def trigger_frame(board: int) -> CanFrame:
 def layout_c(geometry: SensorGeometry) -> ModelMap:
     """Return the id map of a current controller whose SDAs are the rows, their taxels numbered from right to left.
 
-    Raises:
-        ValueError: ids cannot name so many rows or columns.
+    Ids can name eight SDAs with sixteen taxels each; it raises ValueError for more.
     """
     rows, cols = geometry.rows, geometry.cols
-    if rows > SDAS or cols > TAXELS_OF_SDA:
-        raise ValueError(f"{rows} x {cols} taxels, expected at most {SDAS} x {TAXELS_OF_SDA}")
+    if rows > 8 or cols > 16:
+        raise ValueError(f"{rows} x {cols} taxels, expected at most 8 x 16")
     taxels = {
         sda << 8 | taxel << 4 | controller: (str(controller), sda * cols + (cols - 1 - taxel))
         for controller in CONTROLLERS
