@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
@@ -70,7 +70,7 @@ class DemoLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
         if self._link is None or self._process is None:
-            raise ValueError("the link is not open: use it in a with statement")
+            raise not_open()
         if self.ended:
             return []
         try:

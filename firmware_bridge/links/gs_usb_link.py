@@ -3,7 +3,6 @@
 import array
 import errno
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,11 +15,11 @@ from usb.backend import IBackend
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind, Unread
+from firmware_bridge.links.base import FrameLink, SourceKind, not_open
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
 from firmware_bridge.links.usb_devices import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
-from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
 
 INTERFACE: Final = 0
@@ -31,7 +30,7 @@ MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
 
-class GsUsbLink(Link):
+class GsUsbLink(FrameLink):
     """Link to a sensor on a gs_usb adapter.
 
     Frames left in an adapter when its client ends, or restarts without fetching them, can leave it mute until it is
@@ -56,19 +55,15 @@ class GsUsbLink(Link):
         Once it was open, only that adapter is opened again, or with a place the one that is there. `triggers` are
         frames that wake older controllers, sent once after opening, and `backend` is one of pyusb, by default libusb.
         """
+        self._scans = GsUsbScans(model)
+        super().__init__(self._scans, triggers, clock_ns)
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
         self.serial_number = wanted
         self._wanted = wanted
         self._known: Recognised[GsUsbDevice] = Recognised()
-        self._triggers = tuple(triggers)
         self._backend = backend
-        self._clock_ns = clock_ns
-        self._scans = GsUsbScans(model)
-        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
-        self._received_bytes = 0
-        self._transfers = 0
-        self._unread = Unread()
+        self._received_bytes = self._transfers = 0
         self._device: usb.core.Device | None = None
         self._driver_detached = False
         self._packet = array.array("B", bytes(64))
@@ -95,56 +90,35 @@ class GsUsbLink(Link):
             self._stop(device)
         self._release(device)
 
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; raises LinkLostError if the adapter is gone.
-
-        An adapter sends each frame in a transfer of its own: transfers are fetched until a scan closes.
-        """
-        if self._device is None:
-            raise ValueError("the link is not open: use it in a with statement")
-        end_ns = self._clock_ns() + int(timeout_s * 1e9)
-        left_ns = end_ns - self._clock_ns()
-        while True:
-            begun_ns = self._clock_ns()
-            data = self._fetch(self._device, max(1, math.ceil(left_ns / 1e6)))
-            now_ns = self._clock_ns()
-            if data:
-                self._unread.found(begun_ns, now_ns)
-            else:
-                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
-            with self._counting:
-                self._transfers += bool(data)
-                self._received_bytes += len(data)
-                fed = self._scans.feed(data, now_ns)
-                if data and len(data) < len(self._packet):
-                    self._scans.end_transfer()
-            scans = self._unread.mark(fed, now_ns, self._scans.clock.begun_ns)
-            self.trouble = self._scans.errors.trouble(now_ns)
-            self.stamps_dropped |= self._scans.clock.dropped
-            left_ns = end_ns - now_ns
-            if scans or left_ns <= 0:
-                return scans
-
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and transfers, and the counters of decoder, bus and assembler."""
         with self._counting:
             return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
 
-    def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids received so far."""
-        return frozenset(self._scans.can_ids)
-
-    def _fetch(self, device: usb.core.Device, timeout_ms: int) -> bytes:
-        # libusb waits for ever with a time-out of 0.
+    def _fetch(self, timeout_s: float) -> bytes | None:
+        # An adapter sends each frame in a transfer of its own. libusb waits for ever with a time-out of 0.
+        if self._device is None:
+            raise not_open()
         try:
-            count: int = device.read(ENDPOINT_IN, self._packet, timeout_ms)  # pyright: ignore[reportAssignmentType]
+            timeout_ms = max(1, math.ceil(1000 * timeout_s))
+            count: int = self._device.read(  # pyright: ignore[reportAssignmentType]
+                ENDPOINT_IN, self._packet, timeout_ms
+            )
         except usb.core.USBTimeoutError:
-            return b""
+            return None
         except usb.core.USBError as error:
             if error.errno == errno.EINTR:
-                return b""
+                return None
             raise LinkLostError(f"{self.name}: link lost, the cable or the adapter is gone: {error}") from error
-        return self._packet[:count].tobytes()
+        return self._packet[:count].tobytes() or None
+
+    def _take(self, piece: bytes, time_ns: int) -> list[Scan]:
+        self._transfers += 1
+        self._received_bytes += len(piece)
+        scans = self._scans.feed(piece, time_ns)
+        if len(piece) < len(self._packet):
+            self._scans.end_transfer()
+        return scans
 
     def _claim(self, device: usb.core.Device) -> None:
         with suppress(NotImplementedError):  # a platform whose kernel has no such driver

@@ -19,7 +19,7 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread
+from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread, not_open
 from firmware_bridge.links.fd_reader import BurstReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.usb_devices import in_use
@@ -125,7 +125,7 @@ class SlcanSerialLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the port is gone."""
         if self._bursts is None or self._serial is None:
-            raise ValueError("the link is not open: use it in a with statement")
+            raise not_open()
         try:
             pieces = self._take_fetched() or [self._receive(self._bursts, timeout_s)]
         except _PORT_ERRORS as error:

@@ -19,7 +19,7 @@ from websockets.exceptions import (
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
@@ -102,7 +102,7 @@ class XelaServerLink(Link):
             DeviceError: it has no sensor that can be used.
         """
         if self._connection is None:
-            raise ValueError("the link is not open: use it in a with statement")
+            raise not_open()
         if self._first:
             first, self._first = self._first, []
             return first

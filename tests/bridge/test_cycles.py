@@ -17,7 +17,7 @@ from firmware_bridge.can.slcan import encode_frame
 from firmware_bridge.emulation.xela_controller import Controller, bus_timeline
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 LONGEST_WAIT_NS = 1_500_000

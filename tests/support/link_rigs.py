@@ -26,7 +26,7 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.xela_server import XelaServerLink
-from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
