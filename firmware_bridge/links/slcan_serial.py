@@ -74,7 +74,6 @@ class SlcanSerialLink(Link):
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
         self.baudrate = baudrate
-
         self._triggers = tuple(triggers)
         self._plugged = PluggedAdapter(port)
         # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
