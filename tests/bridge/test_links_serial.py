@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import make_recording, read_scans
+from bridge_samples import read_scans
 from serial_samples import SilentDevice
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
@@ -65,24 +64,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
                 os.write(device.device_fd, text[at : at + piece_bytes])
             scans = read_scans(link, len(complete))  # the torn one waits for the next
             assert [scan.complete for scan in scans] == complete
-
-
-def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
-    """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
-
-    def starved(frame):
-        time.sleep(0.1)
-        return encode_frame(frame)
-
-    playing = Emulator([make_recording(50)], loop=True)
-    monkeypatch.setattr(slcan_serial, "encode_frame", starved)
-    with playing as emulator, SlcanSerialLink(emulator.port, triggers=[trigger_frame(1)]) as link:
-        (first, *_) = read_scans(link, 1)
-        assert first.unread_ns > 80_000_000 and first.device_ns is None
-        assert first.not_before_ns == first.time_ns - first.unread_ns
-        end_s = time.monotonic() + 20
-        while any(scan.unread_ns or scan.device_ns is None for scan in read_scans(link, 1)):
-            assert time.monotonic() < end_s
 
 
 # The reader of bursts.

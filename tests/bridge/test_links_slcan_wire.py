@@ -1,7 +1,6 @@
 """Wire of an slcan adapter besides frames: time stamps and status."""
 
 import os
-import time
 
 import pytest
 from bridge_samples import make_recording, read_scans
@@ -160,19 +159,6 @@ def read_now(device: SilentDevice) -> bytes:
         return os.read(device.device_fd, 1000)
     except BlockingIOError:
         return b""
-
-
-def test_who_has_answered_once_is_asked_again_after_an_opening(impatient):
-    with SilentDevice() as device:
-        link = SlcanSerialLink(device.port)
-        with link:
-            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
-            os.write(device.device_fd, b"F00\r")
-            end_s = time.monotonic() + 0.05 * (slcan_status.MOST_UNANSWERED + 2)
-            wait_for(lambda: link.read(0.01) == [] and time.monotonic() > end_s)
-        read_now(device)
-        with link:
-            wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
 
 
 def test_opening_again_does_not_unsay_what_was_said(impatient):
