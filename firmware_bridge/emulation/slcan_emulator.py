@@ -22,8 +22,6 @@ class Emulator:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
         line: this end of the pseudo-terminal.
-        sent_frames: number of frames that went out whole.
-        lost_frames: number of frames without room, because the client did not read.
     """
 
     def __init__(
@@ -63,7 +61,7 @@ class Emulator:
         bus = controllers_of(recordings, rate_hz)
         self.port = ""
         self.adapter = SlcanAdapter() if adapter is None else adapter
-        self.sent_frames = self.lost_frames = 0
+
         self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
         self._frame_s = frame_s
         self._on_scan = on_scan
@@ -126,19 +124,16 @@ class Emulator:
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> Iterator[float]:
         if not self.adapter.hears_the_bus:
             return
-        lines: list[bytes] = []
-        ended: list[int] = []
+        data, ended = b"", list[int]()
         for time_s, frame in frames:
-            lines.append(self.adapter.encode(frame, time_s + self._still_s))
+            data += self.adapter.encode(frame, time_s + self._still_s)
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
-        data = b"".join(lines)
-        room = (yield from self._write_patiently(data)) if self._waits else self.line.write(data)
-        for line in lines:
-            room -= len(line)
-            self.sent_frames += room >= 0
-            self.lost_frames += room < 0
+        if self._waits:
+            yield from self._write_patiently(data)
+        else:
+            self.line.write(data)
         for controller in ended:
             self._on_scan(controller, now_ns)
 
@@ -148,8 +143,8 @@ class Emulator:
         while time.monotonic() < time_s:
             yield time_s
 
-    def _write_patiently(self, data: bytes) -> Generator[float, None, int]:
-        """Send frames as the client makes room for them, with answers between them; return the number of bytes."""
+    def _write_patiently(self, data: bytes) -> Iterator[float]:
+        """Send frames as the client makes room for them, with answers between them."""
         sent, self._writing = 0, True
         while sent < len(data):
             amid_frame = data[:sent][-1:] not in (b"", CR)
@@ -163,7 +158,6 @@ class Emulator:
             if not self.adapter.channel_open:
                 break
         self._writing = False
-        return sent
 
     def obey(self, received: bytes) -> None:
         """Process what the client has written, and answer."""

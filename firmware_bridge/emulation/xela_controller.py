@@ -123,10 +123,10 @@ class SlcanAdapter:
     Attributes:
         channel_open: True while it passes on the frames of the bus.
         acknowledges: True if it answers commands (as Lawicel's do); some firmwares never do.
-        refused: number of commands that it refused.
+
         flags: flags that `F` reports, Lawicel's bits; the report clears them.
         state: state on the bus: a active, w warning, p passive, b bus-off, in which it receives no frame.
-        sent: the latest frames that clients sent to the bus.
+
     """
 
     def __init__(self, *, acknowledges: bool = True, old_canable: bool = False) -> None:
@@ -135,8 +135,7 @@ class SlcanAdapter:
         self.flags = 0
         self.state = "a"
         self.channel_open = False
-        self.refused = 0
-        self.sent: list[bytes] = []
+
         self._bitrate: int | None = None
         self._known = b"OCSMAVTtRr" if old_canable else None
         self._timestamps = False
@@ -158,9 +157,8 @@ class SlcanAdapter:
         """Process bytes from the client and return the answer."""
         *commands, pending = (self._pending + data).split(CR)
         self._pending = pending[-32:]
-        answers = [self._obey(command) for command in commands]
-        self.refused += answers.count(BEL)
-        return b"".join(answers) if self.acknowledges else b""
+        answers = b"".join(map(self._obey, commands))
+        return answers if self.acknowledges else b""
 
     def state_line(self, state: str, rx_errors: int, tx_errors: int) -> bytes:
         """Change the state and return the line that reports it, in the format of the kernel's driver."""
@@ -178,7 +176,6 @@ class SlcanAdapter:
         if self._known is not None and name not in self._known:
             return b""
         if name == b"t" and self.channel_open:
-            self.sent = [*self.sent[-15:], command]
             return b"z" + CR
         if name == b"V" and not value:
             return b"V1013" + CR
