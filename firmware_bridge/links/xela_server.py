@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from threading import Event
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 from urllib.parse import urlsplit
 
 from websockets.exceptions import (
@@ -33,14 +33,6 @@ ANSWER_S: Final = 1.0
 without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
 
 
-class ServerAddress(NamedTuple):
-    """Address of a server."""
-
-    host: str
-    port: int
-    url: str
-
-
 class XelaServerLink(Link):
     """Link to the vendor's xela_server, with all its sensors of the right geometry.
 
@@ -59,7 +51,7 @@ class XelaServerLink(Link):
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
-        self.url = self._address.url
+        self.url = self._address[2]
         self._scans = ServerScans(geometry)
         self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
@@ -176,7 +168,7 @@ class XelaServerLink(Link):
         return self._open.enter_context(connection)
 
 
-def server_address(url: str) -> ServerAddress:
+def server_address(url: str) -> tuple[str, int, str]:
     """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL; raises SourceError on any other form."""
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
@@ -189,7 +181,7 @@ def server_address(url: str) -> ServerAddress:
     extra = parts.username is not None or parts.query or parts.fragment or parts.path not in ("", "/")
     if parts.scheme != "ws" or not host or not port or extra or not url.isprintable() or " " in url:
         raise SourceError(f"address of the xela_server is {url!r}, {expected}")
-    return ServerAddress(host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}")
+    return host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> str:
