@@ -22,6 +22,7 @@ class Emulator:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
         line: this end of the pseudo-terminal.
+        played_out: True once everything was played, and the client has fetched it.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Emulator:
         """
         bus = controllers_of(recordings, rate_hz)
         self.port = ""
+        self.played_out = False
         self.adapter = SlcanAdapter() if adapter is None else adapter
 
         self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
@@ -117,6 +119,7 @@ class Emulator:
                 newest_s = frames[-1][0]
                 yield from self._hand_on(frames)
             yield from self._drain()
+            self.played_out = True
         finally:
             self.line.unplug()
             self._through.set()

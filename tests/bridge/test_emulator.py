@@ -6,11 +6,10 @@ import time
 import can
 import numpy as np
 import pytest
-from bridge_samples import make_counts, make_recording, read_until_lost, stacked, write_recording
+from bridge_samples import make_counts, make_recording, read_until_lost, stacked
 from can.interfaces.slcan import slcanBus
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.robot_main import main
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
 from firmware_bridge.errors import RecordingError
@@ -143,31 +142,6 @@ def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
         came_ns = [scan.time_ns for scan in scans if scan.sensor == str(controller)]
         assert len(told_ns) == len(came_ns) == 10
         assert all(begun_ns < before < after for before, after in zip(told_ns, came_ns, strict=True))
-
-
-# The command.
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [(["gone.csv"], "cannot be read"), (["a.csv"], "--rate-hz"), (["a.csv", "--rate-hz", "0"], "positive")],
-)
-def test_the_command_says_what_is_wrong(tmp_path, monkeypatch, capsys, arguments, words):
-    write_recording(tmp_path / "a.csv", make_counts(1))
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="2"):
-        main(arguments)
-    assert words in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_ctrl_c_ends_the_command_quietly(tmp_path, monkeypatch, capsys):
-    def interrupt(emulator, timeout_s):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Emulator, "wait", interrupt)
-    path = write_recording(tmp_path / "a.csv", make_counts(1))
-    assert main([str(path), "--rate-hz", "100"]) == 130
-    assert capsys.readouterr().err == ""
 
 
 def test_python_can_reads_our_emulator():

@@ -1,8 +1,6 @@
 """Devices on which every link can be tried alike: they give scans when asked, are pulled out and put back."""
 
 import errno
-import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -268,7 +266,7 @@ class ServerRig(Rig):
 
 
 class DemoRig(Rig):
-    """The emulator in a process of its own."""
+    """The demo, whose emulator hangs up."""
 
     name = "demo"
     lost = "link lost, the cable or the adapter is gone"
@@ -277,14 +275,12 @@ class DemoRig(Rig):
         self._recording = write_recording(folder / "demo.csv", make_counts(30), rate_hz=100)
 
     def link(self, **settings):
-        return DemoLink(self._recording, loop=True)
+        self._link = DemoLink(self._recording, loop=True)
+        return self._link
 
     def lose(self):
-        (process_id,) = processes_playing(self._recording)
-        os.kill(process_id, signal.SIGKILL)
-
-    def close(self):
-        assert processes_playing(self._recording) == []
+        assert self._link.emulator is not None
+        self._link.emulator.hang_up()
 
 
 class ReplayRig(Rig):
@@ -310,17 +306,3 @@ def _then_once(fetch: Callable[..., Any], action: Callable[[], object]) -> Calla
         return fetched
 
     return fetch_and_act
-
-
-def processes_playing(path: Path) -> list[int]:
-    """Return the processes of emulators that play a recording."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                command = (entry / "cmdline").read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if b"firmware_bridge.emulation.robot_main" in command and str(path).encode() in command:
-                found.append(int(entry.name))
-    return found

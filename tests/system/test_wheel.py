@@ -98,7 +98,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     emulation = {path.stem for path in (packages / "firmware_bridge" / "emulation").glob("[!_]*.py")}
     assert emulation == {
         "pty_port",
-        "robot_main",
+        "robot",
         "slcan_emulator",
         "xela_controller",
     }, "what the demo needs"
