@@ -1,7 +1,6 @@
 """Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal, as strict as the device."""
 
 import math
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
@@ -73,7 +72,7 @@ class Emulator:
         self._writing = False
         self._answers = b""
         self.line = PseudoPort(link)
-        self._through = threading.Event()
+
         self._alone = EmulatorThread([self])
 
     def __enter__(self) -> Self:
@@ -91,14 +90,6 @@ class Emulator:
     def hang_up(self) -> None:
         """Pull the cable out."""
         self._alone.__exit__()
-
-    def tell(self, line: bytes) -> None:
-        """Send an unsolicited line, such as `adapter.state_line(...)`."""
-        self.line.write(line)
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; return False on time-out."""
-        return self._through.wait(timeout_s)
 
     def course(self) -> Generator[float, None, None]:
         """Play; yield the monotonic time, in [s], at which to go on, or earlier when the client has written."""
@@ -122,7 +113,6 @@ class Emulator:
             self.played_out = True
         finally:
             self.line.unplug()
-            self._through.set()
 
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> Iterator[float]:
         if not self.adapter.hears_the_bus:

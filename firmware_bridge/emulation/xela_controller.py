@@ -160,11 +160,6 @@ class SlcanAdapter:
         answers = b"".join(map(self._obey, commands))
         return answers if self.acknowledges else b""
 
-    def state_line(self, state: str, rx_errors: int, tx_errors: int) -> bytes:
-        """Change the state and return the line that reports it, in the format of the kernel's driver."""
-        self.state = state
-        return b"s%s%03d%03d\r" % (state.encode(), rx_errors, tx_errors) if self.channel_open else b""
-
     def encode(self, frame: CanFrame, time_s: float) -> bytes:
         """Encode a frame from the bus as the client receives it."""
         if self._timestamps:

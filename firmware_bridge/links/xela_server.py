@@ -4,7 +4,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from threading import Event
 from typing import Final, Self
 from urllib.parse import urlsplit
@@ -56,7 +55,6 @@ class XelaServerLink(Link):
         self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
-        self._open = ExitStack()
         self._connection: ClientConnection | None = None
         self._met = False
         self._received_ns = 0
@@ -74,7 +72,7 @@ class XelaServerLink(Link):
         self._connection = self._connect()
         self._received_ns = self._clock_ns()
         try:
-            self._first = self._take(0.5)  # a server greets at once; no message is no error
+            self._first = self._take(self._connection, 0.5)  # a server greets at once; no message is no error
         except BaseException:
             self.__exit__()
             raise
@@ -83,8 +81,9 @@ class XelaServerLink(Link):
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._connection = None
-        self._open.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; waits at most `timeout_s` for the first message.
@@ -98,18 +97,15 @@ class XelaServerLink(Link):
         if self._first:
             first, self._first = self._first, []
             return first
-        return self._take(timeout_s)
+        return self._take(self._connection, timeout_s)
 
     def counters(self) -> dict[str, int]:
         """Return the count of received bytes, and the counters of decoder and scans."""
         with self._counting:
             return {"received_bytes": self._received_bytes} | self._scans.counters()
 
-    def _take(self, timeout_s: float) -> list[Scan]:
+    def _take(self, connection: ClientConnection, timeout_s: float) -> list[Scan]:
         scans: list[Scan] = []
-        connection = self._connection
-        if connection is None:
-            return scans
         try:
             try:
                 for _ in range(64):  # later messages wait for the next read
@@ -153,7 +149,7 @@ class XelaServerLink(Link):
         try:
             # The server is on this machine or near it: no proxy, and no compression, which costs time on both sides.
             # No pings by websockets: it would drop a server that sends messages but answers no ping.
-            connection = connect(
+            return connect(
                 url,
                 sock=plain,
                 proxy=None,
@@ -165,7 +161,6 @@ class XelaServerLink(Link):
             )
         except (OSError, WebSocketException, ValueError) as error:
             raise DeviceError(f"{url}: {_no_handshake(error, opening_s)}") from error
-        return self._open.enter_context(connection)
 
 
 def server_address(url: str) -> tuple[str, int, str]:

@@ -106,30 +106,6 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
     assert (stacked(scans) == make_counts(200)).all()
 
 
-def test_a_stop_amid_a_scan_tears_none():
-    """Only the machine can stop an emulator there; a controller sends its scans whole."""
-    with (
-        Emulator([make_recording(20), make_recording(20, seed=1)], seed=3) as emulator,
-        SlcanSerialLink(emulator.port) as link,
-    ):
-        encode = emulator.adapter.encode
-        numbers = iter(range(20 * 32))
-
-        def encode_slowly(frame, time_s):
-            if next(numbers) in (20, 325):
-                time.sleep(0.5)
-            return encode(frame, time_s)
-
-        emulator.adapter.encode = encode_slowly
-        scans = read_until_lost(link)
-    assert (stacked(scans, "4") == make_counts(20)).all() and (stacked(scans, "6") == make_counts(20, seed=1)).all()
-    assert all(scan.fresh.all() for scan in scans)
-    for sensor in "46":
-        apart_ns = np.diff([scan.device_ns or 0 for scan in scans if scan.sensor == sensor])
-        assert (apart_ns > 300_000_000).sum() >= 2, "a gap of each stop; the machine may have stopped it as well"
-        assert apart_ns.min() > 0, "a clock whose rate is followed may be corrected by some ms after a stop"
-
-
 def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
     stamps = []
     recordings = [make_recording(10), make_recording(10, seed=1)]

@@ -3,10 +3,9 @@
 import errno
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import can
 from bridge_samples import frames_of, make_counts, read_scans, write_recording
@@ -83,10 +82,6 @@ class CanRig(Rig):
 
     def sent(self, frames: int) -> list[CanFrame]:
         """Return the frames that a link has sent, so many."""
-        raise NotImplementedError
-
-    def after_next_frame(self, action: Callable[[], object]) -> None:
-        """Do something in the reader's thread, once, between a frame and what the reader makes of it."""
         raise NotImplementedError
 
     def give(self, link: Link, scans: int) -> list[Scan]:
@@ -167,9 +162,6 @@ class GsUsbRig(CanRig):
     def sent(self, frames):
         return self._port.adapter.sent
 
-    def after_next_frame(self, action):
-        self._port.adapter.fetch = _then_once(self._port.adapter.fetch, action)
-
     def lose(self):
         self._port.adapter.unplug()
 
@@ -213,8 +205,7 @@ class PythonCanRig(CanRig):
         monkeypatch.setattr(can, "Bus", self._open)
 
     def _open(self, *, channel, **_):
-        self._near = PulledBus(self._plugged, channel=channel)
-        return self._near
+        return PulledBus(self._plugged, channel=channel)
 
     def link(self, **settings):
         return CanBusLink("virtual", self._channel, **settings)
@@ -225,9 +216,6 @@ class PythonCanRig(CanRig):
     def sent(self, frames):
         heard = [self._far.recv(1.0) for _ in range(frames)]
         return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
-
-    def after_next_frame(self, action):
-        self._near.recv = _then_once(self._near.recv, action)
 
     def lose(self):
         self._plugged.clear()
@@ -294,15 +282,3 @@ class ReplayRig(Rig):
 
     def link(self, **settings):
         return ReplayLink([self._recording])
-
-
-def _then_once(fetch: Callable[..., Any], action: Callable[[], object]) -> Callable[..., Any]:
-    actions = [action]
-
-    def fetch_and_act(timeout):
-        fetched = fetch(timeout)
-        while actions:
-            actions.pop()()
-        return fetched
-
-    return fetch_and_act
