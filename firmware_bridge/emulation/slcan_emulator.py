@@ -45,7 +45,7 @@ class Emulator:
             recordings: each track is one sensor on the bus.
             rate_hz: scans a second of each sensor; by default as recorded.
             loop: True to begin again after the last scan.
-            adapter: the adapter, by default one that acknowledges commands.
+            adapter: the adapter, by default a good one.
             jitter_s: largest time by which a scan comes early or late, in [s].
             frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
             seed: seed of jitter and unused bytes.

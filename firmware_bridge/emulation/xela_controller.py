@@ -22,7 +22,6 @@ CR: Final = b"\r"
 BEL: Final = b"\a"
 Played = Callable[[Track], Iterable[NDArray[np.int32]]]
 """Function from a track to the scans that are played of it, in order."""
-_RIGHT_BITRATE: Final = 8
 
 
 def scan_frames(
@@ -122,29 +121,23 @@ class SlcanAdapter:
 
     Attributes:
         channel_open: True while it passes on the frames of the bus.
-        acknowledges: True if it answers commands (as Lawicel's do); some firmwares never do.
-
         flags: flags that `F` reports, Lawicel's bits; the report clears them.
-        state: state on the bus: a active, w warning, p passive, b bus-off, in which it receives no frame.
-
+        bus_off: True where it has left the bus, and receives no frame.
     """
 
-    def __init__(self, *, acknowledges: bool = True, old_canable: bool = False) -> None:
-        """Switch the adapter on; an `old_canable`, of its first firmware, has no answers, time stamps and flags."""
-        self.acknowledges = acknowledges and not old_canable
+    def __init__(self) -> None:
+        """Switch the adapter on."""
         self.flags = 0
-        self.state = "a"
+        self.bus_off = False
         self.channel_open = False
-
         self._bitrate: int | None = None
-        self._known = b"OCSMAVTtRr" if old_canable else None
         self._timestamps = False
         self._pending = b""
 
     @property
     def hears_the_bus(self) -> bool:
         """True if the channel is open at the bitrate of the sensor, and not bus-off."""
-        return self.channel_open and self._bitrate == _RIGHT_BITRATE and self.state != "b"
+        return self.channel_open and self._bitrate == 8 and not self.bus_off
 
     def begin_anew(self) -> None:
         """Start up again, as after a reset: closed, and at another bitrate than the sensor's."""
@@ -157,8 +150,7 @@ class SlcanAdapter:
         """Process bytes from the client and return the answer."""
         *commands, pending = (self._pending + data).split(CR)
         self._pending = pending[-32:]
-        answers = b"".join(map(self._obey, commands))
-        return answers if self.acknowledges else b""
+        return b"".join(map(self._obey, commands))
 
     def encode(self, frame: CanFrame, time_s: float) -> bytes:
         """Encode a frame from the bus as the client receives it."""
@@ -168,8 +160,6 @@ class SlcanAdapter:
 
     def _obey(self, command: bytes) -> bytes:
         name, value = command[:1], command[1:]
-        if self._known is not None and name not in self._known:
-            return b""
         if name == b"t" and self.channel_open:
             return b"z" + CR
         if name == b"V" and not value:

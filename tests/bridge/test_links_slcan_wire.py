@@ -156,7 +156,7 @@ def test_opening_again_does_not_unsay_what_was_said(impatient):
         link = SlcanSerialLink(emulator.port)
         with link:
             read_scans(link, 1)
-            emulator.adapter.state = "b"
+            emulator.adapter.bus_off = True
             emulator.line.write(b"sb256256\r")
             read_until(link, lambda: link.trouble == BUS_OFF)
         for _ in range(2):
@@ -165,7 +165,7 @@ def test_opening_again_does_not_unsay_what_was_said(impatient):
         answers = link.counters()["status_answers"]
         with link:
             read_until(link, lambda: link.counters()["status_answers"] > answers)
-            emulator.adapter.state = "a"
+            emulator.adapter.bus_off = False
             read_until(link, lambda: link.trouble is None)
 
 
