@@ -1,5 +1,6 @@
 """Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
+from collections.abc import Iterable
 from itertools import pairwise, starmap
 from operator import itemgetter
 from typing import Final
@@ -128,7 +129,7 @@ class SlcanScans:
                     piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
                 head_ns = time_ns
             if isinstance(piece, CanFrame):
-                self._give_up_begun(time_ns, scans)
+                self._give_up(self._mixed.begun, time_ns, scans)
                 if not piece.extended:  # bounded: there are at most 2048 of these
                     self.can_ids.add(piece.can_id)
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
@@ -172,7 +173,7 @@ class SlcanScans:
         start, cycle_bytes = 0, self._taxels * frame_bytes
         waits = frame_bytes == STAMPED_BYTES and not self.clock.dropped
         if not waits:
-            self._give_up_begun(time_ns, scans)
+            self._give_up(self._mixed.begun, time_ns, scans)
         mixed = bool(self._mixed.begun)
         while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
             scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
@@ -194,15 +195,12 @@ class SlcanScans:
         for number, (_, since_ns) in list(self._mixed.begun.items()):
             # A scan that is open would end by the first of them.
             if time_ns - since_ns > SCAN_GIVEN_UP_NS or self._assembler.is_open(self._mixed.names[number]):
-                self._give_up(number, time_ns, scans)
+                self._give_up([number], time_ns, scans)
 
-    def _give_up_begun(self, time_ns: int, scans: list[Scan]) -> None:
-        for number in list(self._mixed.begun):
-            self._give_up(number, time_ns, scans)
-
-    def _give_up(self, number: int, time_ns: int, scans: list[Scan]) -> None:
-        """Feed the frames of a begun cycle one by one."""
-        self._feed_singly(self._mixed.begun.pop(number)[0], STAMPED_BYTES, time_ns, scans, late=True)
+    def _give_up(self, begun: Iterable[int], time_ns: int, scans: list[Scan]) -> None:
+        """Feed the frames of begun cycles one by one."""
+        for number in tuple(begun):
+            self._feed_singly(self._mixed.begun.pop(number)[0], STAMPED_BYTES, time_ns, scans, late=True)
 
     def _feed_singly(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan], *, late: bool) -> None:
         """Feed frames one by one; `late` if others that came after them were fed before."""
