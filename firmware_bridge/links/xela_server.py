@@ -158,7 +158,7 @@ class XelaServerLink(Link):
                 close_timeout=0.2,
                 ping_interval=None,
                 max_size=LONGEST_MESSAGE_BYTES,
-            )
+            ).__enter__()  # websockets warns of a connection that was not entered
         except (OSError, WebSocketException, ValueError) as error:
             raise DeviceError(f"{url}: {_no_handshake(error, opening_s)}") from error
 
