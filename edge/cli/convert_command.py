@@ -76,7 +76,7 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
     tracks = [track for track in recording.tracks if sensor in (None, track.sensor)]
     expected, scans = (sum(len(track.counts) for track in some) for some in (tracks, made[0].tracks))
     names = ", ".join(track.sensor for track in tracks)
-    lasting_s = max(float(replay.times_ns(track.sensor)[-1]) for track in tracks) / 1e9
+    lasting_s = max(float(replay.times_ns[track.sensor][-1]) for track in tracks) / 1e9
     emulated = ", EMULATED" if recording.origin == "emulated" else ""
     size_mb = path.stat().st_size / 1e6
     yield f"{path}: {scans} scans of sensor {names}, {lasting_s:.1f} s, {size_mb:.2f} MB{emulated}"
@@ -144,7 +144,7 @@ def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     mounting = recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
     poses = [pose.later(-replay.first_ns) for pose in recording.poses]
     own = [pose for pose in poses if pose.sensor == track.sensor] or [pose for pose in poses if pose.sensor is None]
-    write_csv(path, track, replay.times_ns(track.sensor), mounting, own, emulated=recording.origin == "emulated")
+    write_csv(path, track, replay.times_ns[track.sensor], mounting, own, emulated=recording.origin == "emulated")
 
 
 _WRITERS: Final = {".mcap": _write_mcap, ".npz": _write_npz, ".csv": _write_csv}

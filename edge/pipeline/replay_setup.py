@@ -141,7 +141,7 @@ def free_baselines(
                     replay.notes.append(f"sensor {name}: zeroed from its first {FEWEST_SCANS} scans{doubt}")
                 continue
             first, last = int(stretch.rows[0]), int(stretch.rows[-1])
-            at_ns = replay.times_ns(name)[[first, last]]
+            at_ns = replay.times_ns[name][[first, last]]
             how = "still and pressed least"
             if stretch.within_counts is not None:
                 how = f"pressed least; it recovers there: a taxel may be off by {stretch.within_counts:.0f} counts"

@@ -7,23 +7,12 @@ Source: Linux include/uapi/linux/can/error.h, whose bits socketcan and gs_usb ad
 from typing import Final
 
 BUS_OFF: Final = 0x40
-RESTARTED: Final = 0x100
 CONTROLLER: Final = 0x04  # error class whose details are in data byte 1
 RX_OVERFLOW: Final = 0x01
-TX_OVERFLOW: Final = 0x02
-WARNING: Final = 0x04 | 0x08
-PASSIVE: Final = 0x10 | 0x20
 
 LOST_RECENTLY_NS: Final = 5_000_000_000  # time for which a loss of frames is reported, in [ns]
 
-_COUNTED: Final[tuple[str, ...]] = (
-    "bus_off",
-    "error_passive",
-    "error_warnings",
-    "other_errors",
-    "controller_overflows",
-    "overflows",
-)
+_COUNTED: Final = ["bus_off", "error_passive", "error_warnings", "other_errors", "controller_overflows", "overflows"]
 _TROUBLE: Final = {
     "bus_off": "bus-off, the adapter has left the bus: check wires, termination and the bitrate of every node",
     "error_passive": "error-passive, most frames on the bus are garbled: check wires, termination and bitrate",
@@ -40,13 +29,7 @@ class BusErrors:
         self._lost_ns: int | None = None
 
     def error_frame(self, classes: int, data: bytes, time_ns: int) -> None:
-        """Process an error frame.
-
-        Args:
-            classes: error classes, the bits of its id.
-            data: details of the error.
-            time_ns: monotonic time of its arrival, in [ns].
-        """
+        """Process an error frame of the error classes in its id, with their details, that came at `time_ns` [ns]."""
         self._told_before_opening = False
         controller = data[1] if classes & CONTROLLER and len(data) > 1 else 0
         if controller & RX_OVERFLOW:
@@ -54,12 +37,12 @@ class BusErrors:
             self._lost_ns = time_ns
         if classes & BUS_OFF:
             self.left_the_bus()
-        elif controller & PASSIVE:
+        elif controller & 0x30:  # passive, for received frames or sent ones
             self._enter("error_passive")
-        elif controller & WARNING:
+        elif controller & 0x0C:  # a warning of either
             self._counts["error_warnings"] += 1
             self._state = None
-        elif classes & RESTARTED or (classes & CONTROLLER and not controller & (RX_OVERFLOW | TX_OVERFLOW)):
+        elif classes & 0x100 or (classes & CONTROLLER and not controller & 0x03):  # restarted, or active again
             self._state = None
         elif not controller & RX_OVERFLOW:
             self._counts["other_errors"] += 1

@@ -38,19 +38,15 @@ ECHO_IDS: Final = 10  # most frames under way to the bus at once, as in Linux; t
 
 OVERFLOW_FLAG: Final = 1 << 0
 FD_FLAG: Final = 1 << 1
-_FLAGS: Final = 0x0F
+
 EXTENDED: Final = 1 << 31
 REMOTE: Final = 1 << 30
 ERROR: Final = 1 << 29
-_HIGHEST_STANDARD: Final = 0x7FF
 _HIGHEST_EXTENDED: Final = 0x1FFFFFFF
 
 HEADER_BYTES: Final = 12
 FRAME_BYTES: Final = 20
-STAMP_BYTES: Final = 4
-_FD_MORE_BYTES: Final = 64 - 8
 
-USUAL_SAMPLE_POINT: Final = 0.875
 _SAMPLE_POINTS: Final = (0.75, 0.90)
 """Range of sample points within which a bus of usual length works. Source: CiA 301, recommended bit timing."""
 
@@ -75,11 +71,7 @@ class BitTimingLimits(NamedTuple):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "BitTimingLimits":
-        """Decode the answer to the request BIT_TIMING_LIMITS.
-
-        Raises:
-            ValueError: the answer is too short.
-        """
+        """Decode the answer to the request BIT_TIMING_LIMITS; raises ValueError if it is too short."""
         if len(data) < LIMITS_BYTES:
             raise ValueError(f"bit timing limits have {len(data)} bytes, expected {LIMITS_BYTES}")
         return cls(*struct.unpack_from("<10I", data))
@@ -112,8 +104,7 @@ class BitTiming(NamedTuple):
 def bit_timing(limits: BitTimingLimits) -> BitTiming:
     """Return the timing for 1 Mbit/s with the sample point nearest to 87.5 %; of equal ones that of the finest quanta.
 
-    Raises:
-        ValueError: this controller cannot do it.
+    It raises ValueError if this controller cannot do it.
     """
     timings = list(_timings(limits))
     if not timings:
@@ -121,15 +112,11 @@ def bit_timing(limits: BitTimingLimits) -> BitTiming:
             f"its CAN controller cannot do 1 Mbit/s sampled at {_SAMPLE_POINTS[0]:.0%} to {_SAMPLE_POINTS[1]:.0%} "
             f"(clock {limits.clock_hz} Hz, divided by {limits.brp_min} to {limits.brp_max}): use another adapter"
         )
-    return min(timings, key=lambda timing: (abs(timing.sample_point - USUAL_SAMPLE_POINT), timing.brp))
+    return min(timings, key=lambda timing: (abs(timing.sample_point - 0.875), timing.brp))
 
 
 def channel_count(config: bytes) -> int:
-    """Decode the number of channels from the answer to the request DEVICE_CONFIG.
-
-    Raises:
-        ValueError: the answer is too short.
-    """
+    """Decode the number of channels from the answer to the request DEVICE_CONFIG; ValueError if it is too short."""
     if len(config) < CONFIG_BYTES:
         raise ValueError(f"device configuration has {len(config)} bytes, expected {CONFIG_BYTES}")
     return config[3] + 1
@@ -175,7 +162,7 @@ class GsUsbDecoder:
         """Configure the decoder as the adapter was started: with time stamps or not, and with so many channels."""
         self._stamped = stamped
         self._channels = channels
-        self._frame_bytes = FRAME_BYTES + STAMP_BYTES * stamped
+        self._frame_bytes = FRAME_BYTES + 4 * stamped
         self._pending = b""
         self._in_step = True
         self._counts = dict.fromkeys(("frames", "error_frames", "echoes", "other_channels", "fd_frames"), 0)
@@ -201,7 +188,7 @@ class GsUsbDecoder:
                 self._in_step = False
                 position += 1
                 continue
-            size = self._frame_bytes + (_FD_MORE_BYTES if flags & FD_FLAG else 0)
+            size = self._frame_bytes + (64 - 8 if flags & FD_FLAG else 0)
             if end - position < size:
                 break
             self._in_step = True
@@ -224,9 +211,9 @@ class GsUsbDecoder:
     def _plausible(self, echo_id: int, raw_id: int, dlc: int, flags: int) -> bool:
         return (
             (echo_id == RECEIVED or echo_id < ECHO_IDS)
-            and (raw_id & (EXTENDED | ERROR) != 0 or raw_id & _HIGHEST_EXTENDED <= _HIGHEST_STANDARD)
+            and (raw_id & (EXTENDED | ERROR) != 0 or raw_id & _HIGHEST_EXTENDED <= 0x7FF)
             and dlc <= 15
-            and flags <= _FLAGS
+            and flags <= 0x0F
         )
 
     def _read(self, buffer: bytes, position: int, raw_id: int, dlc: int, flags: int) -> HostFrame:

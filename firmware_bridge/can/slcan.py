@@ -206,11 +206,7 @@ class SlcanDecoder:
 
 
 def encode_frame(frame: CanFrame) -> bytes:
-    r"""Encode a frame as an slcan line, with its CR.
-
-    Raises:
-        ValueError: the id, the data or the time stamp does not fit a CAN 2.0 frame.
-    """
+    """Encode a frame as an slcan line, with its CR; raises ValueError for what does not fit a CAN 2.0 frame."""
     highest_id = 0x1FFFFFFF if frame.extended else 0x7FF
     if not 0 <= frame.can_id <= highest_id:
         raise ValueError(f"CAN id is {frame.can_id:#x}, expected 0..{highest_id:#x}")

@@ -24,8 +24,8 @@ FLAGS: Final = {
     0x40: "arbitration_lost",
     0x80: "bus_error",
 }
-STATES: Final = {"a": "error_active", "w": "error_warning", "p": "error_passive", "b": "bus_off"}
-ERRORS: Final = {
+_STATES: Final = {"a": "error_active", "w": "error_warning", "p": "error_passive", "b": "bus_off"}
+_ERRORS: Final = {
     "a": "ack_error",
     "b": "bit_error",
     "B": "bit_error",
@@ -35,8 +35,6 @@ ERRORS: Final = {
     "O": "tx_overrun",
     "s": "stuff_error",
 }
-LOSSES: Final = frozenset({"rx_full", "overrun"})
-NOISE: Final = frozenset({"error_passive", "bus_error"})
 INTERVAL_NS: Final = 5_000_000_000
 MOST_UNANSWERED: Final = 3
 FRAMES_TO_FORGET: Final = 1600  # frames after which a loss that an error line reported is over: a second of one sensor
@@ -70,12 +68,12 @@ class AdapterStatus:
             self.counts["status_answers"] += 1
             self._count(self._flags)
         elif _STATUS.fullmatch(line) and line[:1] == b"s":
-            state = STATES[chr(line[1])]
+            state = _STATES[chr(line[1])]
             self._off_at_frame = frames if state == "bus_off" else None
             self.counts["status_lines"] += 1
             self._count([state])
         elif _STATUS.fullmatch(line) and int(line[1:2]) == len(line) - 2:
-            errors = [ERRORS[letter] for letter in line[2:].decode()]
+            errors = [_ERRORS[letter] for letter in line[2:].decode()]
             if "overrun" in errors:
                 self._lost_at_frame = frames
             self.counts["status_lines"] += 1
@@ -87,19 +85,16 @@ class AdapterStatus:
     def trouble(self, frames: int, *, flags_of_a_silence: bool = False) -> str | None:
         """Return the trouble to report to the user, None if there is none.
 
-        Bus-off is over when a frame comes; a loss that flags reported, when the next flags do not contain it.
-
-        Args:
-            frames: number of frames so far.
-            flags_of_a_silence: True where no frame comes, and the flags were requested since the last one: the flags
-                of any bus hold an error now and then, which is no trouble while frames come.
+        Bus-off is over when a frame comes, of so many `frames` so far; a loss that flags reported, when the next flags
+        do not contain it. `flags_of_a_silence` is True where no frame comes, and the flags were requested since the
+        last one: the flags of any bus hold an error now and then, which is no trouble while frames come.
         """
         if self._off_at_frame == frames:
             return BUS_OFF
-        if flags_of_a_silence and self._flags & NOISE:
+        if flags_of_a_silence and self._flags & {"error_passive", "bus_error"}:
             return BUS_ERRORS
         recent = self._lost_at_frame is not None and frames - self._lost_at_frame < FRAMES_TO_FORGET
-        return FRAMES_LOST if recent or self._flags & LOSSES else None
+        return FRAMES_LOST if recent or self._flags & {"rx_full", "overrun"} else None
 
     def forget(self) -> None:
         """Forget the flags reported last, since the adapter no longer answers."""
@@ -150,10 +145,7 @@ class StatusQuestions:
     def due(self, scans: int, refusals: int, now_ns: int) -> bool:
         """Return True if a request is due, which then counts as sent; to be called at every read.
 
-        Args:
-            scans: number of scans that this read returned.
-            refusals: number of BELs so far.
-            now_ns: monotonic, in [ns].
+        `scans` is the number of scans that this read returned at `now_ns`, and `refusals` that of BELs so far.
         """
         if scans:
             self._scan_ns, self._answers_before_silence = now_ns, None

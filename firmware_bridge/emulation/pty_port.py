@@ -1,35 +1,29 @@
-"""Far end of a pseudo-terminal, which emulates an adapter's port, its cable and its line."""
+"""Far ends of pseudo-terminals, which emulate adapters' ports and cables, and the thread that plays the adapters.
+
+Several share one thread: where each has a thread or a process of its own, each wakes up a thousand times a second, and
+takes the processor from the program that reads them.
+"""
 
 import fcntl
-import math
 import os
-import random
 import select
 import struct
 import termios
+import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
-from typing import Final
-
-LINE_SPEED_BAUD: Final = 3_000_000
-COUNTED_LATE_NS: Final = 10_000_000  # longest delay, in [ns], until a busy kernel counts sent bytes as unread
-_COUNTS: Final = 4
-_SPEEDS_BAUD: Final = {
-    getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
-}
+from typing import Protocol, Self
 
 
 class PseudoPort:
     """Port whose clients may come and go; `path` is theirs, and it is `plugged` while the cable is in."""
 
-    def __init__(self, link: Path | None = None, *, ignores_line_speed: bool = False, seed: int = 0) -> None:
+    def __init__(self, link: Path | None = None) -> None:
         """Prepare a port that is not plugged in; a link points to its present pseudo-terminal, as udev's does."""
         self.path = ""
         self.plugged = False
         self._link = link
-        self._ignores_line_speed = ignores_line_speed
-        self._garble = random.Random(f"line {seed}")
         self._terminal = ""
         self._far_fd = self._client_fd = -1
 
@@ -65,12 +59,12 @@ class PseudoPort:
 
     def received(self) -> bytes:
         """Return the bytes that the client has written, of which there are some."""
-        return self._through_line(os.read(self._far_fd, 4096))
+        return os.read(self._far_fd, 4096)
 
     def write(self, data: bytes) -> int:
         """Send the bytes that find room and return their number; an adapter cannot keep the rest."""
         try:
-            return os.write(self._far_fd, self._through_line(data)) if self.plugged else 0
+            return os.write(self._far_fd, data) if self.plugged else 0
         except BlockingIOError:
             return 0
 
@@ -86,20 +80,75 @@ class PseudoPort:
     def left_bytes(self) -> int:
         """Return the number of bytes left by a client that has stopped reading."""
         counted = 0
-        for _ in range(_COUNTS):
+        for _ in range(4):  # a busy kernel counts sent bytes as unread up to 10 ms late
             counted = max(counted, self.unread_bytes())
-            time.sleep(COUNTED_LATE_NS / _COUNTS / 1e9)
+            time.sleep(0.0025)
         return counted
-
-    def _through_line(self, data: bytes) -> bytes:
-        """Return the bytes that arrive at the other end: at another speed they become noise of another length."""
-        speed_baud = _SPEEDS_BAUD.get(termios.tcgetattr(self._client_fd)[5])
-        if self._ignores_line_speed or speed_baud == LINE_SPEED_BAUD:
-            return data
-        return self._garble.randbytes(math.ceil(len(data) * min(1.0, (speed_baud or 0) / LINE_SPEED_BAUD)))
 
 
 def listen(ports: Iterable[PseudoPort], timeout_s: float) -> dict[PseudoPort, bytes]:
     """Return the bytes that clients have written, by port; waits at most `timeout_s` [s] for the first."""
     readable, _, _ = select.select([port for port in ports if port.plugged], [], [], timeout_s)
     return {port: port.received() for port in readable}
+
+
+class Playing(Protocol):
+    """Emulator as its thread sees it.
+
+    Attributes:
+        line: port of its client.
+    """
+
+    line: PseudoPort
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        ...
+
+    def course(self) -> Generator[float, None, None]:
+        """Play; yield the monotonic time, in [s], at which to go on, or earlier when the client has written."""
+        ...
+
+    def obey(self, received: bytes) -> None:
+        """Process what the client has written."""
+        ...
+
+
+class EmulatorThread:
+    """Thread that plays emulators to their ends, or until it is closed, which ends them where they are."""
+
+    def __init__(self, emulators: Sequence[Playing]) -> None:
+        """Prepare to play them; nothing is plugged in yet."""
+        self._courses = {one: one.course() for one in emulators}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._play, name="emulator", daemon=True)
+
+    def __enter__(self) -> Self:
+        for one in self._courses:
+            one.plug()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _play(self) -> None:
+        try:
+            due_s = {one: next(course) for one, course in self._courses.items()}
+            while due_s and not self._stop.is_set():
+                left_s = min(due_s.values()) - time.monotonic()
+                received = listen([one.line for one in due_s], min(max(left_s, 0.0), 0.05))
+                now_s = time.monotonic()
+                for one in list(due_s):
+                    if data := received.get(one.line):
+                        one.obey(data)
+                    if data or due_s[one] <= now_s:
+                        next_s = next(self._courses[one], None)
+                        if next_s is None:
+                            del due_s[one]
+                        else:
+                            due_s[one] = next_s
+        finally:
+            for course in self._courses.values():
+                course.close()

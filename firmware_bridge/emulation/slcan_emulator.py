@@ -1,28 +1,17 @@
 """Emulator of a XELA controller with an slcan adapter, on a pseudo-terminal, as strict as the device."""
 
 import math
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.emulator_thread import EmulatorThread
-from firmware_bridge.emulation.pty_port import PseudoPort
+from firmware_bridge.emulation.pty_port import EmulatorThread, PseudoPort
 from firmware_bridge.emulation.xela_controller import CR, FRAME_S, Played, SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.tracks import Recording
-
-_ROOM_POLL_S: Final = 0.001
-"""Time until another look for room, in [s]: at 5000 scans a second a reader empties the terminal in 2 ms."""
-_DRAIN_POLL_S: Final = 0.01
-_EMPTY_LOOKS: Final = 3
-"""Looks in turn that must find no unread byte: while a client empties its buffer, the kernel still holds more."""
-_STOOD_STILL_S: Final = 0.2
-"""Lateness in [s] at which the emulator itself was stopped: it ends the scans under way, and goes on where it was,
-since no controller sends in one burst what it has missed."""
 
 
 class Emulator:
@@ -32,25 +21,18 @@ class Emulator:
         port: path for clients, once entered.
         adapter: the adapter, with its state and the number of refused commands.
         line: this end of the pseudo-terminal.
-        sent_frames: number of frames that went out whole.
-        lost_frames: number of frames without room, because the client did not read.
+        played_out: True once everything was played, and the client has fetched it.
     """
 
     def __init__(
         self,
         recordings: Sequence[Recording],
         *,
-        controllers: Sequence[int] = (),
         rate_hz: float | None = None,
         loop: bool = False,
-        acknowledges: bool = True,
-        left_open: bool = False,
-        old_canable: bool = False,
+        adapter: SlcanAdapter | None = None,
         jitter_s: float = 0.001,
-        latency_s: float = 0.001,
         frame_s: float = FRAME_S,
-        first_frame: int = 0,
-        ignores_line_speed: bool = False,
         seed: int = 0,
         on_scan: Callable[[int, int], object] = lambda controller, time_ns: None,
         link: Path | None = None,
@@ -61,17 +43,11 @@ class Emulator:
 
         Args:
             recordings: each track is one sensor on the bus.
-            controllers: their controller ids 0..15; by default 4, 6, 8, ...
             rate_hz: scans a second of each sensor; by default as recorded.
             loop: True to begin again after the last scan.
-            acknowledges: True to answer commands.
-            left_open: True for a channel that is open from the start, as a killed client leaves it.
-            old_canable: True for no answers, no time stamps and no flags.
+            adapter: the adapter, by default a good one.
             jitter_s: largest time by which a scan comes early or late, in [s].
-            latency_s: period in which the adapter hands on its frames, in [s].
             frame_s: duration of a frame on the bus, in [s]; a real one carries no more than 480 scans a second.
-            first_frame: frames that are over when the channel is first opened; by default a cycle begins there.
-            ignores_line_speed: True to accept any speed, as USB-CDC adapters do.
             seed: seed of jitter and unused bytes.
             on_scan: called with the controller and the monotonic time in [ns] of the last frame of a scan.
             link: link that points to the pseudo-terminal; by default clients use the terminal itself.
@@ -79,25 +55,24 @@ class Emulator:
             played: scans that are played of a track; each is asked for while the one before is sent.
 
         Raises:
-            ValueError: an option is out of range.
+            ValueError: the rate is out of range.
             RecordingError: a recording that this sensor cannot have made, or one without a rate.
         """
-        bus = controllers_of(recordings, controllers, rate_hz)
+        bus = controllers_of(recordings, rate_hz)
         self.port = ""
-        self.adapter = SlcanAdapter(acknowledges=acknowledges, left_open=left_open, old_canable=old_canable)
-        self.sent_frames = self.lost_frames = 0
-        self._timeline = bus_timeline(
-            bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, first_frame=first_frame, played=played
-        )
-        self._latency_s, self._frame_s = latency_s, frame_s
+        self.played_out = False
+        self.adapter = SlcanAdapter() if adapter is None else adapter
+
+        self._timeline = bus_timeline(bus, jitter_s=jitter_s, seed=seed, loop=loop, frame_s=frame_s, played=played)
+        self._frame_s = frame_s
         self._on_scan = on_scan
         self._last_frames = {one.model.wire_order(str(one.can_id))[-1][0]: one.can_id for one in bus}
         self._waits = waits
         self._still_s = 0.0
         self._writing = False
         self._answers = b""
-        self.line = PseudoPort(link, ignores_line_speed=ignores_line_speed, seed=seed)
-        self._through = threading.Event()
+        self.line = PseudoPort(link)
+
         self._alone = EmulatorThread([self])
 
     def __enter__(self) -> Self:
@@ -116,54 +91,42 @@ class Emulator:
         """Pull the cable out."""
         self._alone.__exit__()
 
-    def tell(self, line: bytes) -> None:
-        """Send an unsolicited line, such as `adapter.state_line(...)`."""
-        self.line.write(line)
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has hung up; return False on time-out."""
-        return self._through.wait(timeout_s)
-
     def course(self) -> Generator[float, None, None]:
         """Play; yield the monotonic time, in [s], at which to go on, or earlier when the client has written."""
         try:
             while not self.adapter.channel_open:
                 yield math.inf
             start_s, newest_s = time.monotonic(), -math.inf
-            for handed_on_s, group in groupby(self._timeline, key=self._handed_on_s):
+            for handed_on_s, group in groupby(self._timeline, key=lambda timed: math.ceil(1000 * timed[0]) / 1000):
                 due_s = start_s + self._still_s + handed_on_s
                 yield from self._wait_until(due_s)
                 late_s = time.monotonic() - due_s
                 frames = list(group)  # now, since a scan is asked for while the one before is sent
                 between_scans = frames[0][0] - newest_s > 1.5 * self._frame_s
-                if late_s > _STOOD_STILL_S and between_scans and not self._waits:
+                # It was stopped itself: it ends the scans under way, and goes on where it was, since no controller
+                # sends in one burst what it has missed.
+                if late_s > 0.2 and between_scans and not self._waits:
                     self._still_s += late_s
                 newest_s = frames[-1][0]
                 yield from self._hand_on(frames)
             yield from self._drain()
+            self.played_out = True
         finally:
             self.line.unplug()
-            self._through.set()
-
-    def _handed_on_s(self, timed: tuple[float, CanFrame]) -> float:
-        return math.ceil(timed[0] / self._latency_s) * self._latency_s if self._latency_s else timed[0]
 
     def _hand_on(self, frames: Iterable[tuple[float, CanFrame]]) -> Iterator[float]:
         if not self.adapter.hears_the_bus:
             return
-        lines: list[bytes] = []
-        ended: list[int] = []
+        data, ended = b"", list[int]()
         for time_s, frame in frames:
-            lines.append(self.adapter.encode(frame, time_s + self._still_s))
+            data += self.adapter.encode(frame, time_s + self._still_s)
             if frame.can_id in self._last_frames:
                 ended.append(self._last_frames[frame.can_id])
         now_ns = time.monotonic_ns()  # before the write: a reader may be done before it returns
-        data = b"".join(lines)
-        room = (yield from self._write_patiently(data)) if self._waits else self.line.write(data)
-        for line in lines:
-            room -= len(line)
-            self.sent_frames += room >= 0
-            self.lost_frames += room < 0
+        if self._waits:
+            yield from self._write_patiently(data)
+        else:
+            self.line.write(data)
         for controller in ended:
             self._on_scan(controller, now_ns)
 
@@ -173,8 +136,8 @@ class Emulator:
         while time.monotonic() < time_s:
             yield time_s
 
-    def _write_patiently(self, data: bytes) -> Generator[float, None, int]:
-        """Send frames as the client makes room for them, with answers between them; return the number of bytes."""
+    def _write_patiently(self, data: bytes) -> Iterator[float]:
+        """Send frames as the client makes room for them, with answers between them."""
         sent, self._writing = 0, True
         while sent < len(data):
             amid_frame = data[:sent][-1:] not in (b"", CR)
@@ -183,11 +146,11 @@ class Emulator:
             if amid_frame or not self._answers:
                 sent += self.line.write(data[sent:])
             if sent < len(data):
-                yield from self._wait_until(time.monotonic() + _ROOM_POLL_S)
+                # At 5000 scans a second a reader empties the terminal in 2 ms.
+                yield from self._wait_until(time.monotonic() + 0.001)
             if not self.adapter.channel_open:
                 break
         self._writing = False
-        return sent
 
     def obey(self, received: bytes) -> None:
         """Process what the client has written, and answer."""
@@ -199,6 +162,6 @@ class Emulator:
     def _drain(self) -> Iterator[float]:
         """Let the client fetch the bytes under way, which hanging up would discard."""
         looks = 0
-        while self.adapter.channel_open and looks < _EMPTY_LOOKS:
+        while self.adapter.channel_open and looks < 3:  # while a client empties its buffer, the kernel holds more
             looks = 0 if self.line.unread_bytes() else looks + 1
-            yield from self._wait_until(time.monotonic() + _DRAIN_POLL_S)
+            yield from self._wait_until(time.monotonic() + 0.01)

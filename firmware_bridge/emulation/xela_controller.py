@@ -4,7 +4,6 @@ import heapq
 import math
 import random
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import islice
 from operator import attrgetter
 from typing import Final, NamedTuple
 
@@ -21,12 +20,8 @@ FRAME_S: Final = 0.000_13  # duration of a frame of eight bytes on a 1 Mbit/s bu
 
 CR: Final = b"\r"
 BEL: Final = b"\a"
-_LONGEST_COMMAND: Final = 32
 Played = Callable[[Track], Iterable[NDArray[np.int32]]]
 """Function from a track to the scans that are played of it, in order."""
-_SHAPES: Final = tuple(dict.fromkeys(model.geometry.scan_shape for model in ID_MAPS.values()))
-_RIGHT_BITRATE: Final = 8
-_WRONG_BITRATE: Final = 6
 
 
 def scan_frames(
@@ -55,35 +50,32 @@ class Controller(NamedTuple):
     model: ModelMap = USPA44_MAP
 
 
-def controllers_of(recordings: Sequence[Recording], can_ids: Sequence[int], rate_hz: float | None) -> list[Controller]:
-    """Create the controllers that play these recordings on one bus: each track is one.
+def controllers_of(recordings: Sequence[Recording], rate_hz: float | None) -> list[Controller]:
+    """Create the controllers 4, 6, 8, ... that play these recordings on one bus: each track is one.
 
-    Their ids are 0..15, by default 4, 6, 8, ..., and their rates by default as recorded.
+    Their rates are by default as recorded.
 
     Raises:
-        ValueError: an id or the rate is invalid.
+        ValueError: the rate is invalid, or there are more than six.
         RecordingError: a recording that this sensor cannot have made, or one without a rate.
     """
     tracks = [(recording, track) for recording in recordings for track in recording.tracks]
-    can_ids = can_ids or range(4, 4 + 2 * len(tracks), 2)
-    if not len(tracks) == len(can_ids) == len(set(can_ids)) or not set(can_ids) <= set(range(16)):
-        raise ValueError(f"controllers are {list(can_ids)}, expected {len(tracks)} different ones of 0..15")
+    if len(tracks) > 6:
+        raise ValueError(f"{len(tracks)} sensors on one bus, expected at most 6")
     controllers: list[Controller] = []
-    for (recording, track), can_id in zip(tracks, can_ids, strict=True):
+    for number, (recording, track) in enumerate(tracks):
         model = ID_MAPS.get(track.geometry.name)
         if model is None:
-            got, known = track.counts.shape[1:], ", ".join(map(str, _SHAPES))
-            raise RecordingError(f"{recording.path}: scans of shape {got}, expected one of {known}")
-        controllers.append(Controller(track, can_id, playing_rate_hz(recording, track, rate_hz), model))
+            known = ", ".join(dict.fromkeys(str(model.geometry.scan_shape) for model in ID_MAPS.values()))
+            raise RecordingError(f"{recording.path}: scans of shape {track.counts.shape[1:]}, expected one of {known}")
+        controllers.append(Controller(track, 4 + 2 * number, playing_rate_hz(recording, track, rate_hz), model))
     return controllers
 
 
 def playing_rate_hz(recording: Recording, track: Track, rate_hz: float | None) -> float:
     """Return the scans a second at which a track is played: the requested ones, else as recorded.
 
-    Raises:
-        ValueError: the rate is not positive.
-        RecordingError: no rate is requested, and the recording has none.
+    It raises ValueError unless that is positive, and RecordingError where none is recorded.
     """
     known_hz = [one for one in (rate_hz, recording.rate_hz, track.mean_rate_hz) if one is not None]
     if not known_hz:
@@ -100,15 +92,11 @@ def bus_timeline(
     seed: int,
     loop: bool,
     frame_s: float = FRAME_S,
-    first_frame: int = 0,
     played: Played = attrgetter("counts"),
 ) -> Iterator[tuple[float, CanFrame]]:
-    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan.
-
-    The first `first_frame` of them are left out, so that a client can also join in the middle of a cycle.
-    """
+    """Yield all frames on the bus in order, `frame_s` [s] long each, with their time in [s] from the first scan."""
     lanes = [_lane(controller, jitter_s, seed, loop, frame_s, played) for controller in controllers]
-    return islice(heapq.merge(*lanes, key=lambda timed: timed[0]), first_frame, None)
+    return heapq.merge(*lanes, key=lambda timed: timed[0])
 
 
 def _lane(
@@ -133,50 +121,36 @@ class SlcanAdapter:
 
     Attributes:
         channel_open: True while it passes on the frames of the bus.
-        acknowledges: True if it answers commands (as Lawicel's do); some firmwares never do.
-        refused: number of commands that it refused.
         flags: flags that `F` reports, Lawicel's bits; the report clears them.
-        state: state on the bus: a active, w warning, p passive, b bus-off, in which it receives no frame.
-        sent: the latest frames that clients sent to the bus.
+        bus_off: True where it has left the bus, and receives no frame.
     """
 
-    def __init__(self, *, acknowledges: bool = True, left_open: bool = False, old_canable: bool = False) -> None:
-        """Switch the adapter on; `left_open`, as a client leaves it that died, `old_canable`, as its first firmware."""
-        self.acknowledges = acknowledges and not old_canable
+    def __init__(self) -> None:
+        """Switch the adapter on."""
         self.flags = 0
-        self.state = "a"
-        self.channel_open = left_open
-        self.refused = 0
-        self.sent: list[bytes] = []
-        self._bitrate = _RIGHT_BITRATE if left_open else None
-        self._known = b"OCSMAVTtRr" if old_canable else None
+        self.bus_off = False
+        self.channel_open = False
+        self._bitrate: int | None = None
         self._timestamps = False
         self._pending = b""
 
     @property
     def hears_the_bus(self) -> bool:
         """True if the channel is open at the bitrate of the sensor, and not bus-off."""
-        return self.channel_open and self._bitrate == _RIGHT_BITRATE and self.state != "b"
+        return self.channel_open and self._bitrate == 8 and not self.bus_off
 
     def begin_anew(self) -> None:
         """Start up again, as after a reset: closed, and at another bitrate than the sensor's."""
         self.channel_open = False
-        self._bitrate = _WRONG_BITRATE
+        self._bitrate = 6
         self._timestamps = False
         self._pending = b""
 
     def feed(self, data: bytes) -> bytes:
         """Process bytes from the client and return the answer."""
         *commands, pending = (self._pending + data).split(CR)
-        self._pending = pending[-_LONGEST_COMMAND:]
-        answers = [self._obey(command) for command in commands]
-        self.refused += answers.count(BEL)
-        return b"".join(answers) if self.acknowledges else b""
-
-    def state_line(self, state: str, rx_errors: int, tx_errors: int) -> bytes:
-        """Change the state and return the line that reports it, in the format of the kernel's driver."""
-        self.state = state
-        return b"s%s%03d%03d\r" % (state.encode(), rx_errors, tx_errors) if self.channel_open else b""
+        self._pending = pending[-32:]
+        return b"".join(map(self._obey, commands))
 
     def encode(self, frame: CanFrame, time_s: float) -> bytes:
         """Encode a frame from the bus as the client receives it."""
@@ -186,10 +160,7 @@ class SlcanAdapter:
 
     def _obey(self, command: bytes) -> bytes:
         name, value = command[:1], command[1:]
-        if self._known is not None and name not in self._known:
-            return b""
         if name == b"t" and self.channel_open:
-            self.sent = [*self.sent[-15:], command]
             return b"z" + CR
         if name == b"V" and not value:
             return b"V1013" + CR

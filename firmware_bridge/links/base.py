@@ -1,11 +1,14 @@
 """Interface of every link; a new link is one file with this interface, and its form in the registry (`registry.py`)."""
 
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.scans.frame_scans import FrameScans
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 
@@ -116,6 +119,11 @@ class Link(Protocol):
         return None
 
 
+def not_open() -> ValueError:
+    """Return the error of a link that is read before it was opened, or after it was closed."""
+    return ValueError("the link is not open: use it in a with statement")
+
+
 def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
     """Return the common origin of recordings played together: "emulated" if one is; None if they differ otherwise."""
     found = set(origins)
@@ -126,7 +134,6 @@ def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
 
 LONG_UNREAD_NS: Final = 50_000_000
 """Time without a read from which the process counts as stalled, in [ns]: more than twice the longest wait of a link."""
-WAITED_NS: Final = 1_000_000  # duration of a read, in [ns], above which no data was waiting when it began
 
 
 class Unread:
@@ -144,7 +151,7 @@ class Unread:
         """Note that data came during a read from `begun_ns` to `ended_ns`, in [ns] of monotonic time."""
         if self.empty_ns is not None and begun_ns - self.empty_ns > LONG_UNREAD_NS:
             return  # the process stalled: until all data is read, the duration of a read is no evidence
-        if ended_ns - begun_ns > WAITED_NS:
+        if ended_ns - begun_ns > 1_000_000:  # so no data was waiting when it began
             self.empty_ns = begun_ns
 
     def mark(self, scans: Sequence[Scan], time_ns: int, clock_begun_ns: int | None) -> list[Scan]:
@@ -164,3 +171,46 @@ class Unread:
             else:
                 marked.append(scan)
         return marked
+
+
+class FrameLink(Link):
+    """Link to an adapter that gives frames one by one, which is asked for them until a scan closes."""
+
+    def __init__(self, scans: FrameScans, triggers: Sequence[CanFrame], clock_ns: Callable[[], int]) -> None:
+        self._stages = scans
+        self._triggers = tuple(triggers)
+        self._clock_ns = clock_ns
+        self._unread = Unread()
+        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
+
+    def read(self, timeout_s: float) -> list[Scan]:
+        """Return the scans that closed since the last call; raises LinkLostError if the adapter is gone."""
+        now_ns = self._clock_ns()
+        end_ns = now_ns + int(timeout_s * 1e9)
+        while True:
+            begun_ns, scans = self._clock_ns(), list[Scan]()
+            piece = self._fetch(max(0.0, (end_ns - now_ns) / 1e9))
+            now_ns = self._clock_ns()
+            if piece is None:
+                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
+            else:
+                self._unread.found(begun_ns, now_ns)
+                with self._counting:
+                    fed = self._take(piece, now_ns)
+                scans = self._unread.mark(fed, now_ns, self._stages.clock.begun_ns)
+            self.trouble = self._stages.errors.trouble(now_ns)
+            self.stamps_dropped |= self._stages.clock.dropped
+            if scans or now_ns >= end_ns:
+                return scans
+
+    def can_ids(self) -> frozenset[int]:
+        """Return the standard CAN ids received so far."""
+        return frozenset(self._stages.can_ids)
+
+    def _fetch(self, timeout_s: float) -> Any:
+        """Return the next piece, None if none came in time."""
+        raise NotImplementedError
+
+    def _take(self, piece: Any, time_ns: int) -> list[Scan]:
+        """Return the scans that close within a piece."""
+        raise NotImplementedError

@@ -2,41 +2,31 @@
 
 import errno
 import logging
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from types import ModuleType
 from typing import Any, Final, Self
 
-from firmware_bridge.can.bus_errors import BusErrors
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.links.base import Link, SourceKind, Unread
+from firmware_bridge.links.base import FrameLink, SourceKind, not_open
 from firmware_bridge.links.discovery import can_networks, is_pretended
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
-from firmware_bridge.scans.device_clock import DeviceClock
+from firmware_bridge.scans.frame_scans import FrameScans
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.scans.scan_assembler import ScanAssembler
-
-SEND_TIMEOUT_S: Final = 1.0
-TICK_NS: Final = 1_000
 
 PRETENDED: Final = ("virtual", "udp_multicast")
-_WITHOUT_BITRATE: Final = (*PRETENDED, "socketcan")
-"""Interfaces without a bitrate of their own: it is set elsewhere, or does not exist."""
 _NOT_THROUGH_PYTHON_CAN: Final = {
     "slcan": "use slcan:PORT: python-can's waits 2 s, carries 32 scans a second at its usual speed, and one byte of "
     "noise ends it",
     "gs_usb": "use gs_usb:SERIAL: python-can's never sees that the adapter was unplugged or has lost frames",
 }
-# Some of python-can's interfaces let through every error that a missing or incomplete driver causes.
-_NO_DRIVER: Final = (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError)
 
 
-class CanBusLink(Link):
+class CanBusLink(FrameLink):
     """Link to a sensor on an interface that python-can supports.
 
     A wall clock that is set back while no frame comes makes `read` wait longer by that much, since python-can measures
@@ -54,12 +44,11 @@ class CanBusLink(Link):
     ) -> None:
         """Prepare a link to a channel such as "can0" of a python-can interface such as "socketcan"; opens nothing yet.
 
-        `triggers` are frames that wake older controllers, sent once after opening.
-
-        Raises:
-            SourceError: python-can has no such interface, or this link does not support it.
-            DeviceError: python-can is not installed.
+        `triggers` are frames that wake older controllers, sent once after opening. It raises SourceError for an
+        interface that python-can or this link does not support, and DeviceError where python-can is not installed.
         """
+        self._scans = FrameScans(model)
+        super().__init__(self._scans, triggers, clock_ns)
         self.name = f"can:{interface}:{channel}"
         pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
         self.kind: SourceKind = "emulated" if pretended else "device"
@@ -71,31 +60,24 @@ class CanBusLink(Link):
             raise SourceError(f"source is {self.name!r}, expected can:INTERFACE:CHANNEL of {', '.join(sorted(known))}")
         self._interface = interface
         self._channel = channel
-        self._triggers = tuple(triggers)
-        self._clock_ns = clock_ns
-        self._scans = ScanAssembler(model)
-        self._errors = BusErrors()
-        self._unread = Unread()
-        self._device_clock = DeviceClock(TICK_NS, None)
-        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = dict.fromkeys(("frames", "error_frames", "fd_frames"), 0)
         self._bus: Any = None
 
     def __enter__(self) -> Self:
         if self._interface == "socketcan":
             _check_network(self._channel)
-            self._errors.reopened()  # a socket restarts no controller, and the kernel reports bus-off once
+            self._scans.errors.reopened()  # a socket restarts no controller, and the kernel reports bus-off once
         else:
-            self._errors.restarted()
+            self._scans.errors.restarted()
         with self._counting:
             self._scans.begin_anew()
-        self._device_clock.begin_anew()
+        self._scans.clock.begin_anew()
         self._unread.empty_ns = self._clock_ns()
         self._bus = self._open()
         try:
             for frame in self._triggers:
                 message = self._can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-                self._bus.send(message, timeout=SEND_TIMEOUT_S)
+                self._bus.send(message, timeout=1.0)
         except (self._can.CanError, OSError) as error:
             self._close()
             raise DeviceError(f"{self.name}: does not send frames: {error}") from error
@@ -105,76 +87,55 @@ class CanBusLink(Link):
         if self._bus is not None:
             self._close()
 
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; raises LinkLostError if the interface is gone, or down."""
-        if self._bus is None:
-            raise ValueError("the link is not open: use it in a with statement")
-        end_ns = self._clock_ns() + int(timeout_s * 1e9)
-        left_s = timeout_s
-        while True:
-            begun_ns = self._clock_ns()
-            try:
-                message = self._bus.recv(max(left_s, 0.0))
-                if message is None and self._bus.state is self._can.BusState.ERROR:
-                    self._errors.left_the_bus()
-            except (self._can.CanError, OSError) as error:
-                self._errors.restarted()  # a network that comes up, or an adapter that is plugged in, restarts
-                raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
-            now_ns = self._clock_ns()
-            if message is None:
-                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
-                scans = []
-            else:
-                self._unread.found(begun_ns, now_ns)
-                with self._counting:
-                    fed = self._take(message, now_ns)
-                scans = self._unread.mark(fed, now_ns, self._device_clock.begun_ns)
-            self.trouble = self._errors.trouble(now_ns)
-            self.stamps_dropped |= self._device_clock.dropped
-            left_s = (end_ns - now_ns) / 1e9
-            if scans or left_s <= 0:
-                return scans
-
     def counters(self) -> dict[str, int]:
         """Return the counts of frames by kind, bus and assembler; clock_restarts: steps back of the stamps' clock."""
         with self._counting:
-            counts = self._counts | {"clock_restarts": self._device_clock.restarts}
-            return counts | self._errors.counters() | self._scans.counters()
+            return self._counts | {"clock_restarts": self._scans.clock.restarts} | self._scans.counters()
 
-    def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids received so far."""
-        return frozenset(self._scans.can_ids)
+    def _fetch(self, timeout_s: float) -> Any:
+        if self._bus is None:
+            raise not_open()
+        try:
+            message = self._bus.recv(timeout_s)
+            if message is None and self._bus.state is self._can.BusState.ERROR:
+                self._scans.errors.left_the_bus()
+        except (self._can.CanError, OSError) as error:
+            self._scans.errors.restarted()  # a network that comes up, or an adapter that is plugged in, restarts
+            raise LinkLostError(f"{self.name}: link lost, the interface is gone or down: {error}") from error
+        return message
 
-    def _take(self, message: Any, time_ns: int) -> list[Scan]:
-        if message.is_error_frame:
+    def _take(self, piece: Any, time_ns: int) -> list[Scan]:
+        if piece.is_error_frame:
             self._counts["error_frames"] += 1
             if self._interface == "socketcan":
-                self._errors.error_frame(message.arbitration_id, bytes(message.data), time_ns)
+                self._scans.errors.error_frame(piece.arbitration_id, bytes(piece.data), time_ns)
             else:
-                self._errors.unsorted_error()  # each driver reports it in its own way
+                self._scans.errors.unsorted_error()  # each driver reports it in its own way
             return []
-        self._errors.frame_heard()
-        if message.is_fd:
+        if piece.is_fd:
+            self._scans.errors.frame_heard()
             self._counts["fd_frames"] += 1
             return []
         self._counts["frames"] += 1
-        frame = CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_remote_frame)
+        frame = CanFrame(piece.arbitration_id, bytes(piece.data), piece.is_extended_id, piece.is_remote_frame)
         # By the wall clock or the driver's own clock; zero where there is no stamp.
-        stamp_us = round(message.timestamp * 1e6)
-        device = self._device_clock.at(stamp_us, time_ns) if stamp_us else None
-        return self._scans.feed_frame(frame, time_ns, device)
+        return self._scans.feed_frame(frame, round(piece.timestamp * 1e6) or None, time_ns)
 
     def _open(self) -> Any:
-        settings: dict[str, Any] = {} if self._interface in _WITHOUT_BITRATE else {"bitrate": BITRATE_BIT_S}
+        settings: dict[str, Any] = {}
+        channel: str | int = self._channel
         if self._interface == "socketcan":  # the kernel filters; on other interfaces a filter costs more than it saves
             settings["can_filters"] = [{"can_id": 0, "can_mask": 0, "extended": False}]
-        numbered = self._channel.isascii() and self._channel.isdigit() and self._interface not in _WITHOUT_BITRATE
-        channel = int(self._channel) if numbered else self._channel
+        elif self._interface not in PRETENDED:  # the others have no bitrate of their own
+            settings["bitrate"] = BITRATE_BIT_S
+            if self._channel.isascii() and self._channel.isdigit():
+                channel = int(self._channel)
         try:
             return self._can.Bus(channel=channel, interface=self._interface, ignore_config=True, **settings)
         except (self._can.CanError, OSError) as error:
             raise DeviceError(f"{self.name}: {_reason(error)}") from error
-        except _NO_DRIVER as error:
+        # Some interfaces let through every error that a missing or incomplete driver causes.
+        except (NameError, AttributeError, TypeError, KeyError, ValueError, ImportError, NotImplementedError) as error:
             raise DeviceError(
                 f"{self.name}: cannot be opened, is its driver installed and the channel's name right? {error}"
             ) from error
@@ -186,8 +147,7 @@ class CanBusLink(Link):
 
 
 def _python_can() -> ModuleType:
-    # Its problems arrive as exceptions; its log would repeat them on stderr.
-    logging.getLogger("can").addHandler(logging.NullHandler())
+    logging.getLogger("can").addHandler(logging.NullHandler())  # its problems arrive as exceptions as well
     try:
         import can
     except ImportError as error:

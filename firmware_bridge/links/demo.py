@@ -1,92 +1,159 @@
-"""Demo: an emulated sensor on an emulated robot in a process of its own, read over its pseudo-terminal."""
+"""Demo: an emulated sensor on an emulated robot, read over its pseudo-terminal."""
 
-import json
-import os
-import select
-import subprocess
-import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Self
 
-from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
+from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import Scan
 
-START_TIMEOUT_S: Final = 20.0
-END_TIMEOUT_S: Final = 5.0
-_READ_BYTES: Final = 1 << 16
+_Stated = tuple[PadPose, bool]  # a pose, and whether the pad rests there until the next
+
+
+class Robot:
+    """Robot that moves the pad of a recording of one sensor. Another thread may ask it, and take its poses.
+
+    Once it is `steered` it waits, after each tap that a proposal may follow, for the place of the next one in [mm], or
+    None for the next one of the recording. Otherwise it plays the recording.
+
+    Attributes:
+        asked: the places that it is asked for.
+        steered: True once it waits for them.
+        stated: its poses so far, with the times at which the pad was there.
+    """
+
+    def __init__(self, recording: Recording, options: Mapping[str, NDArray[Any]]) -> None:
+        """Prepare to play a recording with these `tap_options`."""
+        self.asked: deque[PadPose | None] = deque()
+        self.steered = False
+        self.stated: deque[TimedPose] = deque()
+        self._options = options
+        rate_hz = recording.rate_hz or 0.0
+        poses = recording.poses if rate_hz else ()
+        self._poses: dict[int, _Stated] = {round(one.time_ns * rate_hz / 1e9): (one.pose, one.holds) for one in poses}
+        tap = options.get("tap", np.zeros(0, dtype=int))
+        begins = np.flatnonzero((tap[1:] > tap[:-1]) & (tap[1:] > 0)) + 1
+        self._taps = {int(first): int(np.flatnonzero(tap == tap[first])[-1]) + 1 for first in begins}
+        self._of_scans: deque[_Stated | None] = deque()
+
+    def played(self, track: Track) -> Iterator[NDArray[np.int32]]:
+        """Yield the scans of one round."""
+        self.asked.clear()
+        number = 0
+        while number < len(track.counts):
+            if number in self._taps and self.steered:
+                moving = track.counts[number - 10 : number]  # the free pad, while the robot moves to the tap
+                option = yield from self._waits(moving)
+                self.asked.clear()
+                if option is not None:
+                    self._of_scans.append((PadPose(*self._options["option_pose"][option].tolist()), True))
+                    taken = (*moving, *self._options["option_counts"][option])
+                    self._of_scans.extend([None] * (len(taken) - 1))
+                    yield from taken
+                    number = self._taps[number]
+            self._of_scans.append(self._poses.get(number))
+            yield track.counts[number]
+            number += 1
+
+    def state(self, controller: int, time_ns: int) -> None:
+        """State the pose of a scan that was sent, if it has one."""
+        stated = self._of_scans.popleft() if self._of_scans else None
+        if stated is not None:
+            self.stated.append(TimedPose(stated[0], time_ns, holds=stated[1]))
+
+    def _waits(self, free: NDArray[np.int32]) -> Generator[NDArray[np.int32], None, int | None]:
+        """Yield scans of the free pad until a tap is asked for, and return its number; None for the recording's."""
+        for scan in range(500):  # a robot that is not asked any more taps by the recording
+            if self.asked:
+                place = self.asked.popleft()
+                if place is None:
+                    return None
+                away = self._options["option_pose"][:, :2] - np.array((place.x_mm, place.y_mm))
+                return int(np.hypot(*away.T).argmin())
+            self._of_scans.append(None)
+            yield free[scan % len(free)]
+        return None
+
+
+def tap_options(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the taps that may take the place of any but the first in a recording; nothing for one without them.
+
+    `tap` (n,) numbers the recording's taps, -1 outside of them; `option_counts` (o, f, 3, rows, cols) are the scans of
+    the others, and `option_pose` (o, 5) their poses.
+    """
+    names = ("tap", "option_counts", "option_pose")
+    if path.suffix != ".npz":
+        return {}
+    with np.load(path, allow_pickle=False) as data:
+        return {name: data[name] for name in names} if set(names) <= set(data.files) else {}
 
 
 class DemoLink(Link):
     """Link to a recording played by the emulator, through the ordinary serial path.
 
-    The emulator ends with this link, and with this process however it ends.
+    Attributes:
+        emulator: the emulator, once the link was open.
     """
 
     def __init__(self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False) -> None:
         self.name = "demo"
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
-        self._recording = str(recording)
+        self.emulator: Emulator | None = None
+        self._recording = Path(recording)
         self._rate_hz = rate_hz
         self._loop = loop
-        self._process: subprocess.Popen[bytes] | None = None
-        self._partial = b""
+        self._robot: Robot | None = None
         self._link: SlcanSerialLink | None = None
         self._counts: dict[str, int] = {}
 
     def __enter__(self) -> Self:
-        rate = [] if self._rate_hz is None else ["--rate-hz", str(self._rate_hz)]
-        loop = ["--loop"] if self._loop else []
-        # A session of its own: Ctrl-C is for this process, which must close the link before the emulator ends.
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "firmware_bridge.emulation.robot_main",
-                *rate,
-                *loop,
-                "--",
-                self._recording,
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            bufsize=0,  # lines after the first are read as they come
-            start_new_session=True,
-        )
         try:
-            self._link = SlcanSerialLink(_await_port(self._process))
+            recording = load_recording(self._recording)
+            robot = Robot(recording, tap_options(self._recording))
+            settings = {"rate_hz": self._rate_hz, "loop": self._loop}
+            emulator = Emulator([recording], **settings, on_scan=robot.state, played=robot.played)
+        except (BridgeError, ValueError) as error:
+            raise DeviceError(f"the emulator did not start: {error}") from error
+        emulator.__enter__()
+        self._robot, self.emulator, self._link = robot, emulator, SlcanSerialLink(emulator.port)
+        try:
             self._link.__enter__()
         except BaseException:
-            self._collect_ended()
+            self.__exit__()
             raise
         return self
 
     def __exit__(self, *exc_info: object) -> None:
         link, self._link = self._link, None
+        if link is None or self.emulator is None:
+            return
         try:
-            if link is not None:
-                link.__exit__(*exc_info)
-                self._counts = link.counters()
+            link.__exit__(*exc_info)
+            self._counts = link.counters()
         finally:
-            self._collect_ended()
+            self.emulator.hang_up()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
-        if self._link is None or self._process is None:
-            raise ValueError("the link is not open: use it in a with statement")
+        if self._link is None or self.emulator is None:
+            raise not_open()
         if self.ended:
             return []
         try:
             scans = self._link.read(timeout_s)
         except LinkLostError:
-            # It hangs up when it has played everything, and only then ends without an error.
-            if not _ends_well(self._process):
+            if not self.emulator.played_out:  # else it has hung up, as everything was played
                 raise
             self.ended = True
             return []
@@ -95,59 +162,16 @@ class DemoLink(Link):
 
     def poses(self) -> list[TimedPose]:
         """Return the poses that the robot has stated since the last call."""
-        stdout = None if self._process is None else self._process.stdout
-        if stdout is None or not select.select([stdout], [], [], 0)[0]:
-            return []
-        *lines, self._partial = (self._partial + os.read(stdout.fileno(), _READ_BYTES)).split(b"\n")
-        return [_timed_pose(line) for line in lines]
+        stated = self._robot.stated if self._robot else ()
+        return [stated.popleft() for _ in range(len(stated))] if stated else []
 
     def steer(self) -> Callable[[PadPose | None], None]:
         """Return the function that takes where the robot is to tap next, None for the next tap of the recording."""
-        self._ask("follow")
-        return lambda pose: self._ask(None if pose is None else [pose.x_mm, pose.y_mm])
-
-    def _ask(self, asked: str | list[float] | None) -> None:
-        if self._process is not None and self._process.stdin is not None:
-            with suppress(BrokenPipeError):  # it has ended, which the next read shows
-                self._process.stdin.write(f"{json.dumps(asked)}\n".encode())
+        if self._robot is None:
+            raise not_open()
+        self._robot.steered = True
+        return self._robot.asked.append
 
     def counters(self) -> dict[str, int]:
-        """Return the counters of the serial link, the last ones after it was closed."""
+        """Return the counts of the serial link, the last ones after it was closed."""
         return self._link.counters() if self._link else dict(self._counts)
-
-    def _collect_ended(self) -> None:
-        process, self._process = self._process, None
-        if process is None:
-            return
-        with process:  # closes the pipes, which ends the emulator, and waits
-            if process.stdin:
-                process.stdin.close()
-            try:
-                process.wait(END_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-
-
-def _await_port(process: subprocess.Popen[bytes]) -> str:
-    if process.stdout is None or process.stderr is None:
-        raise ValueError("the emulator's output is not a pipe")
-    readable, _, _ = select.select([process.stdout], [], [], START_TIMEOUT_S)
-    port = process.stdout.readline().decode().strip() if readable else ""
-    if port:
-        return port
-    process.kill()
-    last_words = process.stderr.read().decode().strip().rpartition("\n")[2]
-    raise DeviceError(f"the emulator did not start: {last_words or f'silent for {START_TIMEOUT_S:.0f} s'}")
-
-
-def _timed_pose(line: bytes) -> TimedPose:
-    fields = json.loads(line)
-    time_ns, holds = fields.pop("time_ns"), fields.pop("holds")
-    return TimedPose(PadPose(**fields), time_ns, holds=holds)
-
-
-def _ends_well(process: subprocess.Popen[bytes]) -> bool:
-    try:
-        return process.wait(END_TIMEOUT_S) == 0
-    except subprocess.TimeoutExpired:
-        return False

@@ -14,12 +14,7 @@ from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
 from firmware_bridge.links.usb_devices import holders
 
-_IP_TIMEOUT_S: Final = 2.0
-SLOW_LATENCY_MS: Final = 16
 SYS_ROOT: Final = Path("/sys")
-_CAN_TYPE: Final = "280"  # type of a CAN network in sysfs, ARPHRD_CAN
-_UP: Final = 1  # flag of a network that is up, IFF_UP
-_PRETENDED: Final = ("vcan", "vxcan")
 
 
 class CanNetwork(NamedTuple):
@@ -46,17 +41,17 @@ def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
     return [
         CanNetwork(
             network.name,
-            bool(int(_text(network / "flags") or "0", 16) & _UP),
+            bool(int(_text(network / "flags") or "0", 16) & 1),  # IFF_UP
             (network / "device/driver").resolve().name if (network / "device/driver").exists() else None,
         )
         for network in sorted((sys_root / "class/net").glob("*"))
-        if _text(network / "type") == _CAN_TYPE
+        if _text(network / "type") == "280"  # ARPHRD_CAN
     ]
 
 
 def is_pretended(name: str) -> bool:
     """Return True if a network of this name has no wire, so that every device on it is emulated."""
-    return name.startswith(_PRETENDED)
+    return name.startswith(("vcan", "vxcan"))
 
 
 def _text(path: Path) -> str | None:
@@ -113,7 +108,7 @@ def serial_devices(
         if held := holders(port.path, proc_root):
             problems.append(f"held by {', '.join(held)}: end it first")
         latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
-        if latency_ms >= SLOW_LATENCY_MS:
+        if latency_ms >= 16:
             problems.append(
                 f"latency timer at {latency_ms} ms: edge-sr sets 1 ms when it opens it; other programs read in bunches"
             )
@@ -187,7 +182,7 @@ def _bitrate_hz(name: str) -> int | None:
         return None
     try:
         command = [ip, "-json", "-details", "link", "show", name]
-        done = subprocess.run(command, capture_output=True, check=True, timeout=_IP_TIMEOUT_S)
+        done = subprocess.run(command, capture_output=True, check=True, timeout=2.0)
         return json.loads(done.stdout)[0]["linkinfo"]["info_data"]["bittiming"]["bitrate"]
     except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
         return None

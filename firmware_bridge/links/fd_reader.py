@@ -26,10 +26,6 @@ except ImportError:
 
 FULL_BYTES: Final = 255  # highest value of VMIN; a scan of sixteen taxels has 352 bytes
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
-KERNEL_BYTES: Final = 64
-"""Bytes that the kernel returns a call where VMIN is set, however many there are; fewer only if no more are there."""
-LONGEST_WAIT_S: Final = 0.02
-"""Longest time that fewer than FULL_BYTES wait to be read, in [s]: without a whole scan there is no hurry."""
 LONGEST_REST_S: Final = 0.004
 """Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
 STEP_S: Final = 0.0003  # time between polls, in [s], where VMIN does not help, because less than FULL_BYTES are missing
@@ -51,12 +47,7 @@ class BurstReader:
         empty_s: latest time at which no more than the beginning of a scan was waiting.
     """
 
-    def __init__(
-        self,
-        descriptor: int,
-        *,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, descriptor: int, *, clock_s: Callable[[], float] = time.monotonic) -> None:
         """Configure the kernel to gather bytes; it raises OSError, or termios.error, if the port is gone."""
         self.descriptor = descriptor
         self._clock_s = clock_s
@@ -64,13 +55,10 @@ class BurstReader:
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
-        self._wake_at(FULL_BYTES)
-
-    def _wake_at(self, least_bytes: int) -> None:
         if termios is not None:
-            attributes = termios.tcgetattr(self.descriptor)
-            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = least_bytes, 0
-            termios.tcsetattr(self.descriptor, termios.TCSANOW, attributes)
+            attributes = termios.tcgetattr(descriptor)
+            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = FULL_BYTES, 0
+            termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> bytes:
         """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
@@ -83,7 +71,8 @@ class BurstReader:
             now_s = self._clock_s()
             left_s = max(end_s - now_s, 0.0)
             hurried = wanted_bytes < FULL_BYTES and now_s - self._newest_s <= LONGEST_REST_S
-            full = self._fills(0.0 if hurried else min(left_s, LONGEST_WAIT_S))
+            # Without a whole scan there is no hurry: fewer than FULL_BYTES wait for 20 ms.
+            full = self._fills(0.0 if hurried else min(left_s, 0.02))
             begun_s = self._clock_s()
             data = self._fetch(full, wanted_bytes, begun_s)
             if data:
@@ -147,6 +136,7 @@ class BurstReader:
                     break
                 raise
             data += piece
-            if len(piece) < KERNEL_BYTES:
+            # Where VMIN is set, the kernel returns 64 bytes a call, and fewer only if no more are there.
+            if len(piece) < 64:
                 break  # another read would raise an exception, which costs more than all else here
         return data

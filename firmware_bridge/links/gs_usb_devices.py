@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Final, NamedTuple
 
 import usb.core
@@ -20,11 +19,6 @@ GS_USB_IDS: Final = {
     (0x16D0, 0x10B8): "ABE CANdebugger FD",
 }
 """Adapters by vendor and product id. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
-
-_PLACE: Final = re.compile(r"[0-9]+-[0-9]+(\.[0-9]+)*")  # bus and sockets, as the kernel names a USB device
-
-# A device without readable texts is still listed: pyusb reports "no langid" where it may not open it.
-_NO_TEXT: Final = (usb.core.USBError, ValueError, NotImplementedError)
 
 
 class GsUsbDevice(NamedTuple):
@@ -54,11 +48,7 @@ class GsUsbDevice(NamedTuple):
 
 
 def usb_backend() -> IBackend:
-    """Return libusb: that of the package libusb-package, else the system's.
-
-    Raises:
-        DeviceError: no libusb works.
-    """
+    """Return libusb: that of the package libusb-package, else the system's; raises DeviceError if none works."""
     try:
         from libusb_package import get_libusb1_backend
     except ImportError:
@@ -70,32 +60,23 @@ def usb_backend() -> IBackend:
 
 
 def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
-    """List all gs_usb adapters of this machine, by bus and address.
-
-    Raises:
-        DeviceError: USB cannot be read.
-    """
+    """List all gs_usb adapters of this machine, by bus and address; raises DeviceError if USB cannot be read."""
     return [described for described, _ in _found(backend)]
 
 
 def find_gs_usb(
     wanted: str | None, known: Recognised[GsUsbDevice], backend: IBackend | None = None
 ) -> tuple[GsUsbDevice, usb.core.Device]:
-    """Return the wanted adapter, and let `known` learn it.
+    """Return the adapter with a serial number or at a place such as "1-2.3", for None the only one; `known` learns it.
 
-    Args:
-        wanted: its serial number, or its place such as "1-2.3"; None for the only one there is.
-        known: that of an earlier opening, which is found again unless a place is wanted.
-        backend: of pyusb; by default libusb.
-
-    Raises:
-        NoDeviceError: there is no such adapter, or there are several.
-        DeviceError: USB cannot be read.
+    The one that is known from an earlier opening is found again, unless a place is wanted. It raises NoDeviceError
+    where there is no such adapter, or several, and DeviceError if USB cannot be read.
     """
     found = _found(backend)
     present = [described for described, _ in found]
     seen = f"gs_usb adapters seen: {'; '.join(map(str, present)) or 'none'}"
-    placed = wanted is not None and _PLACE.fullmatch(wanted) is not None
+    # Bus and sockets, as the kernel names a USB device.
+    placed = wanted is not None and re.fullmatch(r"[0-9]+-[0-9]+(\.[0-9]+)*", wanted) is not None
     if known.device is not None and not placed:
         wanted, same = known.device.serial_number, known.find(present)
         fitting = [one for one in present if one is same]
@@ -153,14 +134,13 @@ def _usb_id(device: usb.core.Device) -> tuple[int, int]:
 
 
 def _describe(device: usb.core.Device) -> GsUsbDevice:
-    serial_number = product = None
-    try:
-        with suppress(*_NO_TEXT):
-            serial_number = device.serial_number
-        with suppress(*_NO_TEXT):
-            product = device.product
-    finally:
-        usb.util.dispose_resources(device)
+    texts: list[str | None] = []
+    for name in ("serial_number", "product"):
+        try:
+            texts.append(getattr(device, name) or None)
+        except (usb.core.USBError, ValueError, NotImplementedError):  # "no langid" where it may not be opened
+            texts.append(None)
+    usb.util.dispose_resources(device)
     bus, sockets = device.bus or 0, device.port_numbers or ()  # pyright: ignore[reportAttributeAccessIssue]
     place = f"{bus}-{'.'.join(map(str, sockets))}" if sockets else None
-    return GsUsbDevice(bus, device.address or 0, _usb_id(device), serial_number or None, product or None, place)
+    return GsUsbDevice(bus, device.address or 0, _usb_id(device), texts[0], texts[1], place)

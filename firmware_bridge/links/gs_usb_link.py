@@ -3,7 +3,6 @@
 import array
 import errno
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,30 +15,22 @@ from usb.backend import IBackend
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind, Unread
+from firmware_bridge.links.base import FrameLink, SourceKind, not_open
 from firmware_bridge.links.gs_usb_devices import GsUsbDevice, find_gs_usb, udev_rule
 from firmware_bridge.links.usb_devices import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
-from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
 
 INTERFACE: Final = 0
 CHANNEL: Final = 0
 ENDPOINT_IN: Final = 0x81
-ENDPOINT_OUT: Final = 0x02
-USUAL_PACKET_BYTES: Final = 64
 REQUEST_TIMEOUT_MS: Final = 1000
-QUIET_MS: Final = 20
-"""Silence after which a stopped channel is empty, in [ms]: frames left in the adapter follow each other much faster."""
 MOST_OLD_TRANSFERS: Final = 1000
 """Most transfers drained from a stopped channel: its queue has 64, and one that goes on did not stop."""
 
-_BUSY = (
-    "end the program that holds it, such as another edge-sr or candump; sudo ip link set can0 down frees the kernel's"
-)
 
-
-class GsUsbLink(Link):
+class GsUsbLink(FrameLink):
     """Link to a sensor on a gs_usb adapter.
 
     Frames left in an adapter when its client ends, or restarts without fetching them, can leave it mute until it is
@@ -59,32 +50,23 @@ class GsUsbLink(Link):
         backend: IBackend | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare a link; nothing is opened yet.
+        """Prepare a link to the adapter with a serial number or at a place such as "1-2.3", for None the only one.
 
-        Args:
-            wanted: serial number of the adapter, or its place such as "1-2.3"; None for the only one there is. Once it
-                was open, only that adapter is opened again, or with a place the one that is there.
-            model: map from CAN ids to taxels.
-            triggers: frames that wake older controllers, sent once after opening.
-            backend: backend of pyusb; by default libusb.
-            clock_ns: monotonic clock, in [ns].
+        Once it was open, only that adapter is opened again, or with a place the one that is there. `triggers` are
+        frames that wake older controllers, sent once after opening, and `backend` is one of pyusb, by default libusb.
         """
+        self._scans = GsUsbScans(model)
+        super().__init__(self._scans, triggers, clock_ns)
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
         self.serial_number = wanted
         self._wanted = wanted
         self._known: Recognised[GsUsbDevice] = Recognised()
-        self._triggers = tuple(triggers)
         self._backend = backend
-        self._clock_ns = clock_ns
-        self._scans = GsUsbScans(model)
-        self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
-        self._received_bytes = 0
-        self._transfers = 0
-        self._unread = Unread()
+        self._received_bytes = self._transfers = 0
         self._device: usb.core.Device | None = None
         self._driver_detached = False
-        self._packet = array.array("B", bytes(USUAL_PACKET_BYTES))
+        self._packet = array.array("B", bytes(64))
 
     def __enter__(self) -> Self:
         with self._counting:
@@ -108,56 +90,35 @@ class GsUsbLink(Link):
             self._stop(device)
         self._release(device)
 
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; raises LinkLostError if the adapter is gone.
-
-        An adapter sends each frame in a transfer of its own: transfers are fetched until a scan closes.
-        """
-        if self._device is None:
-            raise ValueError("the link is not open: use it in a with statement")
-        end_ns = self._clock_ns() + int(timeout_s * 1e9)
-        left_ns = end_ns - self._clock_ns()
-        while True:
-            begun_ns = self._clock_ns()
-            data = self._fetch(self._device, max(1, math.ceil(left_ns / 1e6)))
-            now_ns = self._clock_ns()
-            if data:
-                self._unread.found(begun_ns, now_ns)
-            else:
-                self._unread.empty_ns = min(now_ns, end_ns)  # this thread may not have run for long after the wait
-            with self._counting:
-                self._transfers += bool(data)
-                self._received_bytes += len(data)
-                fed = self._scans.feed(data, now_ns)
-                if data and len(data) < len(self._packet):
-                    self._scans.end_transfer()
-            scans = self._unread.mark(fed, now_ns, self._scans.clock.begun_ns)
-            self.trouble = self._scans.errors.trouble(now_ns)
-            self.stamps_dropped |= self._scans.clock.dropped
-            left_ns = end_ns - now_ns
-            if scans or left_ns <= 0:
-                return scans
-
     def counters(self) -> dict[str, int]:
         """Return the counts of received bytes and transfers, and the counters of decoder, bus and assembler."""
         with self._counting:
             return {"received_bytes": self._received_bytes, "transfers": self._transfers} | self._scans.counters()
 
-    def can_ids(self) -> frozenset[int]:
-        """Return the standard CAN ids received so far."""
-        return frozenset(self._scans.can_ids)
-
-    def _fetch(self, device: usb.core.Device, timeout_ms: int) -> bytes:
-        # libusb waits for ever with a time-out of 0.
+    def _fetch(self, timeout_s: float) -> bytes | None:
+        # An adapter sends each frame in a transfer of its own. libusb waits for ever with a time-out of 0.
+        if self._device is None:
+            raise not_open()
         try:
-            count: int = device.read(ENDPOINT_IN, self._packet, timeout_ms)  # pyright: ignore[reportAssignmentType]
+            timeout_ms = max(1, math.ceil(1000 * timeout_s))
+            count: int = self._device.read(  # pyright: ignore[reportAssignmentType]
+                ENDPOINT_IN, self._packet, timeout_ms
+            )
         except usb.core.USBTimeoutError:
-            return b""
+            return None
         except usb.core.USBError as error:
             if error.errno == errno.EINTR:
-                return b""
+                return None
             raise LinkLostError(f"{self.name}: link lost, the cable or the adapter is gone: {error}") from error
-        return self._packet[:count].tobytes()
+        return self._packet[:count].tobytes() or None
+
+    def _take(self, piece: bytes, time_ns: int) -> list[Scan]:
+        self._transfers += 1
+        self._received_bytes += len(piece)
+        scans = self._scans.feed(piece, time_ns)
+        if len(piece) < len(self._packet):
+            self._scans.end_transfer()
+        return scans
 
     def _claim(self, device: usb.core.Device) -> None:
         with suppress(NotImplementedError):  # a platform whose kernel has no such driver
@@ -176,7 +137,7 @@ class GsUsbLink(Link):
         interface = usb.util.find_descriptor(configuration, bInterfaceNumber=INTERFACE)
         endpoint = usb.util.find_descriptor(interface, bEndpointAddress=ENDPOINT_IN)
         packet_bytes = getattr(endpoint, "wMaxPacketSize", 0) & 0x7FF
-        self._packet = array.array("B", bytes(packet_bytes or USUAL_PACKET_BYTES))
+        self._packet = array.array("B", bytes(packet_bytes or 64))
 
     def _start(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
@@ -190,13 +151,13 @@ class GsUsbLink(Link):
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):
             data = gs_usb.encode_frame(frame, number % gs_usb.ECHO_IDS, limits)
-            device.write(ENDPOINT_OUT, data, REQUEST_TIMEOUT_MS)
+            device.write(0x02, data, REQUEST_TIMEOUT_MS)
 
     def _stop(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.MODE, gs_usb.mode(started=False))
         with suppress(usb.core.USBTimeoutError):
-            for _ in range(MOST_OLD_TRANSFERS):
-                device.read(ENDPOINT_IN, self._packet, QUIET_MS)
+            for _ in range(MOST_OLD_TRANSFERS):  # frames left in the adapter follow each other within 20 ms
+                device.read(ENDPOINT_IN, self._packet, 20)
 
     def _release(self, device: usb.core.Device) -> None:
         with suppress(usb.core.USBError):
@@ -222,7 +183,10 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
         return f"no permission: {udev_rule(described.usb_id)}"
     if code == errno.EBUSY:
         held = ", ".join(holders(f"/dev/bus/usb/{described.bus:03d}/{described.address:03d}"))
-        return f"in use{f' by {held}' if held else ''}: {_BUSY}"
+        return (
+            f"in use{f' by {held}' if held else ''}: end the program that holds it, such as another edge-sr or "
+            "candump; sudo ip link set can0 down frees the kernel's"
+        )
     if code == errno.ETIMEDOUT:
         return f"does not answer: unplug it and plug it in again ({described})"
     if code is None:

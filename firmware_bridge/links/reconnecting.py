@@ -20,13 +20,11 @@ from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import LINK_SILENT_S
 
-FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5
 """Longest pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
 LATE_RETRY_S: Final = 2.0
 SOON_S: Final = 60.0
 """Time of an outage with frequent tries, in [s]; later ones are rarer, to save the robot's processor."""
-STAMPS_DROPPED: Final = "its time stamps do not run as this machine's clock does, and are left out"
 
 _Answer = TypeVar("_Answer")
 
@@ -44,17 +42,12 @@ class LastingLink(Link):
         clock_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        """Wrap a link that is not open yet.
+        """Wrap a link that is not open yet, and whose first opening must succeed.
 
-        Args:
-            link: wrapped link, whose first opening must succeed.
-            give_up_s: longest outage or silence, in [s]; 0 allows no outage, but any silence. None for a source that is
-                not opened again, and counts no outages.
-            name: prefix of the sensors: "4" of "left" is "left/4"; without one they keep the names of the link.
-            places: mountings of sensors whose taxels come in the order of an id map, by the link's name of each. Links
-                that sort readings by their id take a `placed_map` instead, which costs no time.
-            clock_ns: monotonic clock, in [ns].
-            sleep: sleeps for a time in [s].
+        `give_up_s` is the longest outage or silence, in [s]; 0 allows no outage, but any silence, and None is for a
+        source that is not opened again, and counts no outages. With a `name` sensor "4" is "NAME/4". `places` are
+        mountings of sensors whose taxels come in the order of an id map, by the link's name of each; links that sort
+        readings by their id take a `placed_map` instead, which costs no time.
         """
         self.name = link.name
         self.kind = link.kind
@@ -76,7 +69,7 @@ class LastingLink(Link):
         self._away = False
         self._lost_ns: int | None = None
         self._retry_ns = 0
-        self._delay_s = FIRST_RETRY_S
+        self._delay_s = 0.1
         self._received_ns = 0
         self._silent_s = LINK_SILENT_S
         self._silent = False
@@ -118,7 +111,8 @@ class LastingLink(Link):
             self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
         if self._link.stamps_dropped and not self.stamps_dropped:
             self.stamps_dropped = True
-            self._tell("note", f"{self.name}: {STAMPS_DROPPED}")
+            text = "its time stamps do not run as this machine's clock does, and are left out"
+            self._tell("note", f"{self.name}: {text}")
         if scans:
             now_ns = self._clock_ns()
             if self._lost_ns is not None or self._silent:
@@ -171,11 +165,13 @@ class LastingLink(Link):
         """Return the serial line of the wrapped link."""
         return self._link.serial_line()
 
+    def _away_s(self, now_ns: int) -> float:
+        return (now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9
+
     def _end_outage(self, now_ns: int) -> None:
-        away_s = (now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9
-        self._tell("back", f"{self.name} is back after {away_s:.1f} s")
+        self._tell("back", f"{self.name} is back after {self._away_s(now_ns):.1f} s")
         self._lost_ns, self._silent = None, False
-        self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
+        self._delay_s, self._silent_s = 0.1, LINK_SILENT_S
 
     def _suspect(self) -> None:
         """Schedule another opening of a silent link, less often each time."""
@@ -186,11 +182,9 @@ class LastingLink(Link):
             self._silent = True
             self._outages += 1
             self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it again")
-        away_ns = now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)
-        if away_ns >= self._give_up_s * 1e9:
-            raise LinkLostError(
-                f"{self.name} gave no scan for {away_ns / 1e9:.0f} s: check the sensor's power and its cable"
-            )
+        away_s = self._away_s(now_ns)
+        if away_s >= self._give_up_s:
+            raise LinkLostError(f"{self.name} gave no scan for {away_s:.0f} s: check the sensor's power and its cable")
         self._silent_s += min(self._silent_s, LATE_RETRY_S)
         self._open = False
 

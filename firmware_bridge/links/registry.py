@@ -11,13 +11,11 @@ from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
-from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
 from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
     from firmware_bridge.links.replay import ReplayLink
-    from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 FORMS: Final = (
     "slcan:/dev/ttyUSB0[@baud]",
@@ -32,11 +30,6 @@ FORMS: Final = (
 
 
 DEMO_LOOP: Final = "demo:loop"
-_NAME = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
-_BAUD = re.compile(r"[1-9][0-9]{0,7}")
-_CAN_NETWORK = re.compile(r"v?(?:x|sl)?can[0-9]+")
-_RECORDINGS: Final = (".mcap", ".npz", ".csv")
-_FINITE: Final = ("demo", "replay:")  # beginnings of finite sources, which are not opened again after their end
 
 # Each link is imported only where it is used, to save start-up time and memory.
 
@@ -61,13 +54,17 @@ def open_sources(
     """
     named: dict[str, Link] = {}
     for number, text in enumerate(texts or [None], 1):
-        match = None if text is None else _NAME.fullmatch(text)
+        match = None if text is None else re.fullmatch(r"([A-Za-z0-9_-]+)=(.+)", text, re.DOTALL)
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
-        own = {sensor.removeprefix(f"{name}/"): one for sensor, one in mountings.items() if _is_of(sensor, name)}
+        own = {
+            sensor.removeprefix(f"{name}/"): one
+            for sensor, one in mountings.items()
+            if (sensor.startswith(f"{name}/") if name else "/" not in sensor)
+        }
         link = open_source(form, rate_hz, demo_recording, model, own)
         if name in named:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
-        finite = (form or "").startswith(_FINITE)
+        finite = (form or "").startswith(("demo", "replay:"))  # which are not opened again after their end
         named[name] = LastingLink(link, None if finite else give_up_s, name=name) if name or not finite else link
     return list(named.values())
 
@@ -79,14 +76,10 @@ def open_source(
     model: ModelMap = USPA44_MAP,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> Link:
-    """Create the link that `text` names, not yet entered; for None that of the only recognised adapter.
+    """Create the link that `text`, one of FORMS, names, not yet entered; for None that of the only known adapter.
 
-    Args:
-        text: one of FORMS.
-        rate_hz: scans a second at which recordings are played; a device has its own rate.
-        demo_recording: recording that "demo" plays, and "demo:loop" again and again.
-        model: map from CAN ids to taxels, for a device.
-        mountings: mountings of its sensors, by name. Recordings of edge-sr are in place already.
+    `rate_hz` is that at which recordings are played, among them the demo's; a device has its own. `mountings` are of
+    its sensors, by name; recordings of edge-sr are in place already.
 
     Raises:
         SourceError: no such form.
@@ -94,13 +87,18 @@ def open_source(
         RecordingError: a recording that cannot be used.
     """
     model = placed_map(model, mountings)
-    if text is None:
-        return _slcan_link(find_adapter(serial_ports()).path, None, model)
-    scheme, _, rest = text.partition(":")
-    if scheme == "slcan":
-        return _slcan(text, rest, model)
+    scheme, _, rest = (text or "").partition(":")
+    if text is None or scheme == "slcan":
+        from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
+
+        port, baud = (find_adapter(serial_ports()).path, None) if text is None else _port_and_baud(text, rest)
+        link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=model, triggers=trigger_frames(model))
+        link.name = text or link.name
+        return link
     if scheme == "xela-server" and rest:
-        return _placed(_xela_server(rest, model.geometry), mountings, tells_newtons=True)
+        from firmware_bridge.links.xela_server import XelaServerLink
+
+        return _placed(XelaServerLink(rest, geometry=model.geometry), mountings, tells_newtons=True)
     if text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
@@ -145,35 +143,18 @@ def place_recordings(link: "ReplayLink", paths: Sequence[str | Path], mountings:
     return _placed(link, mounted)
 
 
-def _slcan(text: str, rest: str, model: ModelMap) -> Link:
+def _port_and_baud(text: str, rest: str) -> tuple[str, int | None]:
+    """Return the port that a text names after its scheme, and the speed, None if it states none."""
     port, at, baud = rest.rpartition("@")
     if not at:
         port = rest
     if port in ("", "serial="):
         raise _refusal(text)
-    if at and not _BAUD.fullmatch(baud):
+    if at and not re.fullmatch(r"[1-9][0-9]{0,7}", baud):
         raise SourceError(f"baud is {baud[:20]!r}, expected 1 to 99999999 after the @: --source slcan:{port}@115200")
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
-    link = _slcan_link(port, int(baud) if at else None, model)
-    link.name = text
-    return link
-
-
-def _slcan_link(port: str, baud: int | None, model: ModelMap) -> "SlcanSerialLink":
-    from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
-
-    return SlcanSerialLink(port, DEFAULT_BAUD if baud is None else baud, model=model, triggers=trigger_frames(model))
-
-
-def _xela_server(url: str, geometry: SensorGeometry) -> Link:
-    from firmware_bridge.links.xela_server import XelaServerLink
-
-    return XelaServerLink(url, geometry=geometry)
-
-
-def _is_of(sensor: str, source: str) -> bool:
-    return sensor.startswith(f"{source}/") if source else "/" not in sensor
+    return port, int(baud) if at else None
 
 
 def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: bool = False) -> Link:
@@ -193,11 +174,11 @@ def _refusal(text: str) -> SourceError:
 
 def _meant(text: str) -> str | None:
     """Return the likely form of a source named without one, None if there is no guess."""
-    if _CAN_NETWORK.fullmatch(text):
+    if re.fullmatch(r"v?(?:x|sl)?can[0-9]+", text):
         return f"can:socketcan:{text}"
     path = Path(text.partition("@")[0])
     if text.startswith("/dev/") or path.is_char_device():
         return f"slcan:{text}"
     if text.startswith(("ws://", "wss://")):
         return f"xela-server:{text}"
-    return f"replay:{text}" if path.suffix.lower() in _RECORDINGS or path.is_file() else None
+    return f"replay:{text}" if path.suffix.lower() in (".mcap", ".npz", ".csv") or path.is_file() else None

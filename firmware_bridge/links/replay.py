@@ -57,6 +57,8 @@ class ReplayLink(Link):
     Attributes:
         recordings: the recordings that it plays.
         notes: remarks for the user, which become notices.
+        times_ns: times (n,) of each sensor's scans since the first scan, in [ns], by name.
+        first_ns: time of the first scan as it is played, in [ns].
     """
 
     def __init__(
@@ -68,15 +70,10 @@ class ReplayLink(Link):
         clock: Clock = time.monotonic_ns,
         sleep: Sleep = time.sleep,
     ) -> None:
-        """Load the recordings.
+        """Load the recordings, from their paths or in memory.
 
-        Args:
-            paths: paths of the recordings; or recordings, already in memory.
-            rate_hz: scans a second of each sensor, also of one with recorded times if paced; by default the recorded
-                times, else the recorded rate.
-            paced: True plays at that speed, from now on; else each `read` returns a scan at its recorded time.
-            clock: monotonic clock in [ns].
-            sleep: sleeps for a time in [s].
+        They are played by their recorded times, else at their recorded rate, or at `rate_hz` scans a second of each
+        sensor. If `paced`, that is so from now on; else each `read` returns a scan at its recorded time.
 
         Raises:
             RecordingError: a file cannot be used.
@@ -107,32 +104,22 @@ class ReplayLink(Link):
             for track in recording.tracks
         ]
         self._tracks = [track for track, _ in lanes]
-        self._times_ns = {track.sensor: due_times_ns for track, due_times_ns in lanes}
+        self.times_ns = {track.sensor: due_times_ns for track, due_times_ns in lanes}
         sensors = [track.sensor for track in self._tracks]
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
         self._series = [ScanSeries(track.sensor, track.geometry) for track in self._tracks]
-        self._pose_lanes = [
-            lane
-            for number in range(len(self.recordings))
-            if (lane := self._pose_lane(number, lanes, rate_hz)) is not None
-        ]
+        pose_lanes = [self._pose_lane(recording, rate_hz) for recording in self.recordings]
+        self._pose_lanes = [one for one in pose_lanes if one is not None]
         self.states_poses = bool(self._pose_lanes)
         self._poses: list[TimedPose] = []
-        due_ns, lane, row = (
-            np.concatenate(one)
-            for one in zip(
-                *(
-                    (due_times_ns, np.full(len(due_times_ns), number), np.arange(len(due_times_ns)))
-                    for number, (_, due_times_ns) in enumerate(lanes)
-                ),
-                strict=True,
-            )
-        )
+        due_ns = np.concatenate([times_ns for _, times_ns in lanes])
+        lane = np.concatenate([np.full(len(times_ns), number) for number, (_, times_ns) in enumerate(lanes)])
+        row = np.concatenate([np.arange(len(times_ns)) for _, times_ns in lanes])
         order = np.lexsort((lane, due_ns))
         self._due_ns, self._lane, self._row = due_ns[order], lane[order], row[order]
         self._place = 0
-        self._start_ns = _first_ns(self.recordings[0]) or 0
+        self.first_ns = _first_ns(self.recordings[0]) or 0
         if not paced:
             self.unix_offset_ns = self.recordings[0].unix_offset_ns
         self.notes += [note for recording in self.recordings for note in recording.notes]
@@ -140,7 +127,7 @@ class ReplayLink(Link):
 
     def __enter__(self) -> Self:
         if not self.patient:
-            self._start_ns = self._clock()
+            self.first_ns = self._clock()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -163,38 +150,25 @@ class ReplayLink(Link):
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""
         notes, self.notes = self.notes, []
-        return [Notice(self._start_ns, "note", note) for note in notes]
+        return [Notice(self.first_ns, "note", note) for note in notes]
 
     def poses(self) -> list[TimedPose]:
         """Return the poses that the scans of the last `read` were made with, as in the recording, each once."""
         poses, self._poses = self._poses, []
         return poses
 
-    def times_ns(self, sensor: str) -> NDArray[np.int64]:
-        """Return the times (n,) of a sensor's scans since the first scan, in [ns]."""
-        return self._times_ns[sensor]
-
-    @property
-    def first_ns(self) -> int:
-        """Time of the first scan as it is played, in [ns]."""
-        return self._start_ns
-
     def counters(self) -> dict[str, int]:
         """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""
         return dict(self._counts)
 
-    def _pose_lane(
-        self, number: int, lanes: Sequence[tuple[Track, NDArray[np.int64]]], rate_hz: float | None
-    ) -> PoseLane | None:
+    def _pose_lane(self, recording: Recording, rate_hz: float | None) -> PoseLane | None:
         """Return the poses of a recording, None where it has none whose times hold."""
-        recording = self.recordings[number]
         poses, first_ns = recording.poses, _first_ns(recording)
         if not poses:
             return None
         sensors = [track.sensor for track in recording.tracks] if len(self.recordings) > 1 else ()
         if recording.poses_by_row:
-            due_times_ns = next(due_times_ns for track, due_times_ns in lanes if track is recording.tracks[0])
-            times_ns = due_times_ns.tolist()
+            times_ns = self.times_ns[recording.tracks[0].sensor].tolist()
             timed = [replace(one, time_ns=times_ns[one.time_ns], used_from_ns=times_ns[one.time_ns]) for one in poses]
             return PoseLane(timed, 0, sensors)
         if rate_hz is not None or first_ns is None:
@@ -206,16 +180,16 @@ class ReplayLink(Link):
 
     def _next_ns(self) -> int | None:
         """Return the time of the next scan, in [ns]; None after the last."""
-        return None if self._place == len(self._due_ns) else self._start_ns + int(self._due_ns[self._place])
+        return None if self._place == len(self._due_ns) else self.first_ns + int(self._due_ns[self._place])
 
     def _take(self) -> Scan:
         """Return the next scan."""
         due_ns, lane, row = (int(one[self._place]) for one in (self._due_ns, self._lane, self._row))
         for poses in self._pose_lanes:
-            self._poses += poses.up_to(due_ns, self._start_ns)
+            self._poses += poses.up_to(due_ns, self.first_ns)
         self._place += 1
         self.ended = self._place == len(self._due_ns)
-        time_ns = self._start_ns + due_ns
+        time_ns = self.first_ns + due_ns
         track = self._tracks[lane]
         if track.renewed is None:
             vendor = track.vendor[row] if track.vendor else None

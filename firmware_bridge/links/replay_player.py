@@ -110,7 +110,7 @@ class PlayedReplay(ReplayLink):
         self._player = player
         self._length_s = int(self._due_ns[-1]) / NS_PER_S
         self._numbers = [0] * len(self._tracks)
-        self._last_ns = self._start_ns
+        self._last_ns = self.first_ns
         self._anchor: tuple[int, int, float] | None = None  # wall time and time of a scan, and the speed from there on
         self._jumped: list[Notice] = []
         self._shown = 0  # scans still to be shown at once, one of each sensor, since a paused player jumped
@@ -157,14 +157,14 @@ class PlayedReplay(ReplayLink):
         self.ended = False
         self._last_ns = scan.time_ns
         self._numbers[lane] += 1
-        self._player.reach((scan.time_ns - self._start_ns) / NS_PER_S, self._length_s, self._rounds)
+        self._player.reach((scan.time_ns - self.first_ns) / NS_PER_S, self._length_s, self._rounds)
         return replace(scan, number=self._numbers[lane] - 1)
 
     def _jump(self, due_ns: int) -> None:
         """Go on from a place; the times of scans go on as well."""
         self._place = min(int(self._due_ns.searchsorted(due_ns)), len(self._due_ns) - 1)
         due_ns = int(self._due_ns[self._place])
-        self._start_ns = self._last_ns + JUMP_NS - due_ns
+        self.first_ns = self._last_ns + JUMP_NS - due_ns
         for poses in self._pose_lanes:
             poses.begin_at(due_ns)
         self._anchor = None

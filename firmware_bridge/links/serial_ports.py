@@ -20,13 +20,10 @@ KNOWN_ADAPTERS: Final = {
     (0x16D0, 0x117E): "CANable 2, slcan firmware",
 }
 
-_CAN_ADAPTER = re.compile(r"\bCAN\b|CAN-?USB|USB-?CAN")
-
+LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 NO_PERMISSION: Final = (
     "no permission: add the user to the group that owns it (often: sudo usermod -aG dialout $USER), log in again"
 )
-MOST_LOOKS: Final = 3
-LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 
 
 class Port(NamedTuple):
@@ -58,7 +55,8 @@ class Port(NamedTuple):
         For a chip that many devices have, the texts of the device decide, if there are any.
         """
         words = " ".join(word for word in (self.product, self.manufacturer) if word)
-        if self.usb_id is None or (self.usb_id == FTDI_X and words and not _CAN_ADAPTER.search(words)):
+        can = re.search(r"\bCAN\b|CAN-?USB|USB-?CAN", words)
+        if self.usb_id is None or (self.usb_id == FTDI_X and words and not can):
             return None
         return KNOWN_ADAPTERS.get(self.usb_id)
 
@@ -70,27 +68,19 @@ class Port(NamedTuple):
 
 def serial_ports() -> list[Port]:
     """List all serial ports of this machine, by path."""
-    return sorted(
-        Port(
-            info.device,
-            None if info.vid is None or info.pid is None else (info.vid, info.pid),
-            info.serial_number or None,
-            info.description,
-            info.product or None,
-            info.manufacturer or None,
-            (info.location or "").partition(":")[2] or None,
-            (info.location or "").partition(":")[0] or None,
-        )
-        for info in _comports()
-    )
-
-
-def _comports() -> list[ListPortInfo]:
-    for _ in range(MOST_LOOKS):
+    found: list[ListPortInfo] = []
+    for _ in range(3):
         # pyserial converts texts to numbers that it could not read from a device that is being unplugged.
         with suppress(TypeError, ValueError, OSError):
-            return list(list_ports.comports())
-    return []
+            found = list(list_ports.comports())
+            break
+    ports: list[Port] = []
+    for info in found:
+        usb_id = None if info.vid is None or info.pid is None else (info.vid, info.pid)
+        place, _, interface = (info.location or "").partition(":")
+        texts = (info.product or None, info.manufacturer or None, interface or None, place or None)
+        ports.append(Port(info.device, usb_id, info.serial_number or None, info.description, *texts))
+    return sorted(ports)
 
 
 def latency_timer_ms(port: str, root: Path = LATENCY_ROOT) -> int | None:

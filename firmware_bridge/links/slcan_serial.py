@@ -19,7 +19,7 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread
+from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread, not_open
 from firmware_bridge.links.fd_reader import BurstReader, Piece
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.usb_devices import in_use
@@ -32,12 +32,7 @@ WRITE_TIMEOUT_S: Final = 1.0
 QUIET_S: Final = 0.02
 """Silence after which the line counts as quiet, in [s]: a little over the 16 ms for which an FTDI chip holds bytes."""
 LONGEST_SETTLE_S: Final = 0.3
-_LOOK_S: Final = 0.002
-_PIECE_BYTES: Final = 4096
-_MOST_PIECES: Final = 1024
-SLOWEST_STAMPED_BAUD: Final = 1_000_000
-"""Slowest line on which stamps are requested, in [bit/s]: two sensors at 100 scans a second take 832 kbit/s with
-stamps, and 704 without."""
+
 MOST_SILENT_OPENINGS: Final = 10
 """Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
 MOST_LATE_STAMPS: Final = 4
@@ -62,8 +57,7 @@ class SlcanSerialLink(Link):
 
     Attributes:
         port: path of the serial port.
-        baudrate: speed of the serial line, in [bit/s].
-        low_latency: True if the platform accepted the request not to hold bytes back.
+        baudrate: speed of the serial line, in [bit/s]; USB-CDC adapters ignore it.
     """
 
     def __init__(
@@ -71,29 +65,19 @@ class SlcanSerialLink(Link):
         port: str,
         baudrate: int = DEFAULT_BAUD,
         *,
-        rtscts: bool = True,
         model: ModelMap = USPA44_MAP,
         triggers: Sequence[CanFrame] = (),
     ) -> None:
-        """Prepare a link; nothing is opened yet.
-
-        Args:
-            port: path of the serial port.
-            baudrate: speed of the serial line, in [bit/s]; USB-CDC adapters ignore it.
-            rtscts: True for hardware flow control.
-            model: map from CAN ids to taxels.
-            triggers: frames that wake older controllers, sent once after opening.
-        """
+        """Prepare a link; nothing is opened yet. `triggers` are frames that wake older controllers, after opening."""
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
-        self.low_latency = False
         self.baudrate = baudrate
-        self._rtscts = rtscts
         self._triggers = tuple(triggers)
         self._plugged = PluggedAdapter(port)
-        self._asks_stamps = baudrate >= SLOWEST_STAMPED_BAUD
+        # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
+        self._asks_stamps = baudrate >= 1_000_000
         self._scans = SlcanScans(model)
         self._questions = StatusQuestions(self._scans.decoder.status)
         self._stamps_on = False
@@ -140,7 +124,7 @@ class SlcanSerialLink(Link):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the port is gone."""
         if self._bursts is None or self._serial is None:
-            raise ValueError("the link is not open: use it in a with statement")
+            raise not_open()
         try:
             pieces = self._take_fetched() or [self._receive(self._bursts, timeout_s)]
         except _PORT_ERRORS as error:
@@ -205,21 +189,13 @@ class SlcanSerialLink(Link):
     def _open_port(self) -> serial.Serial:
         try:
             port = serial.Serial(
-                self.port,
-                self.baudrate,
-                rtscts=self._rtscts,
-                exclusive=True,
-                timeout=0,
-                write_timeout=WRITE_TIMEOUT_S,
+                self.port, self.baudrate, rtscts=True, exclusive=True, timeout=0, write_timeout=WRITE_TIMEOUT_S
             )
         except (*_PORT_ERRORS, ValueError) as error:
             raise DeviceError(f"{self.port}: {_reason(error, self.port)}") from error
-        try:
+        # Not every platform and driver can: there scans come in bunches.
+        with suppress(OSError, ValueError, NotImplementedError, AttributeError):
             port.set_low_latency_mode(True)
-        except (OSError, ValueError, NotImplementedError, AttributeError):
-            self.low_latency = False  # not this platform, or not this driver: scans come in bunches
-        else:
-            self.low_latency = True
         return port
 
     def _start(self, port: serial.Serial) -> None:
@@ -268,7 +244,7 @@ class SlcanSerialLink(Link):
         now_s = time.monotonic()
         quiet_s, end_s = now_s + QUIET_S, now_s + LONGEST_SETTLE_S
         while now_s < min(quiet_s, end_s):
-            time.sleep(_LOOK_S)
+            time.sleep(0.002)
             dropped = _take_waiting(port.fileno())
             self._dropped_bytes += dropped
             now_s = time.monotonic()
@@ -287,8 +263,8 @@ def _take_waiting(descriptor: int) -> int:
     """Read the waiting bytes, a bounded number of them, and return their count."""
     taken = 0
     with suppress(BlockingIOError):  # all bytes are read
-        for _ in range(_MOST_PIECES):
-            taken += len(os.read(descriptor, _PIECE_BYTES))
+        for _ in range(1024):
+            taken += len(os.read(descriptor, 4096))
     return taken
 
 

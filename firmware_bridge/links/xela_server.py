@@ -4,9 +4,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from threading import Event
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 from urllib.parse import urlsplit
 
 from websockets.exceptions import (
@@ -19,30 +18,18 @@ from websockets.exceptions import (
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
-from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.schedule import NS_PER_S, SERVER_QUIET_S
 
-DEFAULT_PORT: Final = 5000
 OPENING_S: Final = 3.0
 REOPENING_S: Final = 1.0  # time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer
-FIRST_MESSAGE_S: Final = 0.5  # wait for the first message, in [s]: a server greets at once; no message is no error
 ANSWER_S: Final = 1.0
 """Time-out of a ping, in [s]: a link read by itself reports a pulled cable, or a server that hangs, after 1.75 s
 without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
-CLOSING_S: Final = 0.2
-MOST_WAITING: Final = 64  # most messages of one read; later ones wait for the next
-
-
-class ServerAddress(NamedTuple):
-    """Address of a server."""
-
-    host: str
-    port: int
-    url: str
 
 
 class XelaServerLink(Link):
@@ -59,25 +46,15 @@ class XelaServerLink(Link):
     def __init__(
         self, url: str, *, geometry: SensorGeometry = USPA44, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        """Prepare a link; nothing is opened yet.
-
-        Args:
-            url: ws://HOST[:PORT].
-            geometry: geometry of the sensors; others of the server are left out.
-            clock_ns: monotonic clock, in [ns].
-
-        Raises:
-            SourceError: no such URL.
-        """
+        """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL."""
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
-        self.url = self._address.url
+        self.url = self._address[2]
         self._scans = ServerScans(geometry)
         self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
-        self._open = ExitStack()
         self._connection: ClientConnection | None = None
         self._met = False
         self._received_ns = 0
@@ -95,7 +72,7 @@ class XelaServerLink(Link):
         self._connection = self._connect()
         self._received_ns = self._clock_ns()
         try:
-            self._first = self._take(FIRST_MESSAGE_S)
+            self._first = self._take(self._connection, 0.5)  # a server greets at once; no message is no error
         except BaseException:
             self.__exit__()
             raise
@@ -104,8 +81,9 @@ class XelaServerLink(Link):
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._connection = None
-        self._open.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; waits at most `timeout_s` for the first message.
@@ -115,25 +93,22 @@ class XelaServerLink(Link):
             DeviceError: it has no sensor that can be used.
         """
         if self._connection is None:
-            raise ValueError("the link is not open: use it in a with statement")
+            raise not_open()
         if self._first:
             first, self._first = self._first, []
             return first
-        return self._take(timeout_s)
+        return self._take(self._connection, timeout_s)
 
     def counters(self) -> dict[str, int]:
         """Return the count of received bytes, and the counters of decoder and scans."""
         with self._counting:
             return {"received_bytes": self._received_bytes} | self._scans.counters()
 
-    def _take(self, timeout_s: float) -> list[Scan]:
+    def _take(self, connection: ClientConnection, timeout_s: float) -> list[Scan]:
         scans: list[Scan] = []
-        connection = self._connection
-        if connection is None:
-            return scans
         try:
             try:
-                for _ in range(MOST_WAITING):
+                for _ in range(64):  # later messages wait for the next read
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
                     self._received_ns, self._pong = self._clock_ns(), None
@@ -174,27 +149,26 @@ class XelaServerLink(Link):
         try:
             # The server is on this machine or near it: no proxy, and no compression, which costs time on both sides.
             # No pings by websockets: it would drop a server that sends messages but answers no ping.
-            connection = connect(
+            return connect(
                 url,
                 sock=plain,
                 proxy=None,
                 compression=None,
                 open_timeout=opening_s,
-                close_timeout=CLOSING_S,
+                close_timeout=0.2,
                 ping_interval=None,
                 max_size=LONGEST_MESSAGE_BYTES,
-            )
+            ).__enter__()  # websockets warns of a connection that was not entered
         except (OSError, WebSocketException, ValueError) as error:
             raise DeviceError(f"{url}: {_no_handshake(error, opening_s)}") from error
-        return self._open.enter_context(connection)
 
 
-def server_address(url: str) -> ServerAddress:
+def server_address(url: str) -> tuple[str, int, str]:
     """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL; raises SourceError on any other form."""
     expected = "expected ws://HOST or ws://HOST:PORT"
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, DEFAULT_PORT if parts.port is None else parts.port
+        host, port = parts.hostname, 5000 if parts.port is None else parts.port
     except ValueError as error:
         raise SourceError(f"address of the xela_server is {url!r}, {expected}: {error}") from error
     if parts.scheme == "wss":
@@ -202,7 +176,7 @@ def server_address(url: str) -> ServerAddress:
     extra = parts.username is not None or parts.query or parts.fragment or parts.path not in ("", "/")
     if parts.scheme != "ws" or not host or not port or extra or not url.isprintable() or " " in url:
         raise SourceError(f"address of the xela_server is {url!r}, {expected}")
-    return ServerAddress(host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}")
+    return host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> str:

@@ -23,10 +23,8 @@ from numpy.typing import NDArray
 from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
 from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 
-PAYLOAD_BYTES: Final = 8
 CONTROLLERS: Final = range(16)
-SDAS: Final = 8  # number of data lines that an id of layout C can name, with TAXELS_OF_SDA taxels on each
-TAXELS_OF_SDA: Final = 16
+
 BOARDS: Final = range(1, 8)
 _unpack_xyz = struct.Struct(">HHH").unpack_from
 _unpack_packed = struct.Struct(">HxHHHx").unpack_from
@@ -99,7 +97,7 @@ class ModelMap:
 def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
     """Decode the reading in a frame, None if the frame is not one of this model's."""
     place = model.taxels.get(frame.can_id)
-    if place is None or frame.extended or frame.remote or len(frame.data) != PAYLOAD_BYTES:
+    if place is None or frame.extended or frame.remote or len(frame.data) != 8:
         return None
     return Reading(*place, *_unpack_xyz(frame.data, 1))
 
@@ -117,21 +115,18 @@ def trigger_frames(model: ModelMap) -> list[CanFrame]:
 
 
 def trigger_frame(board: int) -> CanFrame:
-    """Return the frame that starts a controller of layout A or B; `board` is 1..7."""
-    if board not in BOARDS:
-        raise ValueError(f"board is {board}, expected 1..7")
+    """Return the frame that starts a controller of layout A or B; `board` is one of BOARDS."""
     return CanFrame(0x200 | board, bytes((0x07, 0x00)))
 
 
 def layout_c(geometry: SensorGeometry) -> ModelMap:
     """Return the id map of a current controller whose SDAs are the rows, their taxels numbered from right to left.
 
-    Raises:
-        ValueError: ids cannot name so many rows or columns.
+    Ids can name eight SDAs with sixteen taxels each; it raises ValueError for more.
     """
     rows, cols = geometry.rows, geometry.cols
-    if rows > SDAS or cols > TAXELS_OF_SDA:
-        raise ValueError(f"{rows} x {cols} taxels, expected at most {SDAS} x {TAXELS_OF_SDA}")
+    if rows > 8 or cols > 16:
+        raise ValueError(f"{rows} x {cols} taxels, expected at most 8 x 16")
     taxels = {
         sda << 8 | taxel << 4 | controller: (str(controller), sda * cols + (cols - 1 - taxel))
         for controller in CONTROLLERS
@@ -141,33 +136,22 @@ def layout_c(geometry: SensorGeometry) -> ModelMap:
     return ModelMap(geometry.name, geometry, MappingProxyType(taxels))
 
 
-def _layout_c_xr1944() -> dict[int, tuple[str, int]]:
-    # Two SDAs of two rows each. That its columns run from right to left too is inferred from
-    # uSPa44, the same board; no document confirms it.
-    return {
-        sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
-        for controller in CONTROLLERS
-        for sda in range(2)
-        for taxel in range(8)
-    }
-
-
-def _layout_a() -> dict[int, tuple[str, int]]:
-    taxels = range(USPA44.taxel_count)
-    return {0x700 | board << 4 | taxel: (str(board), taxel) for board in BOARDS for taxel in taxels}
-
-
-def _layout_b() -> dict[int, tuple[str, int]]:
-    taxels = USPA44.taxel_count
-    return {board << 8 | n: (f"{board}{'ab'[n // taxels]}", n % taxels) for board in BOARDS for n in range(2 * taxels)}
-
-
 USPA44_MAP: Final = layout_c(USPA44)
 USPA46_MAP: Final = layout_c(USPA46)
 """Map of uSPa46: ids from the manual; columns from right to left, as inferred from uSPa44."""
-XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_layout_c_xr1944()))
-LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_layout_a()), triggered=True)
-LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_layout_b()), triggered=True)
+# Two SDAs of two rows each. That its columns run from right to left too is inferred from uSPa44, the same board; no
+# document confirms it.
+_XR1944: Final = {
+    sda << 8 | taxel << 4 | controller: (str(controller), (sda * 2 + taxel // 4) * 4 + (3 - taxel % 4))
+    for controller in CONTROLLERS
+    for sda in range(2)
+    for taxel in range(8)
+}
+_A: Final = {0x700 | board << 4 | taxel: (str(board), taxel) for board in BOARDS for taxel in range(16)}
+_B: Final = {board << 8 | n: (f"{board}{'ab'[n // 16]}", n % 16) for board in BOARDS for n in range(32)}
+XR1944_MAP: Final = ModelMap("XR1944", USPA44, MappingProxyType(_XR1944))
+LAYOUT_A_MAP: Final = ModelMap("layout A", USPA44, MappingProxyType(_A), triggered=True)
+LAYOUT_B_MAP: Final = ModelMap("layout B", USPA44, MappingProxyType(_B), triggered=True)
 
 ID_MAPS: Final = {
     "uSPa44": USPA44_MAP,

@@ -12,23 +12,13 @@ from typing import Final, NamedTuple
 SLOWER: Final = 64
 """Share of the time by which the smallest difference grows: a clock may be slow by as much. A delay of 0.1 s that lasts
 is forgotten in 7 s."""
-HOLDS_NS: Final = 250_000_000
-"""Time for which it holds before it grows, in [ns]: a clock that is slow by 1 % is 2.5 ms off after it."""
 BACK_NS: Final = 4_000_000
 """Largest step back of the stamps before the clock counts as set or restarted, in [ns].
 
 Frames that change places in a driver's queues step back by less than a millisecond. A wall clock set back between two
 frames by less than this plus the pause between them goes unnoticed: at 100 scans a second by 14 ms."""
-JUDGED_NS: Final = 50_000_000
-"""Time in which stamps are compared with arrivals, in [ns], and LONGEST_STEP_NS at most between two: a read that was
-late is no evidence of a slow clock."""
 LONGEST_STEP_NS: Final = 20_000_000
-STOOD_NS: Final = 1_000_000_000
-"""Time between two arrivals, in [ns], up to which this machine may have stood still, which makes no clock slow."""
-MOST_BACK: Final = 8  # steps back by over half of BACK_NS in that time from which stamps are no clock
-SLOWEST: Final = 6
-"""Factor by which stamps that are a clock are slower than arrivals at most: a serial line of 115,200 baud is 4 times
-slower than its bus, and stamps in units of 10 ms are 10 times too slow."""
+"""Time between two arrivals, in [ns], that counts at most: a read that was late is no evidence of a slow clock."""
 MOST_OFF: Final = 3
 """Such times in a row in which stamps advance twice as far as arrivals, or too slowly while reads were late: a backlog
 makes it so once, and so does a machine that stood still."""
@@ -110,8 +100,10 @@ class DeviceClock:
         self._device_ns += step_ns
         difference_ns = arrival_ns - self._device_ns
         self._later_ns += min(since_ns, LONGEST_STEP_NS)
-        if self._later_ns > HOLDS_NS or since_ns > SLOW_NS:
-            self._smallest_ns += (since_ns if since_ns > STOOD_NS else min(since_ns, LONGEST_STEP_NS)) // SLOWER
+        # It holds for a quarter of a second: a clock that is slow by 1 % is 2.5 ms off after it. For up to a second
+        # this machine may have stood still, which makes no clock slow.
+        if self._later_ns > 250_000_000 or since_ns > SLOW_NS:
+            self._smallest_ns += (since_ns if since_ns > 1_000_000_000 else min(since_ns, LONGEST_STEP_NS)) // SLOWER
         if self.begun_ns is None or difference_ns <= self._smallest_ns:
             self._smallest_ns, self._later_ns = difference_ns, 0
         if self.begun_ns is None:
@@ -126,8 +118,10 @@ class DeviceClock:
         self._told_ns += step_ns if step_ns > -BACK_NS else since_ns  # one set back tells nothing of its rate
         self._read_late |= since_ns > LONGEST_STEP_NS
         self.follow_order(step_ns)
-        if self._heard_ns >= JUDGED_NS:
-            slow = SLOWEST * self._told_ns < self._heard_ns
+        if self._heard_ns >= 50_000_000:
+            # A serial line of 115,200 baud is 4 times slower than its bus, and stamps in units of 10 ms are 10 times
+            # too slow.
+            slow = 6 * self._told_ns < self._heard_ns
             fast = self._told_ns > 2 * self._heard_whole_ns + LONGEST_STEP_NS
             self._fast = self._fast + 1 if fast else 0
             self._slow = 0 if not slow else self._slow + 1 if self._read_late else MOST_OFF
@@ -138,4 +132,4 @@ class DeviceClock:
     def follow_order(self, step_ns: int) -> None:
         """Take note of a step between the stamps of two frames, in [ns]: on the bus one came after the other."""
         self._back += 2 * step_ns < -BACK_NS
-        self.dropped |= self._back >= MOST_BACK
+        self.dropped |= self._back >= 8

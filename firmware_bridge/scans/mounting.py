@@ -134,11 +134,9 @@ class Mounting:
 
 
 def placed_map(model: ModelMap, mountings: Mapping[str, Mounting]) -> ModelMap:
-    """Return the id map with taxels at their places on the pad, at no cost: the map sorts every scan anyway.
+    """Return the map of sensors as they are wired with taxels at their places on the pad; it sorts every scan anyway.
 
-    Args:
-        model: id map of the sensors as they are wired.
-        mountings: mountings by sensor name; a sensor without one keeps the order of the map.
+    `mountings` are by sensor name; a sensor without one keeps the order of the map.
     """
     place_of = {
         sensor: {taxel: place for place, taxel in enumerate(mounting.order)}

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import SensorGeometry
 
 ABSENT: Final = -1  # marker of a taxel without a reading in this scan; raw counts are unsigned, so no reading is -1
-
-
 LONGEST_SENSOR_NAME: Final = 64
 
 
@@ -122,14 +120,10 @@ class ScanSeries:
         *,
         whole: bool = False,
     ) -> Scan:
-        """Return the next scan.
+        """Return the next scan, of counts (3, rows, cols), ABSENT where no reading came, which become read-only.
 
-        Args:
-            counts: (3, rows, cols), ABSENT where no reading came; kept and made read-only.
-            time_ns: arrival of its newest reading, in [ns].
-            device_ns: time of its newest reading, as in Scan.
-            vendor: values of the vendor's software.
-            whole: True if it certainly holds every taxel, which halves the cost.
+        `time_ns`, `device_ns` and `vendor` are as in Scan. `whole` is True if it certainly holds every taxel, which
+        halves the cost.
         """
         if whole:
             fresh, renewed = self._all_fresh, np.logical_or.reduce(counts != self._last)

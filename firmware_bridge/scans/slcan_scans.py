@@ -1,5 +1,6 @@
 """Stages from slcan text to scans: decoder, id map and assembler in a row. No I/O, no clock."""
 
+from collections.abc import Iterable
 from itertools import pairwise, starmap
 from operator import itemgetter
 from typing import Final
@@ -20,16 +21,9 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
-_MOST_ORDERS: Final = 1024
 _MS_NS: Final = 1_000_000
-_MIXED_NS: Final = SCAN_GIVEN_UP_NS  # longest time for which frames wait while others are fed, in [ns]
-_JOINED_NS: Final = 5_000_000
-"""Time before its stamp, in [ns], at which no frame can arrive: the error of stamps and of their offset."""
-
 FOREIGN: Final = 255  # number of no sensor
 BEFORE: Final = -1  # place of frames that came before the present ones
-_IDS: Final = 1 << 11
-_TWO_BYTES: Final = np.dtype(">u2")  # the first two of a frame: its id, and 4 bits of its length
 
 
 class MixedCycles:
@@ -48,8 +42,8 @@ class MixedCycles:
         """Begin without a frame; cycles are expected in the order of the model's ids."""
         self.names = sorted({sensor for sensor, _ in model.taxels.values()})
         self.begun: dict[int, tuple[bytes, int]] = {}
-        self._sensors = np.full(_IDS, FOREIGN, dtype=np.uint8)
-        self._places = np.zeros(_IDS, dtype=np.uint8)
+        self._sensors = np.full(1 << 11, FOREIGN, dtype=np.uint8)
+        self._places = np.zeros(1 << 11, dtype=np.uint8)
         self._order = bytes(range(model.geometry.taxel_count))
         for number, name in enumerate(self.names):
             for place, (can_id, _) in enumerate(model.wire_order(name)):
@@ -58,13 +52,11 @@ class MixedCycles:
     def part(self, packed: bytes, frame_bytes: int, time_ns: int, *, waits: bool) -> list[tuple[int, bytes]]:
         """Return whole cycles and single frames, each with the place of its last frame in `packed`, and by that order.
 
-        Args:
-            packed: frames of a standard id, as `SlcanDecoder.cut` packs them, of `frame_bytes` each.
-            frame_bytes: length of each.
-            time_ns: monotonic time of their arrival, in [ns].
-            waits: True to let begun cycles wait; those that came so far are returned if they do not go on.
+        `packed` are frames of `frame_bytes` each, as `SlcanDecoder.cut` packs them, that arrived at `time_ns` [ns].
+        With `waits` begun cycles wait; those that came so far are returned if they do not go on.
         """
-        ids = np.frombuffer(packed, dtype=_TWO_BYTES)[:: frame_bytes // 2] >> 4
+        # The first two bytes of a frame are its id, and four bits of its length.
+        ids = np.frombuffer(packed, dtype=">u2")[:: frame_bytes // 2] >> 4
         sensors = self._sensors[ids]
         # Sorted once: to look for the frames of each sensor takes as long for every sensor as this for all.
         by_sensor = sensors.argsort(kind="stable")
@@ -137,7 +129,7 @@ class SlcanScans:
                     piece = PackedFrames(piece.data[STAMPED_BYTES:], STAMPED_BYTES)
                 head_ns = time_ns
             if isinstance(piece, CanFrame):
-                self._give_up_begun(time_ns, scans)
+                self._give_up(self._mixed.begun, time_ns, scans)
                 if not piece.extended:  # bounded: there are at most 2048 of these
                     self.can_ids.add(piece.can_id)
                 self._feed_reading(decode(piece, self._model), piece.timestamp_ms, time_ns, scans)
@@ -150,7 +142,8 @@ class SlcanScans:
         if frames.frame_bytes != STAMPED_BYTES or self._stamped is None or self._device is None:
             return False
         since_ns = _ns_between(self._stamped[0], int.from_bytes(frames.data[PACKED_BYTES:STAMPED_BYTES]))
-        return head_ns + _JOINED_NS < self._device.host_ns + since_ns < head_ns + _MS_NS * LAST_TIMESTAMP_MS // 2
+        # No frame can arrive 5 ms before its stamp, which is the error of stamps and of their offset.
+        return head_ns + 5 * _MS_NS < self._device.host_ns + since_ns < head_ns + _MS_NS * LAST_TIMESTAMP_MS // 2
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken; the adapter's clock may have restarted as well."""
@@ -180,7 +173,7 @@ class SlcanScans:
         start, cycle_bytes = 0, self._taxels * frame_bytes
         waits = frame_bytes == STAMPED_BYTES and not self.clock.dropped
         if not waits:
-            self._give_up_begun(time_ns, scans)
+            self._give_up(self._mixed.begun, time_ns, scans)
         mixed = bool(self._mixed.begun)
         while not mixed and start + cycle_bytes <= len(packed) and self._one_sensor(packed, start, frame_bytes):
             scan = self._feed_cycle(packed[start : start + cycle_bytes], frame_bytes, time_ns)
@@ -202,15 +195,12 @@ class SlcanScans:
         for number, (_, since_ns) in list(self._mixed.begun.items()):
             # A scan that is open would end by the first of them.
             if time_ns - since_ns > SCAN_GIVEN_UP_NS or self._assembler.is_open(self._mixed.names[number]):
-                self._give_up(number, time_ns, scans)
+                self._give_up([number], time_ns, scans)
 
-    def _give_up_begun(self, time_ns: int, scans: list[Scan]) -> None:
-        for number in list(self._mixed.begun):
-            self._give_up(number, time_ns, scans)
-
-    def _give_up(self, number: int, time_ns: int, scans: list[Scan]) -> None:
-        """Feed the frames of a begun cycle one by one."""
-        self._feed_singly(self._mixed.begun.pop(number)[0], STAMPED_BYTES, time_ns, scans, late=True)
+    def _give_up(self, begun: Iterable[int], time_ns: int, scans: list[Scan]) -> None:
+        """Feed the frames of begun cycles one by one."""
+        for number in tuple(begun):
+            self._feed_singly(self._mixed.begun.pop(number)[0], STAMPED_BYTES, time_ns, scans, late=True)
 
     def _feed_singly(self, packed: bytes, frame_bytes: int, time_ns: int, scans: list[Scan], *, late: bool) -> None:
         """Feed frames one by one; `late` if others that came after them were fed before."""
@@ -245,7 +235,7 @@ class SlcanScans:
         """Return the scan of a sensor's whole cycle; None if this is no whole cycle, or a scan is still open."""
         can_ids = packed[::frame_bytes] + packed[1::frame_bytes]
         if can_ids not in self._cycles:
-            if len(self._cycles) >= _MOST_ORDERS:  # frames of two sensors mix in many orders
+            if len(self._cycles) >= 1024:  # frames of two sensors mix in many orders
                 self._cycles.clear()
             high, low = can_ids[: len(can_ids) // 2], can_ids[len(can_ids) // 2 :]
             order = [h << 4 | b >> 4 for h, b in zip(high, low, strict=True)]
@@ -273,7 +263,7 @@ class SlcanScans:
         if self._stamped is None or self._device is None:
             return self._device_time(stamp_ms, time_ns)
         back_ns = _ns_between(stamp_ms, self._stamped[0])
-        if back_ns > _MIXED_NS:  # it came after them
+        if back_ns > SCAN_GIVEN_UP_NS:  # it came after them, as none waits for so long
             return self._device_time(stamp_ms, time_ns)
         return DeviceTime(self._device.host_ns - back_ns, self._device.own_ns - back_ns)
 

@@ -29,11 +29,6 @@ SHORTEST_PAUSE_NS: Final = 1_500_000
 """Shortest time that counts as a pause, in [ns]: stamps and adapters with steps of 1 ms show less without one."""
 MOST_INTERVALS: Final = 128  # intervals between cycles that give the period
 LEAST_INTERVALS: Final = 8  # intervals from which it shows lost cycles, and pauses are judged by the shorter ones
-RENEWED_EVERY: Final = 32  # cycles after which the period is computed again, once there are so many intervals
-LATER: Final = 64
-"""Share of a period by which the ends of cycles may come later each time, since the period is an estimate."""
-MOST_LATE: Final = 3  # cycles in a row that end late after which that is their pace
-MOST_LATE_IN_PIECES: Final = 5  # the same where several are read at once: an FTDI chip delays three of them
 MOST_DOUBTS: Final = 8
 """Signs of another order in a row, without a whole cycle between them, after which the order is dropped."""
 
@@ -80,12 +75,8 @@ class WireCycle:
     def goes_on(self, newest: int, place: int, *, came: bool, paused: bool, paced: bool) -> bool:
         """Return True if a reading at a place belongs to the open cycle, whose furthest place so far is `newest`.
 
-        Args:
-            newest: the furthest place so far.
-            place: place of the reading.
-            came: True if the cycle has a reading of this taxel already.
-            paused: True if a pause came before the reading.
-            paced: True if the pause may be a late read, and `count` will show it where cycles were lost.
+        `came`: the cycle has a reading of this taxel already. `paused`: a pause came before the reading. `paced`: it
+        may be a late read, and `count` will show it where cycles were lost.
         """
         if not self.order:
             return not (paused or came)
@@ -158,14 +149,15 @@ class WireCycle:
         if not ended:
             on_pace = None
         elif not late:
-            self._due_ns = min(self._due_ns + period_ns // LATER, time_ns)
+            self._due_ns = min(self._due_ns + period_ns // 64, time_ns)  # since the period is an estimate
             self._late, on_pace = 0, True
         else:
             self._late += 1
             self._late_due_ns = time_ns if self._late == 1 else min(self._late_due_ns, time_ns)
-            # Not where some that waited came at once: then the least late one is still to come.
+            # Three in a row that end late are on their own pace; where several are read at once it takes five, since an
+            # FTDI chip delays three. Not where some that waited came at once: the least late one is still to come.
             if (
-                self._late >= (MOST_LATE_IN_PIECES if self.in_pieces else MOST_LATE)
+                self._late >= (5 if self.in_pieces else 3)
                 and ended_ns is not None
                 and 2 * (time_ns - ended_ns) > period_ns
             ):
@@ -196,7 +188,7 @@ class WireCycle:
                 pause_ns = max(shorter_ns // 2, SHORTEST_PAUSE_NS)
                 self.pause_ns = LONGEST_PAUSE_NS if self.in_pieces else min(pause_ns, LONGEST_PAUSE_NS)
                 self.gaps_ns = None
-            self._until_renewed = RENEWED_EVERY if count == MOST_INTERVALS else 1
+            self._until_renewed = 32 if count == MOST_INTERVALS else 1
 
     def _learn(self, order: tuple[int, ...]) -> None:
         self.order = order

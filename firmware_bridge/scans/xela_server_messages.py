@@ -31,11 +31,9 @@ MOST_SENSORS: Final = 16
 HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
-LATEST_S: Final = 1e11  # latest valid time, in [s] since 1970
 WELCOME: Final = "Welcome"
 PRETENDED_VERSION: Final = "_emulated"  # suffix of an emulated server's version, which separates it from the vendor's
-_HEX_WORDS: Final = re.compile("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?").fullmatch
-_COUNTED: Final[tuple[str, ...]] = (
+_COUNTED: Final = [
     "messages",
     "welcomes",
     "without_readings",
@@ -50,7 +48,7 @@ _COUNTED: Final[tuple[str, ...]] = (
     "bad_calibrated",
     "bad_temperature",
     "bad_time",
-)
+]
 
 
 class ServerReading(NamedTuple):
@@ -99,8 +97,8 @@ class ServerDecoder:
         """Decode one message, as text or in UTF-8."""
         self._counted["messages"] += 1
         content = self._content(text)
-        if content is None:
-            return ServerMessage("bad")
+        if isinstance(content, str):
+            return self._bad(content)
         version = content.get("version")
         version = version[:40] if isinstance(version, str) else ""
         if content.get("message") == WELCOME:
@@ -127,22 +125,17 @@ class ServerDecoder:
         """
         return dict(self._counted)
 
-    def _content(self, text: str | bytes) -> dict[str, Any] | None:
+    def _content(self, text: str | bytes) -> dict[str, Any] | str:
+        """Return the object in a message, or what is wrong."""
         if len(text) > LONGEST_MESSAGE_BYTES:
-            self._counted["too_long"] += 1
-            return None
+            return "too_long"
         try:
             content = json.loads(text, object_pairs_hook=_without_duplicates)
         except _DuplicateError:
-            self._counted["duplicate_keys"] += 1
-            return None
+            return "duplicate_keys"
         except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
-            self._counted["bad_json"] += 1
-            return None
-        if not isinstance(content, dict):
-            self._counted["bad_json"] += 1
-            return None
-        return content
+            return "bad_json"
+        return content if isinstance(content, dict) else "bad_json"
 
     def _bad(self, kind: str) -> ServerMessage:
         self._counted[kind] += 1
@@ -152,7 +145,8 @@ class ServerDecoder:
         taxels = content.get("taxels")
         if type(taxels) is int and 0 < taxels != self._geometry.taxel_count:
             model = content.get("model")
-            self.foreign[name] = f"{_printable(model)} with {min(taxels, 9999)} taxels"
+            model = repr(model[:20]) if isinstance(model, str) else "a model without a name"
+            self.foreign[name] = f"{model} with {min(taxels, 9999)} taxels"
             self._counted["foreign_sensor"] += 1
             return None
         known = type(taxels) is int and taxels == self._geometry.taxel_count
@@ -161,10 +155,11 @@ class ServerDecoder:
             self._counted["bad_sensor"] += 1
             return None
         self.foreign.pop(name, None)
+        ups_hz = self._in_range(content.get("ups"), self._geometry.taxel_count, (0, HIGHEST_UPS_HZ), "bad_ups")
         return ServerReading(
             name,
             np.ascontiguousarray(np.array(counts, dtype=np.int32).reshape(-1, 3).T),
-            self._ups_hz(content.get("ups")),
+            None if ups_hz is None else tuple(ups_hz),
             self._newtons(content.get("calibrated")),
             self._temperature_k(content.get("temp")),
             self._time_s(content.get("time")),
@@ -179,10 +174,6 @@ class ServerDecoder:
         of_integer = _whole_numbers(integer, size)
         self._counted["disagreeing"] += of_data != of_integer
         return of_integer if of_data is None else of_data
-
-    def _ups_hz(self, content: object) -> tuple[float, ...] | None:
-        ups_hz = self._in_range(content, self._geometry.taxel_count, (0, HIGHEST_UPS_HZ), "bad_ups")
-        return None if ups_hz is None else tuple(ups_hz)
 
     def _newtons(self, content: object) -> NDArray[np.float32] | None:
         size, range_n = 3 * self._geometry.taxel_count, (-HIGHEST_NEWTONS, HIGHEST_NEWTONS)
@@ -213,7 +204,7 @@ class ServerDecoder:
         return None
 
     def _time_s(self, content: object) -> float | None:
-        if isinstance(content, bool) or not isinstance(content, (int, float)) or not 0 < content < LATEST_S:
+        if isinstance(content, bool) or not isinstance(content, (int, float)) or not 0 < content < 1e11:  # since 1970
             self._counted["bad_time"] += content is not None
             return None
         return float(content)
@@ -234,13 +225,9 @@ def _is_name(key: str) -> bool:
     return 0 < len(key) <= 3 and key.isascii() and key.isdigit()
 
 
-def _printable(model: object) -> str:
-    return repr(model[:20]) if isinstance(model, str) else "a model without a name"
-
-
 def _from_hex(text: str, size: int) -> list[int] | None:
     # Not int() alone: it takes signs, spaces, underscores and 0x as well.
-    if not _HEX_WORDS(text):
+    if not re.fullmatch("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?", text):
         return None
     words = text.removesuffix(",").split(",")
     return [int(word, 16) for word in words] if len(words) == size else None

@@ -27,32 +27,16 @@ from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
-USUAL_UPS_HZ: Final = 83.0  # rate of a taxel by the vendor's data sheet, for a server that does not report it
-DUE_PERIODS: Final = 1.5
-"""Periods after which an unchanged taxel counts as renewed where taxels come one by one; changed ones come earlier."""
-DUE_IN_CYCLE_PERIODS: Final = 0.5
-SLOW_SHARE: Final = 0.5  # share of the median `ups` below which a scan does not wait for a taxel
 STALE_NS: Final = 150_000_000
 """Age beyond the server's usual one at which an arriving reading counts as stale, in [ns]; more than a clock may be set
 back unnoticed."""
-USUAL_AGE_SCANS: Final = 50
-"""Number of scans whose least age when sent is the usual age: one observed server sends every reading .3 s old."""
 MANY_STALE: Final = 50
 """Surplus of stale scans over others at which the lag is reported, until the others have made up for it."""
-LONGEST_AGE_S: Final = 60.0
-"""Longest age of a reading when it is sent, in [s]; a longer or negative one means that the server's clock was set."""
 FARTHEST_BACK: Final = 32
 """Rising numbers in a row below the highest after which they are a new count and no late messages."""
 MOST_MISSED: Final = 100_000
-_TICK_NS: Final = 1000
-_COUNTED: Final[tuple[str, ...]] = (
-    "repeated_messages",
-    "reordered_messages",
-    "missed_messages",
-    "server_restarts",
-    "stale_scans",
-)
-_COUNTED_BY_SENSOR: Final[tuple[str, ...]] = ("scans", "torn_wire", "torn_source", "repeated", "missing_taxels")
+_COUNTED: Final = ["repeated_messages", "reordered_messages", "missed_messages", "server_restarts", "stale_scans"]
+_COUNTED_BY_SENSOR: Final = ["scans", "torn_wire", "torn_source", "repeated", "missing_taxels"]
 
 
 class ServerScans:
@@ -65,7 +49,8 @@ class ServerScans:
         self._sensors: dict[str, _ServerSensor] = {}
         self._more_stale = 0
         self._lags = False
-        self._ages_ns: deque[int] = deque(maxlen=USUAL_AGE_SCANS)
+        # The least of them is the usual age: one observed server sends every reading 0.3 s old.
+        self._ages_ns: deque[int] = deque(maxlen=50)
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self.begin()
 
@@ -91,7 +76,7 @@ class ServerScans:
         self._sequence: int | None = None
         self._may_begin = True
         self._late_ones: list[int] = []
-        self._clock = DeviceClock(_TICK_NS, None)
+        self._clock = DeviceClock(1000, None)
         for sensor in self._sensors.values():
             sensor.begin()
 
@@ -180,7 +165,8 @@ class _ServerSensor:
         self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)
-        self._usual_hz = np.full(geometry.taxel_count, USUAL_UPS_HZ)
+        # By the vendor's data sheet, for a server that does not report it.
+        self._usual_hz = np.full(geometry.taxel_count, 83.0)
         self._received_ns: int | None = None
         self._acquired_s: float | None = None
         self._acquired_ns = 0
@@ -210,7 +196,8 @@ class _ServerSensor:
         self._counts = reading.counts
 
         alive = ups_hz > 0
-        patience = DUE_IN_CYCLE_PERIODS if 2 * changes >= max(1, np.count_nonzero(alive)) else DUE_PERIODS
+        # In periods, until an unchanged taxel counts as renewed: where taxels come one by one, changed ones come first.
+        patience = 0.5 if 2 * changes >= max(1, np.count_nonzero(alive)) else 1.5
         come = changed | (alive & ((arrival_ns - self._come_ns) * ups_hz >= patience * NS_PER_S))
         self._come_ns[come] = arrival_ns
         self._come |= come
@@ -220,7 +207,7 @@ class _ServerSensor:
         waited_for = alive
         if alive.any():
             median_hz = sorted(ups_hz[alive].tolist())[int(np.count_nonzero(alive)) // 2]
-            waited_for = ups_hz >= SLOW_SHARE * median_hz
+            waited_for = ups_hz >= 0.5 * median_hz
         if (waited_for & ~self._come).any():
             return None
         return self._close(np.where(self._come, reading.counts, ABSENT), arrival_ns, device_ns, self._vendor(reading))
@@ -276,4 +263,4 @@ def _age_ns(reading: ServerReading, message: ServerMessage) -> int | None:
     if message.sent_s is None or reading.acquired_s is None:
         return None
     age_s = message.sent_s - reading.acquired_s
-    return round(age_s * NS_PER_S) if 0 <= age_s <= LONGEST_AGE_S else None
+    return round(age_s * NS_PER_S) if 0 <= age_s <= 60 else None  # else its clock was set

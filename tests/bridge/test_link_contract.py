@@ -233,15 +233,3 @@ def test_what_lay_there_because_nobody_read_is_marked_old(rig):
         end_s = time.monotonic() + 60
         while all(scan.unread_ns for scan in [*link.read(0.0), *rig.give(link, 1)]):
             assert time.monotonic() < end_s, "new ones are old for ever"
-
-
-@of([GsUsbRig, PythonCanRig])
-def test_what_came_while_the_reader_stood_still_is_marked_old(rig):
-    def stand_still():
-        rig.hear(*frames_of(2)[1:])
-        time.sleep(0.1)
-
-    with rig.link() as link:
-        rig.after_next_frame(stand_still)
-        rig.hear(*frames_of(1)[:1])
-        assert read_scans(link, 1)[0].unread_ns > 80_000_000

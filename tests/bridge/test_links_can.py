@@ -36,18 +36,27 @@ def read_all(link, messages):
     return [scan for _ in range(messages) for scan in link.read(0.0)]
 
 
+def error_message(classes, *data):
+    return can.Message(arbitration_id=classes, data=bytes(data), is_error_frame=True, is_extended_id=False)
+
+
+BUS_OFF, PASSIVE = error_message(0x40), error_message(4, 0, 0x10)
+FRAME = message_of(frames_of(1)[0])
+
+
 # Clocks.
 
 
-def test_frames_without_stamps_and_those_of_fd(bus):
+def test_frames_without_stamps_and_those_of_fd_and_errors_of_which_nobody_knows_the_meaning(bus):
     now_ns = itertools.count(5 * 10**12, 1_000_000)  # a machine that pauses here must make no pause on the bus
     with link_to(bus, clock_ns=now_ns.__next__) as link:
-        bus.send(message_of(frames_of(1)[0], is_fd=True))
-        for frame in frames_of(1):
-            bus.send(message_of(frame))
-        (scan,) = read_all(link, 17)
+        for message in (message_of(frames_of(1)[0], is_fd=True), BUS_OFF, *map(message_of, frames_of(1))):
+            bus.send(message)
+        (scan,) = read_all(link, 18)
         assert scan.complete and scan.device_ns is None
-        assert (link.counters()["fd_frames"], link.counters()["readings"]) == (1, 16)
+        counters = link.counters()
+        assert (counters["fd_frames"], counters["readings"]) == (1, 16)
+        assert (counters["error_frames"], counters["other_errors"], counters["bus_off"]) == (1, 1, 0)
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])
@@ -79,14 +88,6 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
 
 
 # Errors of the bus.
-
-
-def error_message(classes, *data):
-    return can.Message(arbitration_id=classes, data=bytes(data), is_error_frame=True, is_extended_id=False)
-
-
-BUS_OFF, PASSIVE = error_message(0x40), error_message(4, 0, 0x10)
-FRAME = message_of(frames_of(1)[0])
 
 
 def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
@@ -159,15 +160,6 @@ def test_a_network_that_was_down_begins_anew(lasting):
     assert lasting().trouble is None
 
 
-def test_errors_of_another_interface_are_counted_alone(bus):
-    """Nobody knows the meaning of their bits."""
-    with link_to(bus) as link:
-        bus.send(BUS_OFF)
-        link.read(0.0)
-        counters = link.counters()
-        assert (counters["error_frames"], counters["other_errors"], counters["bus_off"]) == (1, 1, 0)
-
-
 def test_a_bus_that_says_it_is_off(bus, monkeypatch):
     monkeypatch.setattr(VirtualBus, "state", can.BusState.ERROR)
     link = link_to(bus)
@@ -184,36 +176,28 @@ def test_a_bus_that_says_it_is_off(bus, monkeypatch):
 # Opening.
 
 
-@pytest.mark.parametrize(
-    ("interface", "channel", "kind"),
-    [
-        ("virtual", "x", "emulated"),
-        ("udp_multicast", "239.74.163.2", "emulated"),
-        ("socketcan", "vcan0", "emulated"),
-        ("socketcan", "can0", "device"),
-        ("pcan", "PCAN_USBBUS1", "device"),
-        ("kvaser", "0", "device"),
-    ],
-)
-def test_which_kind_of_source_it_is(interface, channel, kind):
-    assert CanBusLink(interface, channel).kind == kind
+FILTERS = {"can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}
 
 
 @pytest.mark.parametrize(
-    ("interface", "channel", "settings"),
+    ("interface", "channel", "kind", "settings"),
     [
-        ("kvaser", "0", {"channel": 0, "bitrate": 1_000_000}),
-        ("pcan", "PCAN_USBBUS1", {"channel": "PCAN_USBBUS1", "bitrate": 1_000_000}),
-        ("virtual", "0", {"channel": "0"}),
-        ("socketcan", "can0", {"channel": "can0", "can_filters": [{"can_id": 0, "can_mask": 0, "extended": False}]}),
+        ("kvaser", "0", "device", {"channel": 0, "bitrate": 1_000_000}),
+        ("pcan", "PCAN_USBBUS1", "device", {"channel": "PCAN_USBBUS1", "bitrate": 1_000_000}),
+        ("virtual", "0", "emulated", {"channel": "0"}),
+        ("udp_multicast", "239.74.163.2", "emulated", {"channel": "239.74.163.2"}),
+        ("socketcan", "can0", "device", {"channel": "can0"} | FILTERS),
+        ("socketcan", "vcan0", "emulated", {"channel": "vcan0"} | FILTERS),
     ],
 )
-def test_the_bitrate_is_given_where_it_is_taken(opens, networks, interface, channel, settings):
+def test_what_python_can_is_asked_for_and_what_is_emulated(opens, networks, interface, channel, kind, settings):
     asked = []
-    make_network(networks, "can0", up=True)
+    for name in ("can0", "vcan0"):
+        make_network(networks, name, up=True)
     opens(lambda **settings: asked.append(settings))
-    CanBusLink(interface, channel).__enter__()
-    assert asked == [{"interface": interface, "ignore_config": True} | settings]
+    link = CanBusLink(interface, channel)
+    link.__enter__()
+    assert link.kind == kind and asked == [{"interface": interface, "ignore_config": True} | settings]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import errno
 import sys
 from functools import partial
+from itertools import count
 
 import can
 import pytest
@@ -26,20 +27,10 @@ def opened(port=None, **settings):
 
 
 @pytest.mark.parametrize("packet_bytes", [24, 64, 512])
-def test_a_frame_ends_its_transfer_whatever_a_packet_holds(packet_bytes):
-    port, link = opened(GsUsbPort(packet_bytes=packet_bytes))
-    with link:
-        port.adapter.hear(*frames_of(1)[:15], stamp_us=1000)
-        assert link.read(0.0) == [] == link.read(0.01)
-        port.adapter.hear(frames_of(1)[15], stamp_us=2000)
-        (scan,) = link.read(10.0)
-        assert scan.complete
-
-
-def test_an_adapter_without_time_stamps_and_with_two_channels():
-    limits = CANDLELIGHT._replace(features=0x03)
-    now_ns = [10**12]
-    port, link = opened(GsUsbPort(lambda: GsUsbAdapter(limits, channels=2)), clock_ns=lambda: now_ns[0])
+def test_an_adapter_without_time_stamps_and_with_two_channels(packet_bytes):
+    limits, now_ns = CANDLELIGHT._replace(features=0x03), [10**12]
+    port = GsUsbPort(lambda: GsUsbAdapter(limits, channels=2), packet_bytes=packet_bytes)
+    port, link = opened(port, clock_ns=lambda: now_ns[0])
     with link:
         port.adapter.hear(*frames_of(1), channel=1)
         port.adapter.hear(*frames_of(1, seed=5))
@@ -48,54 +39,31 @@ def test_an_adapter_without_time_stamps_and_with_two_channels():
         assert (link.counters()["received_bytes"], link.counters()["other_channels"]) == (20 * 32, 16)
 
 
+class Watched(GsUsbAdapter):
+    """Adapter that hands on what `then` makes of each transfer."""
+
+    then = staticmethod(lambda data: data)
+
+    def fetch(self, timeout_s):
+        return self.then(super().fetch(timeout_s))
+
+
 @pytest.mark.parametrize("code", [IO, PIPE])
-def test_an_unplugging_that_comes_as_another_error(code):
-    port, link = opened()
+def test_an_unplugging_may_come_as_another_error_and_a_signal_is_none(code):
+    def interrupt(data):
+        if signals:
+            raise signals.pop()
+        return data
+
+    (port, link), signals = opened(GsUsbPort(Watched)), [usb.core.USBError("interrupted", -10, errno.EINTR)]
     port.gone_as = code
     with link:
+        port.adapter.then = interrupt
+        port.adapter.hear(*frames_of(1)[:1], *frames_of(1), stamp_us=1000)  # the signal takes the first
+        assert len(link.read(10.0)) == 1 and not signals
         port.adapter.unplug()
         with pytest.raises(LinkLostError, match="gs_usb: link lost"):
             link.read(100.0)
-
-
-class Watched(GsUsbAdapter):
-    """Adapter that hands on what `then` makes of each transfer and of the number of those so far."""
-
-    fetched = 0
-    then = staticmethod(lambda number, data: data)
-
-    def fetch(self, timeout_s):
-        data = super().fetch(timeout_s)
-        self.fetched += data is not None
-        return self.then(self.fetched, data)
-
-
-def test_what_came_before_the_unplugging_is_not_lost():
-    """The cable comes out between the sixteenth frame and the next look for one."""
-    port, link = opened(GsUsbPort(Watched))
-    with link:
-        port.adapter.then = lambda number, data: port.adapter.unplug() or data if number == 16 else data
-        port.adapter.hear(*frames_of(1), stamp_us=1000)
-        (scan,) = link.read(10.0)
-        assert scan.complete
-        with pytest.raises(LinkLostError):
-            link.read(10.0)
-
-
-def test_a_signal_is_not_an_unplugging():
-    port, link = opened()
-    signals = [usb.core.USBError("interrupted", -10, errno.EINTR)]
-    with link:
-        fetch = port.adapter.fetch
-
-        def interrupted(timeout_s):
-            if signals:
-                raise signals.pop()
-            return fetch(timeout_s)
-
-        port.adapter.fetch = interrupted
-        port.adapter.hear(*frames_of(1), stamp_us=1000)
-        assert len(link.read(10.0)) == 1 and not signals
 
 
 def test_lost_frames_are_counted_and_told():
@@ -131,7 +99,8 @@ def test_the_state_that_the_controller_reports():
 def test_a_short_packet_ends_a_transfer():
     port, link = opened(GsUsbPort(Watched))
     with link:
-        port.adapter.then = lambda number, data: data[:13] if data and number == 21 else data
+        transfers = count(1)
+        port.adapter.then = lambda data: data[:13] if data and next(transfers) == 21 else data
         for number, frame in enumerate(frames_of(3)):
             port.adapter.hear(frame, stamp_us=10_000 * (number // 16) + 130 * (number % 16))
         scans = [scan for _ in range(48) for scan in link.read(0.0)]
@@ -315,17 +284,10 @@ def test_usb_that_cannot_be_read_or_without_libusb(get_backend, monkeypatch):
         gs_usb_devices.usb_backend()
 
 
-# Public packages find the emulated adapter like a real one.
-
-
-@pytest.fixture
-def public_port(get_backend):
+def test_python_can_reads_it(get_backend):
     backend = GsUsbBackend()
     get_backend(lambda **_: backend)
-    return backend.ports[0]
-
-
-def test_python_can_reads_it(public_port):
+    public_port = backend.ports[0]
     with can.Bus(interface="gs_usb", channel=0, bitrate=1_000_000) as bus:
         public_port.adapter.hear(CanFrame(0x114, b"\1\2"), stamp_us=5_000_000)
         message = bus.recv(1.0)

@@ -1,13 +1,14 @@
 """Links that come back, on a clock of their own."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 from edge_samples import FakeLink, make_scan
 
 from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link
+from firmware_bridge.links.base import Link, Unread
 from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
@@ -224,6 +225,21 @@ def test_trouble_is_told_twice_and_lost_stamps_once():
         ("note", "slcan:x: its time stamps do not run as this machine's clock does"),
         ("well", "slcan:x reports no trouble"),
     ]
+
+
+def test_a_clock_that_was_set_by_readings_which_waited_gives_no_times():
+    """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
+    unread, ms = Unread(), 1_000_000
+    unread.empty_ns = 0
+    scan = replace(make_scan(0), time_ns=100 * ms, device_ns=99 * ms)
+    (old,) = unread.mark([scan], 100 * ms, clock_begun_ns=100 * ms)
+    assert (old.unread_ns, old.device_ns, old.not_before_ns) == (100 * ms, None, 0)
+    (old,) = unread.mark([scan], 101 * ms, clock_begun_ns=-ms)
+    assert (old.unread_ns, old.device_ns) == (100 * ms, 99 * ms)
+    unread.found(101 * ms, 103 * ms)
+    assert unread.empty_ns == 0, "until all data is read, the duration of a read is no evidence"
+    unread.empty_ns = 101 * ms
+    assert unread.mark([replace(scan, time_ns=102 * ms)], 102 * ms, None)[0].unread_ns == 0
 
 
 def test_the_doctor_knows_the_port_behind_a_name():

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import make_recording, read_scans, read_until_lost
-from edge_samples import wait_for
+from bridge_samples import read_scans
 from serial_samples import SilentDevice
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import fd_reader as bursts
 from firmware_bridge.links import slcan_serial
@@ -26,22 +25,6 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
-
-
-def test_the_wrong_line_speed_gives_no_scan():
-    recording = make_recording(20)
-    with (
-        Emulator([recording], left_open=True, loop=True) as emulator,
-        SlcanSerialLink(emulator.port, 115_200) as link,
-    ):
-        wait_for(lambda: link.read(0.1) == [] and link.counters()["received_bytes"] > 100)
-        assert link.counters()["frames"] == 0
-    with (
-        Emulator([recording], ignores_line_speed=True, loop=True) as emulator,
-        SlcanSerialLink(emulator.port, 115_200) as link,
-    ):
-        # So slow a line has no stamps: the pause of a busy machine within a cycle costs that scan, rightly.
-        assert any(scan.complete for scan in read_scans(link, 10))
 
 
 def test_what_came_before_the_loss_is_not_lost(monkeypatch):
@@ -83,24 +66,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
             assert [scan.complete for scan in scans] == complete
 
 
-def test_what_lay_there_since_the_opening_sets_no_clock(monkeypatch):
-    """Stamps of readings that nobody fetched set the adapter's clock, and by it they were new."""
-
-    def starved(frame):
-        time.sleep(0.1)
-        return encode_frame(frame)
-
-    playing = Emulator([make_recording(50)], loop=True)
-    monkeypatch.setattr(slcan_serial, "encode_frame", starved)
-    with playing as emulator, SlcanSerialLink(emulator.port, triggers=[trigger_frame(1)]) as link:
-        (first, *_) = read_scans(link, 1)
-        assert first.unread_ns > 80_000_000 and first.device_ns is None
-        assert first.not_before_ns == first.time_ns - first.unread_ns
-        end_s = time.monotonic() + 20
-        while any(scan.unread_ns or scan.device_ns is None for scan in read_scans(link, 1)):
-            assert time.monotonic() < end_s
-
-
 # The reader of bursts.
 
 
@@ -118,9 +83,20 @@ def test_few_reads_make_a_scan(monkeypatch):
             wakes.append(timeout_ms)
             return self._poll.poll(timeout_ms)
 
+    def send_scans():
+        begun_s = time.monotonic()
+        for number in range(30 * 16):
+            due_s = begun_s + number // 16 * 0.01 + number % 16 * FRAME_S
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            os.write(device.device_fd, LINES[number % 16])
+
     monkeypatch.setattr(select, "poll", CountedPoll)
-    with Emulator([make_recording(30)], latency_s=0.0) as emulator, SlcanSerialLink(emulator.port) as link:
-        assert len(read_until_lost(link)) == 30
+    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
+        thread = threading.Thread(target=send_scans)
+        thread.start()
+        while link.counters()["frames"] < 30 * 16:
+            link.read(0.05)
+        thread.join()
     assert len(wakes) < 30 * 5, "one for each of sixteen frames"
 
 
@@ -237,14 +213,14 @@ def test_a_stream_that_will_not_stop_holds_up_no_opening(limits):
             thread.join()
 
 
-def test_flow_control_and_low_latency_are_asked_for(monkeypatch):
+def test_speed_flow_control_and_low_latency_are_asked_for(monkeypatch):
     asked = []
     monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda port, on: asked.append(on))
     with SilentDevice() as device:
-        for rtscts in (True, False):
-            with SlcanSerialLink(device.port, rtscts=rtscts) as link:
-                assert bool(termios.tcgetattr(device.client_fd)[2] & termios.CRTSCTS) == rtscts
-                assert link.low_latency
+        for settings, speed in (((), termios.B3000000), ((115_200,), termios.B115200)):
+            with SlcanSerialLink(device.port, *settings):
+                attributes = termios.tcgetattr(device.client_fd)
+                assert attributes[2] & termios.CRTSCTS and attributes[4:6] == [speed, speed]
     assert asked == [True, True]
 
 

@@ -13,8 +13,7 @@ from edge_samples import wait_for
 from server_samples import looping, lose, read_notices
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection
-from xela_server_emulator import ServerEmulator
-from xela_server_model import VERSIONS, VendorServer
+from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer
 
 from edge.cli import main as cli
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError

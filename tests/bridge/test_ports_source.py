@@ -2,7 +2,7 @@
 
 import libusb_package
 import pytest
-from bridge_samples import make_counts, make_recording, read_scans, write_recording
+from bridge_samples import make_counts, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend
 from link_rigs import SlcanRig
@@ -10,7 +10,6 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import NoDeviceError, RecordingError, SourceError
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.demo import DemoLink
@@ -234,61 +233,62 @@ def test_old_controllers_are_woken_over_other_adapters_too(monkeypatch):
 
 
 GRIPPER = Port("/dev/ttyUSB0", (0x0403, 0x6015), "GRIP1", "gripper")
+NAMELESS = Port("/dev/ttyACM0", (0xAD50, 0x60C4), None, "CANtact")
+DOUBLE = [VSCOM._replace(path=f"/dev/ttyUSB{n}", interface=f"1.{n}") for n in range(2)]
+MOVED = [one._replace(path=f"/dev/ttyUSB{n}") for n, one in enumerate(DOUBLE, 4)]
+ONE, OTHER_ONE = (Port(f"/dev/ttyACM{n}", (0xAD50, 0x60C4), "00001", "CANtact", interface="1.0") for n in range(2))
+LEFT, RIGHT = (Port(f"/dev/ttyUSB{n}", (0x0403, 0x6001), "0001", "USB CAN", location=f"1-{n + 2}") for n in range(2))
+CROSSED = [LEFT._replace(path=RIGHT.path), RIGHT._replace(path=LEFT.path)]
+NEITHER = r"no adapter that is surely the one with serial number 00001 .*ttyACM0"
 
 
-def test_an_adapter_is_found_again_by_its_serial_number():
-    adapter = PluggedAdapter("/dev/ttyUSB0")
-    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
-    # Another has its name now, and it has the next.
-    assert adapter.find([GRIPPER, VSCOM._replace(path="/dev/ttyUSB1")]) == "/dev/ttyUSB1"
-    with pytest.raises(NoDeviceError, match=r"no adapter .* serial number D30BL366 .* seen: /dev/ttyUSB0"):
-        adapter.find([GRIPPER])
-    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
-
-
-def test_an_adapter_without_a_serial_number_is_its_path():
-    adapter = PluggedAdapter("/dev/ttyACM0")
-    nameless = Port("/dev/ttyACM0", (0xAD50, 0x60C4), None, "CANtact")
-    assert adapter.find([nameless]) == adapter.find([]) == adapter.find([VSCOM]) == "/dev/ttyACM0"
-    # And what comes there later with one is learnt then.
-    assert adapter.find([VSCOM._replace(path="/dev/ttyACM0")]) == "/dev/ttyACM0"
-    assert adapter.find([VSCOM]) == "/dev/ttyUSB0"
-
-
-def test_of_a_device_with_several_ports_it_is_the_same_one():
-    first, second = (VSCOM._replace(path=f"/dev/ttyUSB{n}", interface=f"1.{n}") for n in range(2))
-    adapter = PluggedAdapter("/dev/ttyUSB1")
-    assert adapter.find([first, second]) == "/dev/ttyUSB1"
-    moved = [first._replace(path="/dev/ttyUSB4"), second._replace(path="/dev/ttyUSB5")]
-    assert adapter.find(moved) == "/dev/ttyUSB5"
-    with pytest.raises(NoDeviceError, match="no adapter"):
-        adapter.find(moved[:1])
-
-
-def test_a_serial_number_of_two_identifies_neither():
-    """Cheap adapters all have the same: the one that is left must not be taken for the other."""
-    one, other = (Port(f"/dev/ttyACM{n}", (0xAD50, 0x60C4), "00001", "CANtact", interface="1.0") for n in range(2))
-    adapter = PluggedAdapter(one.path)
-    assert adapter.find([one, other]) == adapter.find([other, one]) == one.path
-    for present in ([other], [other, one._replace(path="/dev/ttyACM2")]):
-        with pytest.raises(
-            NoDeviceError, match=r"no adapter that is surely the one with serial number 00001 .*ttyACM0"
-        ):
-            adapter.find(present)
-    assert adapter.find([one]) == one.path
-
-
-def test_of_two_with_one_serial_number_each_has_its_socket():
-    """Names of the kernel change, and sockets do not."""
-    left, right = (
-        Port(f"/dev/ttyUSB{n}", (0x0403, 0x6001), "0001", "USB CAN", location=f"1-{n + 2}") for n in range(2)
-    )
-    adapters = [PluggedAdapter(port.path) for port in (left, right)]
-    assert [adapter.find([left, right]) for adapter in adapters] == [left.path, right.path]
-    crossed = [left._replace(path=right.path), right._replace(path=left.path)]
-    assert [adapter.find(crossed) for adapter in adapters] == [right.path, left.path]
-    with pytest.raises(NoDeviceError, match="surely"):
-        adapters[0].find([right._replace(path=left.path)])
+@pytest.mark.parametrize(
+    ("path", "looks"),
+    [
+        (
+            "/dev/ttyUSB0",
+            [
+                ([VSCOM], "/dev/ttyUSB0"),
+                ([GRIPPER, VSCOM._replace(path="/dev/ttyUSB1")], "/dev/ttyUSB1"),  # another has its name now
+                ([GRIPPER], r"no adapter .* serial number D30BL366 .* seen: /dev/ttyUSB0"),
+                ([VSCOM], "/dev/ttyUSB0"),
+            ],
+        ),
+        # Without a serial number it is its path; what comes there later with one is learnt then.
+        (
+            "/dev/ttyACM0",
+            [
+                *(
+                    (ports, "/dev/ttyACM0")
+                    for ports in ([NAMELESS], [], [VSCOM], [VSCOM._replace(path="/dev/ttyACM0")])
+                ),
+                ([VSCOM], "/dev/ttyUSB0"),
+            ],
+        ),
+        # Of a device with several ports it is the same one.
+        ("/dev/ttyUSB1", [(DOUBLE, "/dev/ttyUSB1"), (MOVED, "/dev/ttyUSB5"), (MOVED[:1], "no adapter")]),
+        # Cheap adapters all have the same number: the one that is left must not be taken for the other.
+        (
+            ONE.path,
+            [
+                *((ports, ONE.path) for ports in ([ONE, OTHER_ONE], [OTHER_ONE, ONE])),
+                *((ports, NEITHER) for ports in ([OTHER_ONE], [OTHER_ONE, ONE._replace(path="/dev/ttyACM2")])),
+                ([ONE], ONE.path),
+            ],
+        ),
+        # Names of the kernel change, and sockets do not.
+        (LEFT.path, [([LEFT, RIGHT], LEFT.path), (CROSSED, RIGHT.path), (CROSSED[1:], "surely")]),
+        (RIGHT.path, [([LEFT, RIGHT], RIGHT.path), (CROSSED, LEFT.path)]),
+    ],
+)
+def test_an_adapter_is_found_again_under_any_name(path, looks):
+    adapter = PluggedAdapter(path)
+    for ports, found in looks:
+        if found.startswith("/"):
+            assert adapter.find(ports) == found
+        else:
+            with pytest.raises(NoDeviceError, match=found):
+                adapter.find(ports)
 
 
 def test_a_link_that_the_user_named_by_place_is_followed(tmp_path):
@@ -302,22 +302,3 @@ def test_a_link_that_the_user_named_by_place_is_followed(tmp_path):
         assert adapter.find(ports) == port.path
     with pytest.raises(NoDeviceError, match=r"no adapter at .*left"):
         adapter.find(ports[1:])
-
-
-def test_the_cable_out_and_in_again_under_another_name(plugged):
-    """The ports are real pseudo-terminals, which only the listing takes for USB."""
-    with Emulator([make_recording(10)], loop=True) as first, Emulator([make_recording(10)], loop=True) as second:
-        plugged.append(VSCOM._replace(path=first.port))
-        link = open_source("slcan:serial=D30BL366")
-        with link:
-            before = read_scans(link, 3)
-            first.hang_up()
-        plugged.clear()
-        with pytest.raises(NoDeviceError, match=r"no adapter .* with serial number D30BL366"):
-            link.__enter__()
-        plugged.append(VSCOM._replace(path=second.port))
-        with link:
-            after = read_scans(link, 3)
-    assert link.name == "slcan:serial=D30BL366"
-    assert after[0].number > before[-1].number, "one series of numbers"
-    assert after[0].device_ns is not None and 0 <= after[0].time_ns - after[0].device_ns < 10**9

@@ -23,8 +23,7 @@ import written_samples
 from bridge_samples import write_recording
 from doctor_samples import healthy_counts
 from edge_samples import BASELINE, ROOT, ListSink
-from xela_server_emulator import ServerEmulator
-from xela_server_model import VendorServer
+from xela_server_emulator import ServerEmulator, VendorServer
 
 from edge.cli import main as cli
 from edge.cli import run_command as run

@@ -22,6 +22,7 @@ from edge.cli.run_help import parser
 from edge.doctor import command, examine
 from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import SlcanAdapter
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
@@ -145,7 +146,11 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line():
 
 
 def test_another_line_speed_than_the_adapters(limits):
-    with Emulator([recording(healthy_counts(200))], loop=True, left_open=True) as emulator:
+    class Garbled(SlcanAdapter):
+        def encode(self, frame, time_s):
+            return bytes(range(200, 210))
+
+    with Emulator([recording(healthy_counts(200))], loop=True, adapter=Garbled()) as emulator:
         limits(command, GIVEN_UP_S=0.5)
         done = doctor(f"{emulator.port}@115200", "--json")
     found = verdicts(done)

@@ -19,7 +19,7 @@ FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest"
 UNUSED_IN_A_REPLAY = {
     *("edge.sinks.jsonl", "edge.sinks.npz_file", "edge.sinks.ros2.sink", "cyclonedds", "tqdm", "edge.bench"),
     *("edge.cli.demo", "edge.terminal.heatmap", "edge.cli.realtime", "websockets", "usb", "can", "subprocess"),
-    *("firmware_bridge.emulation.robot_main", "firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
+    *("firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
     *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
     *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),
 }
@@ -40,7 +40,7 @@ def test_no_module_of_the_runtime_loads_a_training_library():
         for path in sorted((ROOT / package).rglob("*.py"))
         if path.stem != "__init__" and (find_spec("cyclonedds") or "ros2" not in path.parts)
     ]
-    assert {"edge.cli.main", "edge.inference.onnx_session", "firmware_bridge.emulation.robot_main"} <= set(modules)
+    assert {"edge.cli.main", "edge.inference.onnx_session", "firmware_bridge.links.demo"} <= set(modules)
     light = "edge.inference.contract", "edge.api", "edge.cli.main", "edge.pipeline.result_stream", "edge.sinks.registry"
     first, every = run(
         f"import sys, {', '.join(light)}\nprint(*sys.modules)\nimport {', '.join(modules)}\nprint(*sys.modules)"

@@ -90,11 +90,7 @@ class GsUsbAdapter:
             self._changed.notify_all()
 
     def request_out(self, number: int, payload: bytes) -> None:
-        """Obey a request.
-
-        Raises:
-            StalledError: it knows no such request, or the payload is too short.
-        """
+        """Obey a request; raises StalledError if it knows none such, or the payload is too short."""
         lengths = {gs_usb.HOST_FORMAT: 4, gs_usb.BIT_TIMING: 20, gs_usb.MODE: 8}
         if len(payload) < lengths.get(number, 1 << 16):
             raise StalledError(f"request {number} with {len(payload)} bytes")
@@ -108,11 +104,7 @@ class GsUsbAdapter:
                     self._stamped = features & self._limits.features & gs_usb.HARDWARE_STAMPS != 0
 
     def request_in(self, number: int) -> bytes:
-        """Answer a request.
-
-        Raises:
-            StalledError: it knows no such request.
-        """
+        """Answer a request; raises StalledError if it knows none such."""
         if number == gs_usb.BIT_TIMING_LIMITS:
             return struct.pack("<10I", *self._limits)
         if number == gs_usb.DEVICE_CONFIG:

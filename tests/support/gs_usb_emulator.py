@@ -13,41 +13,17 @@ import usb.backend
 import usb.core
 from gs_usb_adapter import GsUsbAdapter, StalledError
 
-IO: Final = -1
-ACCESS: Final = -3
-NO_DEVICE: Final = -4
-NOT_FOUND: Final = -5
-BUSY: Final = -6
-TIMEOUT: Final = -7
-OVERFLOW: Final = -8
-PIPE: Final = -9
-
-_ERRNO: Final = {
-    IO: errno.EIO,
-    ACCESS: errno.EACCES,
-    NO_DEVICE: errno.ENODEV,
-    NOT_FOUND: errno.ENOENT,
-    BUSY: errno.EBUSY,
-    TIMEOUT: errno.ETIMEDOUT,
-    OVERFLOW: errno.EOVERFLOW,
-    PIPE: errno.EPIPE,
-}
-_GET_DESCRIPTOR: Final = 6
-_ENGLISH: Final = b"\x04\x03\x09\x04"
-_TEXTS: Final = 3
-_DIRECTION_IN: Final = 0x80
+IO, ACCESS, NO_DEVICE, NOT_FOUND, BUSY, TIMEOUT, OVERFLOW, PIPE = -1, -3, -4, -5, -6, -7, -8, -9
+_ERRNO: Final = {IO: errno.EIO, ACCESS: errno.EACCES, NO_DEVICE: errno.ENODEV, NOT_FOUND: errno.ENOENT} | {
+    BUSY: errno.EBUSY, TIMEOUT: errno.ETIMEDOUT, OVERFLOW: errno.EOVERFLOW, PIPE: errno.EPIPE
+}  # fmt: skip
 
 
 class GsUsbPort:
-    """Place on the bus where an adapter may be plugged in.
+    """Place on the bus where an adapter may be plugged in: the one that is there, or was there last.
 
     Attributes:
-        adapter: the one that is there, or was there last.
-        serial_number, product: its texts; None where it has none.
-        kernel_driver: the kernel's driver holds it.
-        claimed: some program holds it.
-        handles: how often it is open.
-        permitted: the user may open it.
+        kernel_driver, claimed: who holds it; handles: how often it is open; permitted: the user may open it.
         sockets: numbers of the hubs' sockets that lead to it.
         gone_as: the error of libusb that unplugging gives; host controllers differ.
     """
@@ -205,10 +181,10 @@ class GsUsbBackend(usb.backend.IBackend):
     ) -> int:
         adapter = dev_handle.check()
         try:
-            if not bmRequestType & _DIRECTION_IN:
+            if not bmRequestType & 0x80:  # to the device
                 adapter.request_out(bRequest, data.tobytes())
                 return len(data)
-            if bmRequestType == _DIRECTION_IN and bRequest == _GET_DESCRIPTOR and wValue >> 8 == _TEXTS:
+            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):  # get a descriptor, of a text
                 answer = self._text(dev_handle.port, wValue & 0xFF)
             else:
                 answer = adapter.request_in(bRequest)
@@ -247,12 +223,12 @@ class GsUsbBackend(usb.backend.IBackend):
 
     def _text(self, port: GsUsbPort, index: int) -> bytes:
         if index == 0:
-            return _ENGLISH
+            return b"\x04\x03\x09\x04"  # English
         text = {2: port.product, 3: port.serial_number}.get(index)
         if text is None:
             raise StalledError(f"text {index}")
         encoded = text.encode("utf-16-le")
-        return bytes((2 + len(encoded), _TEXTS)) + encoded
+        return bytes((2 + len(encoded), 3)) + encoded
 
 
 def libusb_error(code: int) -> usb.core.USBError:

@@ -1,14 +1,11 @@
 """Devices on which every link can be tried alike: they give scans when asked, are pulled out and put back."""
 
 import errno
-import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import can
 from bridge_samples import frames_of, make_counts, read_scans, write_recording
@@ -26,7 +23,7 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.xela_server import XelaServerLink
-from firmware_bridge.scans.gs_usb_scans import GsUsbScans
+from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -85,10 +82,6 @@ class CanRig(Rig):
 
     def sent(self, frames: int) -> list[CanFrame]:
         """Return the frames that a link has sent, so many."""
-        raise NotImplementedError
-
-    def after_next_frame(self, action: Callable[[], object]) -> None:
-        """Do something in the reader's thread, once, between a frame and what the reader makes of it."""
         raise NotImplementedError
 
     def give(self, link: Link, scans: int) -> list[Scan]:
@@ -169,9 +162,6 @@ class GsUsbRig(CanRig):
     def sent(self, frames):
         return self._port.adapter.sent
 
-    def after_next_frame(self, action):
-        self._port.adapter.fetch = _then_once(self._port.adapter.fetch, action)
-
     def lose(self):
         self._port.adapter.unplug()
 
@@ -215,8 +205,7 @@ class PythonCanRig(CanRig):
         monkeypatch.setattr(can, "Bus", self._open)
 
     def _open(self, *, channel, **_):
-        self._near = PulledBus(self._plugged, channel=channel)
-        return self._near
+        return PulledBus(self._plugged, channel=channel)
 
     def link(self, **settings):
         return CanBusLink("virtual", self._channel, **settings)
@@ -227,9 +216,6 @@ class PythonCanRig(CanRig):
     def sent(self, frames):
         heard = [self._far.recv(1.0) for _ in range(frames)]
         return [CanFrame(one.arbitration_id, bytes(one.data), one.is_extended_id) for one in heard if one]
-
-    def after_next_frame(self, action):
-        self._near.recv = _then_once(self._near.recv, action)
 
     def lose(self):
         self._plugged.clear()
@@ -268,7 +254,7 @@ class ServerRig(Rig):
 
 
 class DemoRig(Rig):
-    """The emulator in a process of its own."""
+    """The demo, whose emulator hangs up."""
 
     name = "demo"
     lost = "link lost, the cable or the adapter is gone"
@@ -277,14 +263,12 @@ class DemoRig(Rig):
         self._recording = write_recording(folder / "demo.csv", make_counts(30), rate_hz=100)
 
     def link(self, **settings):
-        return DemoLink(self._recording, loop=True)
+        self._link = DemoLink(self._recording, loop=True)
+        return self._link
 
     def lose(self):
-        (process_id,) = processes_playing(self._recording)
-        os.kill(process_id, signal.SIGKILL)
-
-    def close(self):
-        assert processes_playing(self._recording) == []
+        assert self._link.emulator is not None
+        self._link.emulator.hang_up()
 
 
 class ReplayRig(Rig):
@@ -298,29 +282,3 @@ class ReplayRig(Rig):
 
     def link(self, **settings):
         return ReplayLink([self._recording])
-
-
-def _then_once(fetch: Callable[..., Any], action: Callable[[], object]) -> Callable[..., Any]:
-    actions = [action]
-
-    def fetch_and_act(timeout):
-        fetched = fetch(timeout)
-        while actions:
-            actions.pop()()
-        return fetched
-
-    return fetch_and_act
-
-
-def processes_playing(path: Path) -> list[int]:
-    """Return the processes of emulators that play a recording."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                command = (entry / "cmdline").read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if b"firmware_bridge.emulation.robot_main" in command and str(path).encode() in command:
-                found.append(int(entry.name))
-    return found

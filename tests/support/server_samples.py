@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 from bridge_samples import REST_COUNTS, make_recording
-from xela_server_model import VendorServer
+from xela_server_emulator import VendorServer
 
 from firmware_bridge.errors import LinkLostError
 

@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.emulator_thread import EmulatorThread
-from firmware_bridge.emulation.pty_port import PseudoPort
+from firmware_bridge.emulation.pty_port import EmulatorThread, PseudoPort
 from firmware_bridge.emulation.xela_controller import SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
@@ -60,24 +59,21 @@ BusFault = Callable[[list[Sent]], list[Sent]]
 LineFault = Callable[[bytes], bytes]
 
 
-def _struck(usual: float, strike: Callable[[random.Random, Sent], list[Sent]]) -> Callable[..., BusFault]:
+def _struck(strike: Callable[[random.Random, Sent], list[Sent]]) -> Callable[..., BusFault]:
     """Return a fault that replaces a share of the frames."""
-
-    def begin(draw: random.Random, share: float | None) -> BusFault:
-        most = usual if share is None else share
-        return lambda batch: [new for one in batch for new in (strike(draw, one) if draw.random() < most else [one])]
-
-    return begin
+    return lambda draw, share: (
+        lambda batch: [new for one in batch for new in (strike(draw, one) if draw.random() < share else [one])]
+    )
 
 
 def _foreign(draw: random.Random, sent: Sent) -> list[Sent]:
     return [Sent(sent.time_s, CanFrame(0x740 | draw.randrange(16), draw.randbytes(8)), -1), sent]
 
 
-def _swapping(draw: random.Random, share: float | None) -> BusFault:
+def _swapping(draw: random.Random, share: float) -> BusFault:
     def swap(batch: list[Sent]) -> list[Sent]:
         for at in range(0, len(batch) - 1, 2):
-            if draw.random() < (0.02 if share is None else share):
+            if draw.random() < share:
                 batch[at : at + 2] = batch[at + 1], batch[at]
         return batch
 
@@ -87,11 +83,11 @@ def _swapping(draw: random.Random, share: float | None) -> BusFault:
 def _without(same: Callable[[Sent], object]) -> Callable[..., BusFault]:
     """Return a fault that loses all frames that are alike in this to one that is drawn."""
 
-    def begin(draw: random.Random, share: float | None) -> BusFault:
+    def begin(draw: random.Random, share: float) -> BusFault:
         drawn: list[object] = []
 
         def lose(batch: list[Sent]) -> list[Sent]:
-            if batch and not drawn and draw.random() < 1 / 4:
+            if batch and not drawn and draw.random() < share:
                 drawn.append(same(draw.choice(batch)))
             return [one for one in batch if same(one) not in drawn]
 
@@ -100,39 +96,25 @@ def _without(same: Callable[[Sent], object]) -> Callable[..., BusFault]:
     return begin
 
 
-def _gaps(draw: random.Random, share: float | None) -> BusFault:
+def _gaps(draw: random.Random, share: float) -> BusFault:
     """Return a fault that loses as many frames in a row as make the parts of two cycles fit."""
     left = 0
 
-    def lose(batch: list[Sent]) -> list[Sent]:
+    def kept(_: Sent) -> bool:
         nonlocal left
-        kept: list[Sent] = []
-        for one in batch:
-            if not left and draw.random() < (0.01 if share is None else share):
-                left = 16 * draw.randint(1, 6)
-            if left:
-                left -= 1
-            else:
-                kept.append(one)
-        return kept
+        left = left - 1 if left else 16 * draw.randint(1, 6) if draw.random() < share else 0
+        return not left
 
-    return lose
+    return lambda batch: list(filter(kept, batch))
 
 
-def _vanishing(draw: random.Random, share: float | None) -> BusFault:
-    most, key = 0.05 if share is None else share, draw.random()
-
-    def lose(batch: list[Sent]) -> list[Sent]:
-        return [one for one in batch if random.Random(f"{key} {one.sensor} {one.cycle}").random() >= most]
-
-    return lose
+def _vanishing(draw: random.Random, share: float) -> BusFault:
+    key = draw.random()
+    return lambda batch: [one for one in batch if random.Random(f"{key} {one.sensor} {one.cycle}").random() >= share]
 
 
 def _line(spoil: Callable[[random.Random, bytes], bytes]) -> Callable[..., LineFault]:
-    def begin(draw: random.Random, share: float | None) -> LineFault:
-        return lambda line: spoil(draw, line) if draw.random() < (0.02 if share is None else share) else line
-
-    return begin
+    return lambda draw, share: lambda line: spoil(draw, line) if draw.random() < share else line
 
 
 def _high_bit(draw: random.Random, line: bytes) -> bytes:
@@ -141,16 +123,18 @@ def _high_bit(draw: random.Random, line: bytes) -> bytes:
 
 
 BUS_FAULTS: Final[dict[str, Callable[..., BusFault]]] = {
-    "lost": _struck(0.02, lambda draw, sent: []),
+    "lost": _struck(lambda draw, sent: []),
     "gaps": _gaps,
-    "repeated": _struck(0.02, lambda draw, sent: [sent, sent]),
-    "foreign": _struck(0.02, _foreign),
+    "repeated": _struck(lambda draw, sent: [sent, sent]),
+    "foreign": _struck(_foreign),
     "reordered": _swapping,
     "dead": _without(lambda sent: sent.frame.can_id),
     "silent": _without(lambda sent: sent.sensor),
     "vanished": _vanishing,
-    "bus-off": _struck(1.0, lambda draw, sent: []),
+    "bus-off": _struck(lambda draw, sent: []),
 }
+USUAL_SHARE: Final = {"gaps": 0.01, "dead": 0.25, "silent": 0.25, "vanished": 0.05, "bus-off": 1.0}
+"""Share of frames, of cycles, or of looks for a victim, that a fault strikes by default; 0.02 where none is given."""
 LINE_FAULTS: Final[dict[str, Callable[..., LineFault]]] = {
     "garbage": _line(lambda draw, line: bytes(draw.choices(_NOISE, k=draw.randint(12, 200))) + b"\r" + line),
     "truncated": _line(lambda draw, line: line[: draw.randint(1, 20)] + b"\r"),
@@ -163,10 +147,10 @@ NAMES: Final = (*BUS_FAULTS, *LINE_FAULTS, BURSTS, *LINK_FAULTS)
 
 
 class Stretch(NamedTuple):
-    """Fault, the share that it strikes or None for the usual one, and its interval in [s]."""
+    """Fault, the share that it strikes, and its interval in [s]."""
 
     name: str
-    share: float | None
+    share: float
     start_s: float
     end_s: float
 
@@ -185,7 +169,7 @@ def stretches(text: str, seed: int) -> list[Stretch]:
         if name not in (*NAMES, MIXED):
             raise ValueError(f"fault is {name!r}, expected one of: {', '.join((*NAMES, MIXED))}")
         try:
-            begin_s, long_s, struck = float(start), float(length), float(share) if share else None
+            begin_s, long_s, struck = float(start), float(length), float(share or USUAL_SHARE.get(name, 0.02))
         except ValueError:
             raise ValueError(f"fault is {part!r}, expected NAME[=SHARE]@START+LENGTH in seconds") from None
         found += (
@@ -203,7 +187,7 @@ def _mixture(start_s: float, long_s: float, seed: int) -> Iterator[Stretch]:
             fault_s = draw.uniform(0.2, LONGEST_S)
             if time_s + fault_s > start_s + long_s - CALM_S:
                 break
-            yield Stretch(name, None, time_s, time_s + fault_s)
+            yield Stretch(name, USUAL_SHARE.get(name, 0.02), time_s, time_s + fault_s)
             time_s += draw.uniform(0.5, 1.5) * pause_s + fault_s * (name in LINK_FAULTS)
 
 
@@ -230,7 +214,7 @@ class FaultyBus:
         on_sent: Callable[[Sent, int], object] = lambda sent, now_ns: None,
     ) -> None:
         """Prepare to play; `on_sent` gets each frame whose line goes out whole, just before it does, with the time."""
-        self.line = PseudoPort(link, seed=seed)
+        self.line = PseudoPort(link)
         self.begun = Counter[str]()
         self.handed = self.foreign = self.unread_bytes = self.openings = 0
         self.back_ns: list[int] = []
@@ -340,7 +324,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     try:
-        played = controllers_of([load_recording(path) for path in options.file], [], options.rate_hz)
+        played = controllers_of([load_recording(path) for path in options.file], options.rate_hz)
         faults = stretches(options.faults, options.seed)
     except ValueError as error:
         parser.error(str(error))

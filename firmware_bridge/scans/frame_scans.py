@@ -1,42 +1,57 @@
-"""Stages from the bytes of a gs_usb adapter to scans. No I/O, no clock."""
-
-from typing import Final
+"""Stages from CAN frames with time stamps in microseconds, or from the bytes of a gs_usb adapter, to scans. No I/O."""
 
 from firmware_bridge.can.bus_errors import BusErrors
 from firmware_bridge.can.gs_usb import GsUsbDecoder
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 
-TICK_NS: Final = 1_000
-WRAP_TICKS: Final = 1 << 32  # ticks after which the 32-bit stamps wrap: 71.6 minutes of microseconds
 
-
-class GsUsbScans:
-    """Stages from bytes to scans, over any number of starts of the adapter.
+class FrameScans:
+    """Stages from frames to scans, over any number of openings.
 
     Attributes:
-        clock: the adapter's clock since the last start.
+        clock: the adapter's clock.
         errors: what the adapter reported of its bus.
         can_ids: the standard CAN ids received so far, of any device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self._scans = ScanAssembler(model)
-        self.can_ids = self._scans.can_ids
+        self.clock = DeviceClock(1_000, None)
         self.errors = BusErrors()
-        self._earlier_counts: dict[str, int] = {}
-        self._decoder, self.clock = GsUsbDecoder(stamped=False), DeviceClock(TICK_NS, WRAP_TICKS)
+        self._assembler = ScanAssembler(model)
+        self.can_ids = self._assembler.can_ids
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken."""
-        self._scans.begin_anew()
+        self._assembler.begin_anew()
+
+    def feed_frame(self, frame: CanFrame, stamp_us: int | None, time_ns: int) -> list[Scan]:
+        """Return the scans that a frame closes; it arrived at `time_ns` [ns], by its stamp, if any, at `stamp_us`."""
+        self.errors.frame_heard()
+        device = None if stamp_us is None else self.clock.at(stamp_us, time_ns)
+        return self._assembler.feed_frame(frame, time_ns, device)
+
+    def counters(self) -> dict[str, int]:
+        """Return the counters of all stages."""
+        return self.errors.counters() | self._assembler.counters()
+
+
+class GsUsbScans(FrameScans):
+    """The same from the bytes of a gs_usb adapter."""
+
+    def __init__(self, model: ModelMap = USPA44_MAP) -> None:
+        super().__init__(model)
+        self._earlier_counts: dict[str, int] = {}
+        self._decoder = GsUsbDecoder(stamped=False)
 
     def start(self, *, stamped: bool, channels: int) -> None:
         """Begin with a new decoder and clock after a start of the adapter, which may have reset its clock."""
         self._earlier_counts = self._sum_decoder_counts()
-        self._decoder, self.clock = GsUsbDecoder(stamped=stamped, channels=channels), DeviceClock(TICK_NS, WRAP_TICKS)
+        self._decoder = GsUsbDecoder(stamped=stamped, channels=channels)
+        self.clock = DeviceClock(1_000, 1 << 32)  # the 32-bit stamps wrap after 71.6 minutes
         self.errors.restarted()
 
     def feed(self, data: bytes, time_ns: int) -> list[Scan]:
@@ -47,11 +62,8 @@ class GsUsbScans:
                 self.errors.overflow(time_ns)
             if host_frame.error is not None:
                 self.errors.error_frame(host_frame.error, host_frame.frame.data, time_ns)
-                continue
-            self.errors.frame_heard()
-            stamp_us = host_frame.stamp_us
-            device = None if stamp_us is None else self.clock.at(stamp_us, time_ns)
-            scans += self._scans.feed_frame(host_frame.frame, time_ns, device)
+            else:
+                scans += self.feed_frame(host_frame.frame, host_frame.stamp_us, time_ns)
         return scans
 
     def end_transfer(self) -> None:
@@ -60,7 +72,7 @@ class GsUsbScans:
 
     def counters(self) -> dict[str, int]:
         """Return the counters of all stages."""
-        return self._sum_decoder_counts() | self.errors.counters() | self._scans.counters()
+        return self._sum_decoder_counts() | super().counters()
 
     def _sum_decoder_counts(self) -> dict[str, int]:
         return {name: self._earlier_counts.get(name, 0) + count for name, count in self._decoder.counters().items()}
