@@ -48,8 +48,8 @@ STYLE_LINK: Final = b'<link rel="stylesheet" href="page.css">'
 SCRIPT_LINK: Final = b'<script type="module" src="page.js"></script>'
 KEY: Final = b'<meta name="edge-sr-key" content="">'
 SCRIPTS: Final = (
-    *("colour_map.js", "words.js", "link.js", "traces.js", "marks.js", "history.js", "contact_shape.js", "relief.js"),
-    *("overlay.js", "explain.js", "numbers.js", "limits.js", "sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
+    *("drawing.js", "numbers.js", "link.js", "traces.js", "history.js"),
+    *("sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
 )
 """Files of the script in the order in which they are joined, so that they share one scope."""
 

@@ -5,8 +5,8 @@ const SHOWN = Object.keys(NOTHING);
 
 class Sensor {
   constructor(name, hello) {
-    Object.assign(this, { name, hello, result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
-    Object.assign(this, { trace: new Trace(), history: new History(), path: new Path(), later: null, touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
+    Object.assign(this, NOTHING, { name, hello, cursor: null, trace: new Trace(), history: new History(), path: new Path() });
+    Object.assign(this, { later: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
     this.part = Object.fromEntries([...root.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
@@ -34,14 +34,14 @@ class Sensor {
       const heading = group.appendChild(document.createElement("h3"));
       heading.textContent = title;
       const list = group.appendChild(document.createElement("dl"));
-      for (const [label, key, size] of rows) {
+      for (const [label, key, meaning, text] of rows) {
         const term = list.appendChild(document.createElement("dt"));
-        const value = list.appendChild(document.createElement("dd"));
+        const element = list.appendChild(document.createElement("dd"));
         term.textContent = label;
-        explain(term, EXPLAIN[key]);
-        value.dataset.number = key;
-        if (size) { term.className = value.className = size; }
-        fields[key] = value;
+        explain(term, meaning);
+        element.dataset.number = key;
+        if (key === "force" || key === "area") term.className = element.className = "big";
+        fields[key] = { element, text };
       }
       this.part.numbers.append(group);
     }
@@ -279,15 +279,9 @@ class Sensor {
     say(stamp, this.stampText());
     show(stamp, this.unsure() || (!live && !(page.atS !== null && this.newest())));
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
-    if (this.pattern !== null) {
-      const [rows, cols] = this.pattern.shape;
-      paintMap(pattern, this.pattern.values, rows, cols, high, VIRIDIS);
-      const most = largest(this.pattern.values);
-      say(this.part["pattern-most"], live || page.atS !== null ? `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}` : "");
-    } else {
-      pattern.getContext("2d").clearRect(0, 0, pattern.width, pattern.height);
-      say(this.part["pattern-most"], "");
-    }
+    paintMap(pattern, this.pattern, high, VIRIDIS);
+    const most = this.pattern !== null && (live || page.atS !== null) ? largest(this.pattern.values) : null;
+    say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
     const relief = page.relief && this.pattern !== null;
     field.classList.toggle("relief", relief);
     if (relief) paintRelief(this.part.relief, this.pattern, high, VIRIDIS);
@@ -316,7 +310,7 @@ class Sensor {
     show(dead, deaths.length > 0);
     say(dead, `dead, not used: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
     if (this.zeroed === null) {
-      taxels.getContext("2d").clearRect(0, 0, taxels.width, taxels.height);
+      paintMap(taxels, null);
       say(this.part["taxels-high"], "counts");
     } else {
       const [, rows, cols] = this.zeroed.shape;
@@ -324,7 +318,7 @@ class Sensor {
       const z = values.subarray(2 * count, 3 * count);
       const believed = Array.from(z, (value, taxel) => (this.result.dead?.[taxel] ? 0 : value));
       const high = roundUp(largest(believed, LEAST_COUNTS));
-      paintMap(taxels, z, rows, cols, high, CIVIDIS);
+      paintMap(taxels, { values: z, shape: [rows, cols] }, high, CIVIDIS);
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
       if (width > 0) paintShear(this, context, width, height, rows, cols, values, high);
     }
@@ -334,20 +328,13 @@ class Sensor {
 
   paintDeviation() {
     const { deviation } = this.part;
-    const field = this.part["deviation-field"];
-    const stamp = this.part["deviation-stamp"];
-    const there = this.deviation !== null;
+    const [field, stamp] = [this.part["deviation-field"], this.part["deviation-stamp"]];
     field.classList.toggle("old", this.old());
-    show(stamp, !there);
+    show(stamp, this.deviation === null);
     say(stamp, this.pattern !== null ? "not given by this model" : page.atS === null ? "no contact yet" : "no contact then");
-    if (!there) {
-      deviation.getContext("2d").clearRect(0, 0, deviation.width, deviation.height);
-      return say(this.part["deviation-high"], this.unit());
-    }
-    const [rows, cols] = this.deviation.shape;
-    const high = roundUp(largest(this.deviation.values, LEAST_DEVIATION_MM));
-    paintMap(deviation, this.deviation.values, rows, cols, high, MAGMA);
-    return say(this.part["deviation-high"], `${short(high)}${THIN}${this.unit()}`);
+    const high = this.deviation === null ? null : roundUp(largest(this.deviation.values, 0.01));
+    paintMap(deviation, this.deviation, high, MAGMA);
+    say(this.part["deviation-high"], high === null ? this.unit() : `${short(high)}${THIN}${this.unit()}`);
   }
 
   paintTaps() {
@@ -359,9 +346,8 @@ class Sensor {
     const high = there ? largest(this.taps.values, LEAST_COUNTS) : 1;
     [...thumbs.children].forEach((item, tap) => {
       item.classList.toggle("empty", tap >= there);
-      const canvas = item.firstChild;
-      if (tap < there) paintMap(canvas, this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), rows, cols, high, CIVIDIS);
-      else canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+      const map = tap < there ? { values: this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), shape: [rows, cols] } : null;
+      paintMap(item.firstChild, map, high, CIVIDIS);
     });
   }
 
@@ -384,15 +370,13 @@ class Sensor {
     const made = this.made();
     if (result === null) return;
     const counters = result.counters ?? {};
-    const texts = numberTexts(this);
-    for (const [key, element] of Object.entries(this.fields)) {
-      if (!LOSSES.has(key)) say(element, texts[key]);
-      else {
-        say(element, String(counters[key] ?? 0));
-        element.classList.toggle("warn", counters[key] > LOSS_SHARE * (counters.scans ?? 0));
-      }
+    const ellipse = made.state === "contact" && made.trusted !== false && this.newest() ? this.ellipse() : null;
+    for (const [key, { element, text }] of Object.entries(this.fields)) {
+      say(element, text?.({ sensor: this, hello: this.hello, result, made, ellipse }) ?? String(counters[key] ?? 0));
+      // Fewer losses, as in the first second of a run, are no reason to worry.
+      if (!text) element.classList.toggle("warn", counters[key] > 0.01 * (counters.scans ?? 0));
     }
-    this.fields.trusted.classList.toggle("warn", made.trusted === false);
-    this.fields.baseline_age_s.classList.toggle("warn", result.baseline !== null && !known(result.baseline_age_s));
+    this.fields.trusted.element.classList.toggle("warn", made.trusted === false);
+    this.fields.baseline_age_s.element.classList.toggle("warn", result.baseline !== null && !known(result.baseline_age_s));
   }
 }
