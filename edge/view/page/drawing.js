@@ -65,7 +65,7 @@ function haloedText(context, [ink, halo], text, x, y) {
 
 /** Draw a bar of a round length at the lower left of a canvas that shows so many mm across. */
 function scaleBar(context, ink, widthMm, width, height) {
-  const barMm = SCALE_BARS_MM.find((mm) => mm <= widthMm / 3) ?? widthMm;
+  const barMm = [50, 20, 10, 5, 2, 1, 0.5].find((mm) => mm <= widthMm / 3) ?? widthMm;
   const bar = (barMm / widthMm) * width;
   haloed(context, ink, 2, () => {
     context.moveTo(10, height - 16);
@@ -135,12 +135,7 @@ function thumb(tap) {
   return item;
 }
 
-const SCALE_BARS_MM = [50, 20, 10, 5, 2, 1, 0.5];
 const LEAST_COUNTS = 200; // so that noise at rest stays dark
-const LEAST_SHEAR_COUNTS = 100;
-const LEAST_MM = 0.02;
-const FRESH_S = 0.3;
-const SHEAR_SHARE = 0.4; // length of the arrow of a force that is all shear, as a share of the pattern's width
 
 // ---- Marks over the pattern and the taxels ----
 
@@ -148,7 +143,7 @@ const SHEAR_SHARE = 0.4; // length of the arrow of a force that is all shear, as
 function paintOver(sensor, canvas, current) {
   const [context, width, height] = blank(canvas);
   const [rows, cols] = sensor.size();
-  const widthMm = cols * sensor.hello.pixel_pitch_mm;
+  const widthMm = cols * page.hello.pixel_pitch_mm;
   if (!(widthMm > 0) || width === 0) return;
   const ink = sensor.pattern === null ? [colour("text"), colour("card")] : ["#fff", "#0009"];
   scaleBar(context, ink, widthMm, width, height);
@@ -165,7 +160,7 @@ function paintOver(sensor, canvas, current) {
   if (wrench?.centre_of_pressure_mm) {
     const [x, y] = place(wrench.centre_of_pressure_mm);
     const [fx, fy] = wrench.force_n;
-    const length = (SHEAR_SHARE * width) / Math.hypot(...wrench.force_n);
+    const length = (0.4 * width) / Math.hypot(...wrench.force_n); // of the arrow of a force that is all shear: 0.4 of the width
     haloed(context, ink, 1.5, () => context.arc(x, y, 5, 0, 2 * Math.PI));
     arrow(context, ink, x, y, fx * length, fy * length);
   }
@@ -179,7 +174,7 @@ function paintOver(sensor, canvas, current) {
 
 function paintShear(sensor, context, width, height, rows, cols, values, high) {
   const count = rows * cols;
-  let longest = LEAST_SHEAR_COUNTS;
+  let longest = 100;
   for (let taxel = 0; taxel < count; taxel++) {
     if (!sensor.result.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
   }
@@ -204,10 +199,6 @@ function paintShear(sensor, context, width, height, rows, cols, values, high) {
 
 // ---- Shape of the contact: its ellipse, and the path of its centre ----
 
-const WHOLE_SHARE = 0.9; // of the pad
-const PATH_S = 5;
-const PATH_POINTS = 600;
-
 /** Return the ellipse with the moments of the touched pixels: centre and half axes in mm, and the turn of the long one in degrees; null without any, or if they fill the pad. */
 function contactEllipse({ values, shape: [rows, cols] }, pitchMm, share) {
   const least = share * largest(values);
@@ -219,7 +210,7 @@ function contactEllipse({ values, shape: [rows, cols] }, pitchMm, share) {
       sum += 1; sumX += col; sumY += row; sumXx += col * col; sumXy += col * row; sumYy += row * row;
     }
   }
-  if (sum > WHOLE_SHARE * rows * cols) return null; // the whole pad has no shape
+  if (sum > 0.9 * rows * cols) return null; // the whole pad has no shape
   const [x, y] = [sumX / sum, sumY / sum];
   const [xx, xy, yy] = [sumXx / sum - x * x + 1 / 12, sumXy / sum - x * y, sumYy / sum - y * y + 1 / 12];
   const [mean, spread] = [(xx + yy) / 2, Math.hypot((xx - yy) / 2, xy)];
@@ -254,11 +245,11 @@ class Path {
     const centre = touched ? wrench?.centre_of_pressure_mm ?? centroid : null;
     if (!centre && this.points.at(-1)?.[1] === null) return; // one point parts two contacts
     this.points.push([atS, centre ?? null]);
-    if (this.points.length > PATH_POINTS) this.points.shift();
+    if (this.points.length > 600) this.points.shift();
   }
 
   draw(context, ink, place, endS) {
-    const shown = this.points.filter(([atS]) => atS <= endS + 1e-6 && endS - atS <= PATH_S);
+    const shown = this.points.filter(([atS]) => atS <= endS + 1e-6 && endS - atS <= 5);
     haloed(context, ink, 1.2, () => {
       let drawing = false;
       for (const [, centre] of shown) {
@@ -272,7 +263,6 @@ class Path {
 // ---- Relief: the pattern as a surface, seen from above at a slant ----
 
 const RELIEF_SHARE = 0.3; // height of the scale's end, as a share of the width
-const LIGHT = [-0.5, -0.6, 0.62];
 
 /** Paint the surface from its far edge to its near one, in the colours of the map and lit from the upper left. */
 function paintRelief(canvas, { values, shape: [rows, cols] }, high, table) {
@@ -292,7 +282,7 @@ function paintRelief(canvas, { values, shape: [rows, cols] }, high, table) {
       const corners = [[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]];
       const [a, b, c, d] = corners.map(([r, k]) => value(r, k));
       const slope = [-(b + c - a - d) * 0.5 * steep, -(c + d - a - b) * 0.5 * steep, 1];
-      const lit = (slope[0] * LIGHT[0] + slope[1] * LIGHT[1] + LIGHT[2]) / Math.hypot(...slope);
+      const lit = (-0.5 * slope[0] - 0.6 * slope[1] + 0.62) / Math.hypot(...slope);
       const shade = 0.45 + 0.75 * Math.max(0, lit);
       const at = 3 * level((a + b + c + d) / 4, 1);
       context.fillStyle = `rgb(${[0, 1, 2].map((channel) => Math.min(255, Math.round(table[at + channel] * shade))).join()})`;

@@ -55,9 +55,9 @@ function nextTapText(next) {
   return ways.map(([mm, less, more]) => `${amount(Math.abs(mm), 1, "mm")} ${mm < 0 ? less : more}`).join(", ");
 }
 
-function trustText({ state, trusted, untrusted_reason: reason }, checks) {
+function trustText({ state, trusted, untrusted_reason: reason }) {
   if (trusted === true || trusted === false) return trusted ? "yes" : `no: ${reason}`;
-  return state !== "contact" ? "\u2013" : checks ? TOO_LIGHT : "not checked";
+  return state !== "contact" ? "\u2013" : page.hello.checks ? TOO_LIGHT : "not checked";
 }
 
 /**
@@ -77,7 +77,7 @@ const NUMBERS = {
     ["long axis", "axis", "Direction of the ellipse's long axis, from x to the right towards y down; round if it is hardly longer than wide.",
       ({ ellipse }) => (ellipse === null ? "\u2013" : isRound(ellipse) ? "round" : `${number(ellipse.turn)}\u00b0`)],
     ["taps used", "taps_used", "Taps that the pattern was made of, and the most that the model takes.",
-      ({ made, hello }) => (made.taps_used ? `${made.taps_used} of ${hello.taps}` : "\u2013")],
+      ({ made }) => (made.taps_used ? `${made.taps_used} of ${page.hello.taps}` : "\u2013")],
     ["another tap", "another_tap", "Whether one more tap is expected to make the error smaller.",
       ({ made }) => ({ true: "would help", false: "would not help" })[made.another_tap] ?? "\u2013"],
     ["next tap", "next_tap", "Where to touch next: half a pitch from the taps so far.", ({ result }) => nextTapText(result.next_tap)],
@@ -92,7 +92,7 @@ const NUMBERS = {
   ],
   Uncertainty: [
     ["to be believed", "trusted", "Whether the readings fit the pattern; one that is not checked, or a pattern that is not to be believed must not be acted on.",
-      ({ made, hello }) => trustText(made, hello.checks)],
+      ({ made }) => trustText(made)],
     ["mismatch", "mismatch", "Share of the readings that the pattern does not explain.",
       ({ made }) => amount(known(made.mismatch) ? 100 * made.mismatch : null, 1, "%")],
     ["tap mismatch", "tap_mismatch", "The same for each earlier tap, against the newest one.",

@@ -4,8 +4,8 @@ const NOTHING = { result: null, receivedS: 0, pattern: null, deviation: null, to
 const SHOWN = Object.keys(NOTHING);
 
 class Sensor {
-  constructor(name, hello) {
-    Object.assign(this, NOTHING, { name, hello, cursor: null, trace: new Trace(), history: new History(), path: new Path() });
+  constructor(name) {
+    Object.assign(this, NOTHING, { name, cursor: null, trace: new Trace(), history: new History(), path: new Path() });
     Object.assign(this, { later: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
@@ -29,7 +29,7 @@ class Sensor {
   addNumbers() {
     const fields = {};
     for (const [title, rows] of Object.entries(NUMBERS)) {
-      if (title === "Wrench" && !this.hello.wrench) continue;
+      if (title === "Wrench" && !page.hello.wrench) continue;
       const group = document.createElement("div");
       const heading = group.appendChild(document.createElement("h3"));
       heading.textContent = title;
@@ -125,7 +125,7 @@ class Sensor {
 
   // -- reading a pixel --
 
-  size() { return this.pattern?.shape ?? [this.hello.height, this.hello.width]; }
+  size() { return this.pattern?.shape ?? [page.hello.height, page.hello.width]; }
 
   point(x, y) {
     const [rows, cols] = this.size();
@@ -154,7 +154,7 @@ class Sensor {
   reading() {
     const [rows, cols] = this.size();
     const [row, col] = this.cursor;
-    const pitch = this.hello.pixel_pitch_mm;
+    const pitch = page.hello.pixel_pitch_mm;
     const place = `x ${number((col + 0.5 - cols / 2) * pitch, 1)}, y ${number((row + 0.5 - rows / 2) * pitch, 1)}${THIN}mm`;
     if (this.pattern === null) return `${place}: no pattern`;
     const unit = this.unit();
@@ -165,7 +165,7 @@ class Sensor {
 
   // -- state --
 
-  unit() { return this.result?.pattern_unit || this.hello.pattern_unit || "mm"; }
+  unit() { return this.result?.pattern_unit || page.hello.pattern_unit || "mm"; }
 
   ageS() { return nowS() - this.receivedS; }
   unsure() { return this.result?.state === "baseline_in_doubt"; }
@@ -181,7 +181,7 @@ class Sensor {
   /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
     if (this.pattern === null) return false;
-    return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < FRESH_S);
+    return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < 0.3);
   }
 
   live() { return page.atS === null && !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
@@ -199,10 +199,10 @@ class Sensor {
   verdict() {
     if (this.doubted()) return `not to be believed: ${this.touched.untrusted_text}`;
     if (this.pattern === null || this.touched.trusted !== null) return null;
-    return this.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
+    return page.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
   }
 
-  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, this.hello.pixel_pitch_mm, this.hello.contact_level); }
+  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
 
   word() {
     if (page.atS !== null) return ["past", this.result === null ? "no scan then" : `${this.newest() && this.doubted() ? "contact, not believed" : this.result.state}, ${number(this.trace.newestS - page.atS, 1)}${THIN}s ago`];
@@ -238,7 +238,7 @@ class Sensor {
   paintWord() {
     const [state, word] = this.word();
     const { badge, why, zero } = this.part;
-    const source = this.result?.source ?? this.hello.source;
+    const source = this.result?.source ?? page.hello.source;
     if (this.part.word.dataset.state !== state) {
       announce(`sensor ${this.name}: ${word}`);
       this.part.word.dataset.state = state;
@@ -266,8 +266,8 @@ class Sensor {
   }
 
   high() {
-    const full = this.hello.full_scale || 1;
-    return page.auto ? Math.max(this.highest, LEAST_MM) : full;
+    const full = page.hello.full_scale || 1;
+    return page.auto ? Math.max(this.highest, 0.02) : full;
   }
 
   paintPattern() {
@@ -322,7 +322,7 @@ class Sensor {
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
       if (width > 0) paintShear(this, context, width, height, rows, cols, values, high);
     }
-    const [rows, cols] = [this.hello.rows, this.hello.cols];
+    const [rows, cols] = [page.hello.rows, page.hello.cols];
     for (const [taxel] of deaths) cross(context, width, height, rows, cols, Number(taxel));
   }
 
@@ -339,10 +339,10 @@ class Sensor {
 
   paintTaps() {
     const { thumbs } = this.part;
-    const slots = Math.max(this.hello.taps || 1, this.taps?.shape[0] ?? 0);
+    const slots = Math.max(page.hello.taps || 1, this.taps?.shape[0] ?? 0);
     while (thumbs.children.length > slots) thumbs.lastChild.remove();
     while (thumbs.children.length < slots) thumbs.append(thumb(thumbs.children.length));
-    const [there, rows, cols] = this.taps?.shape ?? [0, this.hello.rows, this.hello.cols];
+    const [there, rows, cols] = this.taps?.shape ?? [0, page.hello.rows, page.hello.cols];
     const high = there ? largest(this.taps.values, LEAST_COUNTS) : 1;
     [...thumbs.children].forEach((item, tap) => {
       item.classList.toggle("empty", tap >= there);
@@ -356,9 +356,9 @@ class Sensor {
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
     paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts", page.atS, this.limits.of("force"));
-    if (page.shear && this.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
+    if (page.shear && page.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
     else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2", page.atS, this.limits.of("area"));
-    show(this.part.shear_toggle, this.hello.wrench);
+    show(this.part.shear_toggle, page.hello.wrench);
     this.part.shear_toggle.setAttribute("aria-pressed", String(page.shear));
     this.limits.paint();
     say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
@@ -372,7 +372,7 @@ class Sensor {
     const counters = result.counters ?? {};
     const ellipse = made.state === "contact" && made.trusted !== false && this.newest() ? this.ellipse() : null;
     for (const [key, { element, text }] of Object.entries(this.fields)) {
-      say(element, text?.({ sensor: this, hello: this.hello, result, made, ellipse }) ?? String(counters[key] ?? 0));
+      say(element, text?.({ sensor: this, result, made, ellipse }) ?? String(counters[key] ?? 0));
       // Fewer losses, as in the first second of a run, are no reason to worry.
       if (!text) element.classList.toggle("warn", counters[key] > 0.01 * (counters.scans ?? 0));
     }

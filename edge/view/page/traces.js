@@ -1,9 +1,8 @@
 // ---- Traces ----
 
-const LONGEST_S = 180; // as the history
 const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
-const POINTS = Math.ceil(1.1 * LONGEST_S / STEP_S);
+const POINTS = Math.ceil(1.1 * HISTORY_S / STEP_S);
 
 /** Ring buffer of the last minutes of force, area and shear. */
 class Trace {
