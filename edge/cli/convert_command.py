@@ -95,7 +95,7 @@ def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
 
 
 def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.npz_file import recorded_rows, write_npz
+    from edge.sinks.converted_files import recorded_rows, write_npz
 
     recording = replay.recordings[0]
     origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
@@ -137,7 +137,7 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
 
 def _write_csv(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
-    from edge.sinks.csv_file import write_csv
+    from edge.sinks.converted_files import write_csv
 
     recording = replay.recordings[0]
     track = next(track for track in recording.tracks if sensor in (None, track.sensor))

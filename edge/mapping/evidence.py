@@ -91,16 +91,6 @@ def _reached(grid: Grid, centre_mm: float, reach_mm: float) -> tuple[int, NDArra
 
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's top from which a pixel counts as touched: where a blurred edge of a flat part truly lies."""
-FLOOR_MM: Final = 0.02  # standard deviation of a pixel below which no model is taken at its word, in [mm]
-UNKNOWN_MM: Final = 0.05  # standard deviation of a pixel where the model gives none, in [mm]
-BLUR: Final = 0.15
-"""Standard deviation of a pattern's share of its top by which an edge is blurred, even in a sure pattern."""
-MOST_ODDS: Final = 4.0
-"""Largest log odds of one pattern's pixel: one pattern in fifty is wrong there however sure it is."""
-LEAST_TOP_MM: Final = 0.05
-"""Top below which a pattern may be all drift: a free pad that has warmed by a few kelvin makes .02 mm, in [mm]."""
-_TOP_PIXELS: Final = 8
-_LOGISTIC: Final = 1.702  # log odds of a normal distribution per standard deviation, within 0.01 in probability
 
 
 class Evidence(NamedTuple):
@@ -119,16 +109,17 @@ def weigh(
 ) -> Evidence | None:
     """Return the evidence of a pattern, None if it is flat: touched is where its share of the top exceeds `level`."""
     height, width = pattern.shape
-    top_mm = float(np.partition(pattern, -_TOP_PIXELS, axis=None)[-_TOP_PIXELS:].mean())
-    if not top_mm >= LEAST_TOP_MM:
+    top_mm = float(np.partition(pattern, -8, axis=None)[-8:].mean())
+    if not top_mm >= 0.05:  # [mm]; it may be all drift: a free pad that has warmed by a few kelvin makes .02 mm
         return None
-    variance = np.full_like(pattern, UNKNOWN_MM**2) if deviation is None else deviation * deviation
+    variance = np.full_like(pattern, 0.05**2) if deviation is None else deviation * deviation
     variance += _moved(pattern, pose, pixel_mm)
-    variance += np.float32(FLOOR_MM**2)
-    spread = np.sqrt(variance + np.float32((BLUR * top_mm) ** 2))
-    odds = (pattern - np.float32(level * top_mm)) * np.float32(_LOGISTIC)
+    variance += np.float32(0.02**2)  # however sure a model is of a pixel
+    spread = np.sqrt(variance + np.float32((0.15 * top_mm) ** 2))  # an edge is blurred even in a sure pattern
+    # 1.702: log odds of a normal distribution per standard deviation, within 0.01 in probability.
+    odds = (pattern - np.float32(level * top_mm)) * np.float32(1.702)
     odds /= spread
-    np.clip(odds, -MOST_ODDS, MOST_ODDS, out=odds)
+    np.clip(odds, -4, 4, out=odds)  # one pattern in fifty is wrong there however sure it is
     layers = np.empty((height, width, 4), dtype=np.float32)
     layers[..., 0] = 1
     layers[..., 1] = odds

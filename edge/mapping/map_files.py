@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from edge.mapping.object_map import MapLayers, ObjectMap
 
 FORMAT: Final = "tactile-object-map"
-VERSION: Final = 1
-_LEAST_PX: Final = 480  # side of the picture of one layer, at least: a pixel of the map is repeated
-_NOTHING: Final = (255, 255, 255)
-_DOUBTED: Final = (200, 40, 30)
 _GAP_PX: Final = 8
-_WORD_PX: Final = 6
 _EMULATED: Final = (
     "### #   # #  # #    ##  ### ### ## ",
     "#   ## ## #  # #   #  #  #  #   # #",
@@ -36,7 +31,7 @@ def save_npz(path: Path, whole: ObjectMap, **facts: str) -> None:
     arrays |= {f"{name}_patterns": np.array(count) for name, count in whole.counts.items()}
     arrays |= {name: np.array(text) for name, text in facts.items()}
     arrays |= {"px_per_mm": np.array(whole.grid.px_per_mm), "centre_mm": np.array(whole.grid.centre_mm)}
-    np.savez_compressed(path, format=np.array(FORMAT), version=np.array(VERSION), **arrays)
+    np.savez_compressed(path, format=np.array(FORMAT), version=np.array(1), **arrays)
 
 
 def check_npz(path: Path) -> None:
@@ -57,7 +52,7 @@ def save_png(path: Path, whole: ObjectMap, **facts: str) -> None:
     heights_mm = layers.height_mm
     lowest_mm = min(float(np.nanmin(heights_mm)), -1e-6) if np.isfinite(heights_mm).any() else -1.0
     doubted = (layers.doubted > 0) & ~(layers.coverage > 0)
-    times = -(-_LEAST_PX // whole.grid.pixels)
+    times = -(-480 // whole.grid.pixels)  # so that a layer's picture is at least 480 pixels wide
     panels = [_coloured(layers.contact, doubted), _coloured(1 - heights_mm / lowest_mm, doubted)]
     large = [np.repeat(np.repeat(panel, times, axis=0), times, axis=1) for panel in panels]
     gap = np.full((len(large[0]), _GAP_PX, 3), 255, dtype=np.uint8)
@@ -69,9 +64,9 @@ def save_png(path: Path, whole: ObjectMap, **facts: str) -> None:
 
 def _emulated_line(width: int) -> NDArray[np.uint8]:
     """Return a line (height, width, 3) with the word EMULATED, white on black."""
-    word = np.array([[mark == "#" for mark in row] for row in _EMULATED]).repeat(_WORD_PX, 0).repeat(_WORD_PX, 1)
+    word = np.array([[mark == "#" for mark in row] for row in _EMULATED]).repeat(6, 0).repeat(6, 1)
     line = np.zeros((len(word) + 2 * _GAP_PX, width, 3), dtype=np.uint8)
-    line[_GAP_PX:-_GAP_PX, _GAP_PX : _GAP_PX + word.shape[1]][word] = _NOTHING
+    line[_GAP_PX:-_GAP_PX, _GAP_PX : _GAP_PX + word.shape[1]][word] = 255
     return line
 
 
@@ -80,8 +75,8 @@ def _coloured(shares: NDArray[np.floating], doubted: NDArray[np.bool_]) -> NDArr
 
     known = np.isfinite(shares)
     pixels = colours(np.where(known, shares, 0)).astype(np.uint8)
-    pixels[~known] = _NOTHING
-    pixels[doubted] = _DOUBTED
+    pixels[~known] = 255
+    pixels[doubted] = (200, 40, 30)
     return pixels
 
 

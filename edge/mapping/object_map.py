@@ -20,18 +20,9 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 
 STEP_MM: Final = 0.5  # movement within which patterns are one piece of evidence, about one pixel of a pattern
-INDEPENDENT_MM: Final = USPA44.pitch_mm
-"""Movement after which a pattern is evidence of its own, since other taxels then see each part."""
-LEAST_SHARE: Final = 0.05
-"""Worth of a pattern at a place that counted before: its noise and the error of its pose are new."""
-MOST_ODDS: Final = 12.0  # largest log odds on the map, so that an object that has moved can be seen again
 PLACES: Final = 256  # places that are remembered as counted: 128 mm of a slide
-_FAR_MM: Final = 1e9
-_OVERLAP_MM2: Final = 5.0
-"""Area that must lie on the map already for a press to be aligned with it, about a quarter of a taxel's."""
 _RADIUS_MM: Final = USPA44.rows * USPA44.pitch_mm / 6**0.5
 """Distance from the pad's centre at which a turn moves its points, at the root of their mean square."""
-_HIGHEST: Final = 0.98  # share of the touched pixels that lie below the map's top, which no single pixel is to define
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +51,10 @@ class _Press:
 
 
 class ObjectMap:
-    """Map of one object.
+    """Map of one object, a square of `size_mm` around `centre_mm` in the object's plane.
 
-    Args:
-        size_mm: length of the map's sides.
-        px_per_mm: pixels of the map per [mm].
-        centre_mm: place of the map's centre in the object's plane.
-        contact_level: share of a pattern's top from which a pixel counts as touched.
-
-    Raises:
-        UsageError: the size is out of range.
+    A pixel of a pattern counts as touched from the share `contact_level` of its top on. Raises a UsageError where the
+    size is out of range.
     """
 
     def __init__(
@@ -92,7 +77,7 @@ class ObjectMap:
         # Coverage, log odds of a touch, information about the height, and that times the height, as in the evidence.
         self._sums = np.zeros((count * count, 4), dtype=np.float32)
         self._doubts = np.zeros(count * count, dtype=np.float32)
-        self._places = np.full((PLACES, 3), _FAR_MM)
+        self._places = np.full((PLACES, 3), 1e9)  # [mm]: far away
         self._checks = False
         self._presses: dict[str, _Press] = {}
 
@@ -109,8 +94,7 @@ class ObjectMap:
     def add(self, result: Result, pose: PadPose | None) -> None:
         """Take a result and the pose of its pad; without contact, or without a pose, the press before is over.
 
-        Raises:
-            UsageError: the pattern is not in [mm].
+        Raises a UsageError where the pattern is not in [mm].
         """
         sensor = result.scan.sensor
         if result.pattern is None or pose is None:
@@ -141,7 +125,7 @@ class ObjectMap:
         nothing = np.full(len(sums), np.nan, dtype=np.float32)
         height_mm = np.divide(lifted, information, out=nothing.copy(), where=touched)
         if touched.any():
-            height_mm -= np.quantile(height_mm[touched], _HIGHEST)
+            height_mm -= np.quantile(height_mm[touched], 0.98)  # no single pixel is to define the map's top
         deviation_mm = np.divide(1, np.sqrt(information), out=nothing, where=touched)
         made = (height_mm, _contact(covered, odds), deviation_mm, covered.copy(), doubts.copy())
         shape = (self.grid.pixels, self.grid.pixels)
@@ -192,14 +176,14 @@ class ObjectMap:
         seen[:, 3] += np.float32(offset_mm) * seen[:, 2]
         seen *= np.float32(self._worth(pose))
         seen += before
-        np.clip(seen[:, 1], -MOST_ODDS, MOST_ODDS, out=seen[:, 1])
+        np.clip(seen[:, 1], -12, 12, out=seen[:, 1])  # so that an object that has moved can be seen again
         sums[under.pixels] = seen
         return "fused"
 
     def _offset_mm(self, seen: NDArray[np.float32], before: NDArray[np.float32], top_mm: float) -> float:
         """Return what a press adds to its pattern so that it agrees with the map where both touched."""
         both = np.flatnonzero((seen[:, 2] > 0) & (before[:, 2] > 0))
-        if len(both) < _OVERLAP_MM2 * self.grid.px_per_mm**2:
+        if len(both) < 5.0 * self.grid.px_per_mm**2:  # [mm^2], about a quarter of a taxel's area
             return -top_mm  # its top is taken to be as high as the first press's, which is 0
         information, there = seen[both, 2], before[both]
         weight = information * there[:, 2] / (information + there[:, 2])
@@ -207,11 +191,14 @@ class ObjectMap:
         return float(weight @ apart_mm / weight.sum())
 
     def _worth(self, pose: PadPose) -> float:
-        """Return how many taps a pattern is worth, beside those that counted before."""
+        """Return how many taps a pattern is worth beside those before: a whole one a pitch away, under other taxels.
+
+        It is never worth nothing, since its noise and the error of its pose are new.
+        """
         x_mm, y_mm, turn_rad = self._places.T
         turned_mm = _RADIUS_MM * 2 * np.sin((turn_rad - radians(pose.turn_deg)) / 2)
         away_mm = np.sqrt((x_mm - pose.x_mm) ** 2 + (y_mm - pose.y_mm) ** 2 + turned_mm**2)
-        return min(1.0, max(LEAST_SHARE, float(away_mm.min()) / INDEPENDENT_MM))
+        return min(1.0, max(0.05, float(away_mm.min()) / USPA44.pitch_mm))
 
 
 def _too_light(result: Result) -> bool:

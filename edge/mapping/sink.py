@@ -56,11 +56,8 @@ class MapState(NamedTuple):
         return Box(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1) if len(rows) else None
 
 
-APART_MM: Final = USPA44.rows * USPA44.pitch_mm / 2
-"""Half a pad, in [mm]: the centres of two pads are never that near to each other."""
 SHOW_NS: Final = 250_000_000
-"""Time between two states that are shown, in [ns], of a map of SHOWN_PX pixels; larger ones are shown less often."""
-SHOWN_PX: Final = 240 * 240
+"""Time between two states that are shown, in [ns], of a map of 240 x 240 pixels; larger ones are shown less often."""
 
 
 class MapSink(Sink):
@@ -84,10 +81,7 @@ class MapSink(Sink):
         """Check that the files can be written: layers and picture, on `close` and at a reset; later ones are numbered.
 
         `show` is called with the map's state a few times a second and must not wait. `origin` is the kind of source
-        that the scans of a recording come from.
-
-        Raises:
-            SinkError: a file exists, or cannot be written.
+        that the scans of a recording come from. Raises a SinkError where a file exists, or cannot be written.
         """
         self.whole = whole
         self.without_pose = self.together = 0
@@ -101,7 +95,7 @@ class MapSink(Sink):
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
         self._clock_ns = clock_ns
-        self._pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // SHOWN_PX)
+        self._pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // 240**2)
         self._due_ns = 0
         self._unseen = False
         self._shown = 0
@@ -163,9 +157,10 @@ class MapSink(Sink):
         return self.whole.counts | {"without_pose": self.without_pose, "together": self.together}
 
     def _is_shared(self, sensor: str, pose: PadPose, time_ns: int) -> bool:
-        """Return whether another pad is at this place by its pose: then one has poses that are not its own."""
+        """Return whether another pad is within half a pad by its pose: then one has poses that are not its own."""
+        near_mm = USPA44.rows * USPA44.pitch_mm / 2
         return any(
-            abs(time_ns - at_ns) <= GAP_NS and hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm) < APART_MM
+            abs(time_ns - at_ns) <= GAP_NS and hypot(pose.x_mm - other.x_mm, pose.y_mm - other.y_mm) < near_mm
             for name, (other, at_ns) in self._pads.items()
             if name != sensor
         )

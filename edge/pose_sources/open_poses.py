@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import zenoh
 
 FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC")
-DEFAULT_KEY: Final = "pose"
-_NAMED: Final = re.compile(r"([A-Za-z0-9_/-]{1,64})=(.+)", re.DOTALL)
 
 
 class PoseSource(Protocol):
@@ -26,16 +24,12 @@ class PoseSource(Protocol):
 
 
 def check_poses(text: str) -> tuple[str | None, str, str]:
-    """Return sensor, form and target of the source that `text` names, FORM or SENSOR=FORM; nothing is opened.
-
-    Raises:
-        UsageError: no such form.
-    """
-    match = _NAMED.fullmatch(text)
+    """Return sensor, form and target of the source that `text` names, FORM or SENSOR=FORM, or raise a UsageError."""
+    match = re.fullmatch(r"([A-Za-z0-9_/-]{1,64})=(.+)", text, re.DOTALL)
     sensor, form_text = (match[1], match[2]) if match else (None, text)
     form, _, target = form_text.partition(":")
     if form == "zenoh":
-        target = target or DEFAULT_KEY
+        target = target or "pose"
         parsed_target(target)
     elif form == "ros2" and target:
         target = base_topic(target)

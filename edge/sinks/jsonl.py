@@ -23,11 +23,7 @@ from edge.pipeline.sink import NOW, RunFacts, Sink
 from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
 
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
-_PAGE_BYTES: Final = 4096
-_OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 _ALL: Final = RecordForm(maps=True)
-_ROOM_S: Final = 0.002
-"""Pause between two checks for room in a slow reader's pipe, in [s]; a pipe holds more than comes in meanwhile."""
 
 
 class JsonLinesSink(Sink):
@@ -65,7 +61,8 @@ class JsonLinesSink(Sink):
 
     def _write(self, line: bytes) -> None:
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
-            if not self._run.lossless or self._run.stop.wait(_ROOM_S):
+            # In the pause less comes in than a pipe holds.
+            if not self._run.lossless or self._run.stop.wait(0.002):
                 self.unwritten += 1
                 return
         written = 0
@@ -88,7 +85,7 @@ class JsonLinesSink(Sink):
 
 def record_line(result: Result, counters: Mapping[str, int] | None, form: RecordForm = _ALL) -> bytes:
     """Return a result as one line of JSON, its maps last."""
-    return orjson.dumps(form.of(result, counters), option=_OPTIONS)
+    return orjson.dumps(form.of(result, counters), option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
 
 
 def has_room(descriptor: int, wanted_bytes: int) -> bool:
@@ -103,8 +100,8 @@ def has_room(descriptor: int, wanted_bytes: int) -> bool:
     waiting_bytes = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))[0]
     if waiting_bytes == 0:
         return True  # the pipe may be too small for a record, and a reader that has taken everything is not slow
-    # A pipe holds pages, and a record may begin a new page, so up to half of their room stays empty.
-    return 2 * waiting_bytes + wanted_bytes + 2 * _PAGE_BYTES <= fcntl.fcntl(descriptor, fcntl.F_GETPIPE_SZ)
+    # A pipe holds pages of 4 KiB, and a record may begin a new page, so up to half of their room stays empty.
+    return 2 * waiting_bytes + wanted_bytes + 8192 <= fcntl.fcntl(descriptor, fcntl.F_GETPIPE_SZ)
 
 
 def _widen(descriptor: int) -> None:

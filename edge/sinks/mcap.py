@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
 
 from edge import __version__
 from edge.errors import SinkError
@@ -49,9 +48,6 @@ from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADAT
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
-
-REPEAT_NS: Final = NS_PER_S
-"""Time from which on a sensor's facts and baseline are repeated, in [ns]: a part of a file has them, too."""
 
 
 class McapScans(McapFile):
@@ -122,9 +118,9 @@ class McapScans(McapFile):
         if not self._source_told:
             self.add_metadata(SOURCE_METADATA, source)
             self._source_told = True
-        repeat = unix_ns >= self._repeat_ns.get(sensor, 0)
+        repeat = unix_ns >= self._repeat_ns.get(sensor, 0)  # once a second, so that a part of a file has them, too
         if repeat:
-            self._repeat_ns[sensor] = unix_ns + REPEAT_NS
+            self._repeat_ns[sensor] = unix_ns + NS_PER_S
             facts = self._facts | {SOURCE_METADATA: source}
             if sensor in self._mountings:
                 facts[MOUNTING_METADATA] = self._mountings[sensor]

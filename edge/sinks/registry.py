@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from operator import attrgetter, methodcaller
+from operator import methodcaller
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,6 @@ from firmware_bridge.poses import TimedPose
 
 LOOK_NS: Final = 500_000_000
 """Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
-_UNWRITTEN: Final = attrgetter("unwritten")
 
 
 class Fan(Sink):
@@ -86,7 +85,7 @@ class Fan(Sink):
                 act(sink)
             except SinkError as error:
                 self._give_up(sink, error, counters)
-        self.unwritten = self._given_up_unwritten + sum(map(_UNWRITTEN, self._sinks))
+        self.unwritten = self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             known, self._known_trouble = self._known_trouble, self._troubles()
@@ -121,20 +120,15 @@ FORMS: Final = (
     *("status", "jsonl:FILE", "jsonl:- (stdout)", "mcap:FILE.mcap"),
     *("shm:NAME", "zenoh:KEY", "ros2:TOPIC", "ros2:TOPIC?commands"),
 )
-_TARGETED: Final = ("jsonl", "mcap", "shm", "zenoh", "ros2")
 
 
 def check_sink(text: str) -> tuple[str, str]:
-    """Return form and target of the sink that `text` names; nothing is opened.
-
-    Raises:
-        UsageError: no such form (the forms are listed), or no target of this form.
-    """
+    """Return form and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
     form, _, target = text.partition(":")
     if form == "npz" and target:
         made = Path(target).with_suffix(".mcap")
         raise UsageError(f"no sink {text!r}: record by --sink mcap:{made}, then edge-sr convert {made} {target}")
-    if text != "status" and (form not in _TARGETED or not target):
+    if text != "status" and (form not in ("jsonl", "mcap", "shm", "zenoh", "ros2") or not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
     if form == "mcap" and not target.endswith(".mcap"):
         raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in .mcap")
@@ -158,8 +152,7 @@ def open_sink(text: str, contract: Contract, run: RunFacts = NOW) -> Sink:
     """Open the sink that `text` names, of FORMS; the contract names the maps that will come, and their shapes.
 
     Raises:
-        UsageError: no such form, and the forms are listed; a sink in metres, and a model whose patterns have no unit
-            that is known; or what the sink needs is not installed.
+        UsageError: no such form; a sink in metres for patterns of an unknown unit; a package is not installed.
         SinkError: the sink cannot be opened.
     """
     # Each is imported only where it is used, which saves start-up time and memory.

@@ -29,20 +29,18 @@ from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS
 from edge.pipeline.sink import Sink
 
-FOLDER: Final = "/dev/shm"
 MAGIC: Final = b"TESR-SHM"
-VERSION: Final = 1
 SLOTS: Final = 32
 LINE_BYTES: Final = 64
 """Size of a cache line: values that different processes write and read often lie in lines of their own."""
 HEADER_BYTES: Final = 192
 HEARTBEAT_AT: Final = 128
 
-_SIZES: Final = ("version", "header_bytes", "slots", "slot_bytes", "half_bytes", "first_half_at")
-_SHAPES: Final = ("rows", "cols", "height", "width", "zeroed_at", "counts_at", "pattern_at", "deviation_at")
 HEADER: Final = (
     ("magic", "8s"),
-    *((name, "I") for name in (*_SIZES, *_SHAPES)),
+    *((name, "I") for name in ("version", "header_bytes", "slots", "slot_bytes", "half_bytes", "first_half_at")),
+    *((name, "I") for name in ("rows", "cols", "height", "width")),
+    *((name, "I") for name in ("zeroed_at", "counts_at", "pattern_at", "deviation_at")),
     *(("writer_pid", "Q"), ("pattern_unit", "16s")),
     *((name, "I") for name in ("traction_at", "traction_height", "traction_width")),
 )
@@ -109,7 +107,7 @@ class Layout:
     def header(self, writer_pid: int, pattern_unit: str) -> bytes:
         """Return the header's fields, without the heartbeat."""
         return struct_of(HEADER).pack(
-            *(MAGIC, VERSION, HEADER_BYTES, SLOTS, self.slot_bytes, self.half_bytes, LINE_BYTES),
+            *(MAGIC, 1, HEADER_BYTES, SLOTS, self.slot_bytes, self.half_bytes, LINE_BYTES),
             *(self.rows, self.cols, self.height, self.width),
             *(self.maps[name][2] for name in ("zeroed", "counts", "pattern", "deviation")),
             writer_pid,
@@ -120,8 +118,6 @@ class Layout:
 
 _HEAD: Final = struct_of(MEMBERS)
 _COLUMNS: Final = Columns(field.in_memory() for field in IN_MEMORY)
-_WRITER_PID_AT: Final = offsets_of(HEADER)["writer_pid"]
-_CHECKED_FROM: Final = offsets_of(MEMBERS)["sequence"]
 _WORD: Final = 8
 
 
@@ -132,14 +128,10 @@ class SharedMemorySink(Sink):
         self,
         name: str,
         contract: Contract,
-        folder: Path = Path(FOLDER),
+        folder: Path = Path("/dev/shm"),
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Make the segment in a folder of shared memory; one that a crash left over is replaced.
-
-        Raises:
-            SinkError: the segment cannot be made, or another program writes it.
-        """
+        """Make the segment in a folder of shared memory; one that a crash left over is replaced."""
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name):
             raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
         if not folder.is_dir():
@@ -203,7 +195,7 @@ class SharedMemorySink(Sink):
         # A map that this result lacks is filled with NaN, so that no older values stay.
         for place, values in zip(self._maps.values(), self._map_columns.of(result), strict=True):
             place[:] = values
-        checksum = zlib.crc32(memoryview(self._draft)[_CHECKED_FROM:])
+        checksum = zlib.crc32(memoryview(self._draft)[8:])  # from `sequence` on
         self._draft[:4] = checksum.to_bytes(4, "little")
 
     def _create(self, pattern_unit: str) -> tuple[int, mmap.mmap]:
@@ -244,7 +236,7 @@ class SharedMemorySink(Sink):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                pid = int.from_bytes(head[_WRITER_PID_AT : _WRITER_PID_AT + _WORD], "little")
+                (pid,) = struct.unpack_from("<Q", head, offsets_of(HEADER)["writer_pid"])
                 raise SinkError(f"{self._path} is written by process {pid}: end it, or choose another name") from error
             os.pwrite(descriptor, bytes(_WORD), HEARTBEAT_AT)  # for readers that still look at it
             self._unlink(descriptor)

@@ -15,16 +15,11 @@ from edge.terminal.text_wrap import drawn, rewritable
 from firmware_bridge.errors import harmless
 from firmware_bridge.schedule import SHOWN_AT_REST_S, SHOWN_SILENT_S
 
-REFRESH_S: Final = 0.1
 CLEAR_TO_END: Final = "\x1b[K"
-FIRST_HINT_S: Final = 5.0
-"""Time without a scan before the first hint, in [s]; the next hints come after twice, four times, ... as long."""
 ALL_DETAILS: Final = 4  # levels of detail of the line: 4 has all of it, 0 only what a person must act on
 _COUNTED: Final = ("dropped", "overruns", "torn_wire", "unwritten", "poses", "poses_refused", "poses_dropped")
 """Counters on the line. Of scans torn at the source, noise makes one in forty of a healthy sensor: not an alarm."""
 _SHORTER: Final = {"overruns": "overrun", "torn_wire": "torn"}
-_BETWEEN: Final = " | "
-_MORE: Final = " ..."
 
 
 class StatusSink(Sink):
@@ -77,7 +72,7 @@ class StatusSink(Sink):
 
     def _refresh(self) -> None:
         now_s = self._clock_s()
-        if self._terminal and (self._last_shown_s is None or now_s - self._last_shown_s >= REFRESH_S):
+        if self._terminal and (self._last_shown_s is None or now_s - self._last_shown_s >= 0.1):
             self._last_shown_s = now_s
             self._show()
 
@@ -98,9 +93,9 @@ class StatusSink(Sink):
             line = self.line(details)
         if len(line) <= columns:
             return line
-        room = max(columns - len(_MORE), 0)
-        ends = [line.rfind(between, 0, room + len(between)) for between in (_BETWEEN, " ")]
-        return (line[: next((end for end in ends if end > 0), 0)] + _MORE)[: max(columns, 0)]
+        room = max(columns - len(" ..."), 0)
+        ends = [line.rfind(between, 0, room + len(between)) for between in (" | ", " ")]
+        return (line[: next((end for end in ends if end > 0), 0)] + " ...")[: max(columns, 0)]
 
     def line(self, details: int = ALL_DETAILS) -> str:
         """Return the line, the most important part first."""
@@ -119,7 +114,7 @@ class StatusSink(Sink):
         if details == ALL_DETAILS:
             zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
             parts += [result.baseline_text() for result in zeroed]
-        return _BETWEEN.join(parts)
+        return " | ".join(parts)
 
     def _sensor_text(self, name: str, details: int) -> str:
         result = self._latest[name]
@@ -185,7 +180,7 @@ class MessageSink(Sink):
         self._first, self._hint = first, hint
         self._stream = sys.stderr if stream is None else stream
         self._clock_s, self._begun_s = clock_s, clock_s()
-        self._patience_s = FIRST_HINT_S
+        self._patience_s = 5.0  # before the first hint; the next ones come after twice, four times, ... as long
         self._doubted: set[str] = set()
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:

@@ -19,15 +19,13 @@ from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import RunFacts, Sink
-from edge.sinks.binary_message import pack
-from edge.sinks.json_encoding import CountersInTurn, event_record, record
+from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.sinks.json_encoding import CountersInTurn, event_record, pack, record
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:
     import zenoh
 
-PLACE: Final = "tcp/127.0.0.1:7447"  # endpoint of a router on this machine, at zenoh's usual port
 CLOSED: Final = {
     "mode": "peer",
     "listen/endpoints": [],
@@ -36,11 +34,6 @@ CLOSED: Final = {
     "transport/shared_memory/enabled": False,
 }
 """Settings that keep discovery and listening off unless a configuration turns them on; zenoh's defaults turn all on."""
-CLOSE_S: Final = 0.5
-_JSON: Final = "application/json"
-_PACKED: Final = "application/octet-stream"
-LIVE: Final = RunFacts(lossless=False)
-_REMEDY: Final = "expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or zenoh:KEY?config=FILE.json5"
 
 
 class ZenohSink(Sink):
@@ -50,7 +43,7 @@ class ZenohSink(Sink):
         zid: the session's id, which the time stamp of every message holds, too.
     """
 
-    def __init__(self, target: str, run: RunFacts = LIVE) -> None:
+    def __init__(self, target: str, run: RunFacts = NOW) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later."""
         self._target, self._source = target, run.source
         self._key, self._session = open_session(target)
@@ -61,7 +54,7 @@ class ZenohSink(Sink):
         self._congestion = zenoh.CongestionControl.BLOCK if run.lossless else zenoh.CongestionControl.DROP
         with opening():
             self.zid = str(self._session.zid())
-            self._events = self._publisher(f"{self._key}/event", _JSON)
+            self._events = self._publisher(f"{self._key}/event", "application/json")
             self._read = True  # until a result shows that there is no subscriber
             self._alive = self._session.liveliness().declare_token(f"{self._key}/alive/{self.zid}")
         self._publishers: dict[str, tuple[zenoh.Publisher, zenoh.Publisher]] = {}
@@ -90,9 +83,9 @@ class ZenohSink(Sink):
 
     def _declare(self, sensor: str) -> "tuple[zenoh.Publisher, zenoh.Publisher]":
         base = f"{self._key}/{chunks(sensor)}"
-        publishers = self._publisher(f"{base}/scan", _JSON), self._publisher(f"{base}/pattern", _PACKED)
-        self._publishers[sensor] = publishers
-        return publishers
+        scans = self._publisher(f"{base}/scan", "application/json")
+        self._publishers[sensor] = scans, self._publisher(f"{base}/pattern", "application/octet-stream")
+        return self._publishers[sensor]
 
     def _publisher(self, key: str, encoding: str) -> "zenoh.Publisher":
         return self._session.declare_publisher(key, encoding=encoding, congestion_control=self._congestion)
@@ -118,12 +111,15 @@ def parsed_target(target: str) -> tuple[str, dict[str, Any] | Path]:
         )
     name, _, value = option.partition("=")
     if not asked:
-        return key, {**CLOSED, "connect/endpoints": [PLACE]}
+        return key, {**CLOSED, "connect/endpoints": ["tcp/127.0.0.1:7447"]}  # of a router here, at zenoh's usual port
     if name == "connect" and all("/" in endpoint for endpoint in value.split(",")):
         return key, {**CLOSED, "connect/endpoints": value.split(",")}
     if name == "config" and value:
         return key, Path(value)
-    raise UsageError(f"zenoh:{target} has {option!r} after its key: {_REMEDY}")
+    raise UsageError(
+        f"zenoh:{target} has {option!r} after its key: expected zenoh:KEY, zenoh:KEY?connect=tcp/HOST:7447 or "
+        "zenoh:KEY?config=FILE.json5"
+    )
 
 
 def open_session(target: str) -> "tuple[str, zenoh.Session]":
@@ -149,7 +145,7 @@ def opening() -> Iterator[None]:
 
 
 def close_session(session: "zenoh.Session") -> None:
-    """End a session within CLOSE_S: a peer that stands still would delay zenoh for ten seconds."""
+    """End a session within half a second: a peer that stands still would delay zenoh for ten seconds."""
     import zenoh
 
     def close() -> None:
@@ -158,7 +154,7 @@ def close_session(session: "zenoh.Session") -> None:
 
     closing = threading.Thread(target=close, name="zenoh-close", daemon=True)
     closing.start()
-    closing.join(CLOSE_S)
+    closing.join(0.5)
 
 
 def _configured(configuration: dict[str, Any] | Path) -> "zenoh.Config":

@@ -18,6 +18,7 @@ import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from fcntl import ioctl
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -25,20 +26,10 @@ from urllib.parse import parse_qs
 
 from edge.errors import UsageError
 
-try:
-    from fcntl import ioctl
-except ImportError:
-    ioctl = None
-
 PAGE: Final = "/"
 SOCKET: Final = "/ws"
 SHORTEST_TOKEN: Final = 12
-REMEDY: Final = (
-    "open the address that edge-sr printed when it started, or name this one with --view-host; a proxy must send the "
-    "host and port of edge-sr as Host"
-)
 _HOST: Final = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w.-]+))(?::[0-9]*)?")
-_TOKEN: Final = re.compile(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}")
 
 
 class Refusal(NamedTuple):
@@ -68,7 +59,9 @@ class Access:
         """
         called = ", ".join(hosts) or "nothing"
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
-            return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {REMEDY}")
+            remedy = "open the address that edge-sr printed when it started, or name this one with --view-host"
+            proxies = "a proxy must send the host and port of edge-sr as Host"
+            return Refusal(HTTPStatus.FORBIDDEN, f"this server is not called {called}; {remedy}; {proxies}")
         place, _, query = path.partition("?")
         given = parse_qs(query)
         # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
@@ -130,7 +123,7 @@ def grant(host: str, name: str, token: str | None) -> Access:
 
     Raises UsageError where the token is too easy, or cannot be part of an address.
     """
-    if token is not None and not _TOKEN.fullmatch(token):
+    if token is not None and not re.fullmatch(rf"[A-Za-z0-9_-]{{{SHORTEST_TOKEN},200}}", token):
         expected = f"expected at least {SHORTEST_TOKEN} letters, digits, - or _"
         raise UsageError(f"a token of {len(token)} characters for the live page: {expected}, or leave it to be made")
     if token is None and not is_loopback(host):
@@ -161,10 +154,8 @@ def _same(given: str, token: str) -> bool:
     return hmac.compare_digest(given.encode(errors="surrogatepass"), token.encode())
 
 
-_SIOCGIFADDR: Final = 0x8915
 _REQUEST: Final = struct.Struct("16s4x4s232x")
 """The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses."""
-_IPV6: Final = Path("/proc/net/if_inet6")
 
 
 def own_addresses(host: str) -> list[str]:
@@ -180,15 +171,14 @@ def _ipv4() -> list[str]:
     found: list[str] = []
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
-            if ioctl is None:
-                break
-            with suppress(OSError):  # an interface without an IPv4 address
-                answer = ioctl(asked, _SIOCGIFADDR, _REQUEST.pack(name.encode(), bytes(4)))
+            with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
+                answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
                 found.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
     return found
 
 
 def _ipv6() -> list[str]:
     with suppress(OSError):
-        return [socket.inet_ntop(socket.AF_INET6, bytes.fromhex(line[:32])) for line in _IPV6.read_text().splitlines()]
+        lines = Path("/proc/net/if_inet6").read_text().splitlines()
+        return [socket.inet_ntop(socket.AF_INET6, bytes.fromhex(line[:32])) for line in lines]
     return []

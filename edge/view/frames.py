@@ -2,22 +2,19 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from edge.inference.contract import Contract
 from edge.mapping.sink import MapState
 from edge.perception.event import Event
-from edge.sinks.binary_message import pack
-from edge.sinks.json_encoding import event_record, record
+from edge.sinks.json_encoding import event_record, pack, record
 from edge.view.run_snapshot import MAX_FPS, Newest, NumberedEvent, Point, RunSnapshot
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import PlayerState
 from firmware_bridge.schedule import SENSOR_SILENT_NS
-
-VERSION: Final = 1
 
 
 class Run(NamedTuple):
@@ -129,7 +126,7 @@ def hello(run: Run, recording: Path | None) -> bytes:
     height, width = contract.pattern_shape
     header = {
         "kind": "hello",
-        "version": VERSION,
+        "version": 1,
         "run": run.id,
         "name": harmless(run.name),
         "source": run.kind,

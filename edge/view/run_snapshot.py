@@ -22,7 +22,6 @@ RECENT_SCANS: Final = 256
 EVENTS: Final = 20
 MAX_FPS: Final = 25  # most result frames a second of one sensor: more is not visible to the eye
 _PERIOD_NS: Final = round(1e9 / MAX_FPS)
-_POINT_NS: Final = round(TRACE_S / TRACE_POINTS * 1e9)
 
 
 class Point(NamedTuple):
@@ -147,7 +146,8 @@ class _Trace:
         point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n, shear)
         self._recent.append(point)
         past = self._past
-        if not past or time_ns // _POINT_NS != past[-1].time_ns // _POINT_NS:
+        step_ns = round(TRACE_S / TRACE_POINTS * 1e9)
+        if not past or time_ns // step_ns != past[-1].time_ns // step_ns:
             past.append(point)
         elif (result.force_counts or 0.0) > (past[-1].force_counts or 0.0):
             past[-1] = point  # the highest of its 50 ms, so that a short tap is seen, too

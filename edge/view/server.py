@@ -7,7 +7,6 @@ import asyncio
 import base64
 import contextlib
 import errno
-import gc
 import hashlib
 import secrets
 import socket
@@ -44,12 +43,9 @@ from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import Player
 
 FOLDER: Final = Path(__file__).with_name("page")
-STYLE_LINK: Final = b'<link rel="stylesheet" href="page.css">'
-SCRIPT_LINK: Final = b'<script type="module" src="page.js"></script>'
-KEY: Final = b'<meta name="edge-sr-key" content="">'
 SCRIPTS: Final = (
-    *("colour_map.js", "words.js", "link.js", "traces.js", "marks.js", "history.js", "contact_shape.js", "relief.js"),
-    *("overlay.js", "explain.js", "numbers.js", "limits.js", "sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
+    *("drawing.js", "numbers.js", "link.js", "history.js", "traces.js"),
+    *("sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
 )
 """Files of the script in the order in which they are joined, so that they share one scope."""
 
@@ -65,9 +61,9 @@ def load_page(key: str = "") -> Page:
     """Return the page, with its style, its script and its key inside: nothing else is fetched."""
     style, script = (FOLDER / "page.css").read_bytes(), page_script()
     body = (FOLDER / "page.html").read_bytes()
-    body = body.replace(STYLE_LINK, b"<style>\n%s</style>" % style)
-    body = body.replace(SCRIPT_LINK, b'<script type="module">%s</script>' % script)
-    body = body.replace(KEY, KEY.replace(b'""', b'"%s"' % key.encode()))
+    body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
+    body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
+    body = body.replace(b'name="edge-sr-key" content=""', b'name="edge-sr-key" content="%s"' % key.encode())
     headers = (
         ("Content-Type", "text/html; charset=utf-8"),
         ("Content-Length", str(len(body))),
@@ -95,13 +91,7 @@ def _policy(script: bytes) -> str:
 
 
 STATE_S: Final = 1.0
-TIDY_S: Final = 10.0
-TIDY_CONNECTIONS: Final = 64  # number of lost connections that are tidied up at once, without waiting for TIDY_S
 OPEN_S: Final = 5.0
-CLOSE_S: Final = 1.0
-END_S: Final = 0.5  # longest wait for viewers to read that the run has ended, in [s]
-COMMAND_PAUSE_S: Final = 0.02
-"""Pause between two commands of a viewer, in [s], so that a viewer that never stops asking does not delay the loop."""
 
 
 class Server:
@@ -132,7 +122,7 @@ class Server:
         self._socket = _listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
-        self._connections = Connections(self._look_round)
+        self._connections = Connections()
         self._viewers: dict[ServerConnection, AttendedViewer] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
@@ -191,17 +181,15 @@ class Server:
             server_header=None,
             open_timeout=OPEN_S,
             ping_interval=None,
-            close_timeout=CLOSE_S,
+            close_timeout=1.0,
             max_size=LONGEST_BYTES,
         ) as server:
             ready.set()
             sent: tuple[object, ...] = ()
-            sent_s = tidied_s = 0.0
-            closing = False  # connections that were still closing when the others were tidied up
+            sent_s = 0.0
             while not self._ending:
                 with contextlib.suppress(TimeoutError):
-                    waits = self._viewers or self._connections.gone or closing
-                    async with asyncio.timeout(STATE_S if waits else None):
+                    async with asyncio.timeout(STATE_S if self._viewers else None):
                         await self._news.wait()
                 self._news.clear()
                 frames = Frames(self._snapshot, time.monotonic_ns(), self._source)
@@ -216,19 +204,10 @@ class Server:
                     broadcast(
                         self._viewers, state(recording, len(self._viewers), silent, played, self._recorder.recorded)
                     )
-                gone = self._connections.gone
-                if gone >= TIDY_CONNECTIONS or ((gone or closing) and now_s - tidied_s >= TIDY_S):
-                    self._connections.gone, tidied_s, closing = 0, now_s, gone > 0
-                    _tidy()
                 for viewer in self._viewers.values():
                     viewer.send(frames, now_s)
             server.close(code=CloseCode.GOING_AWAY, reason="the run has ended")
-            self._loop.call_later(END_S, self._connections.abort)
-
-    def _look_round(self) -> None:
-        """Wake the server when a first connection has gone, to start its time, and when many have, to tidy at once."""
-        if self._connections.gone in (1, TIDY_CONNECTIONS):
-            self._news.set()
+            self._loop.call_later(0.5, self._connections.abort)  # of viewers that do not read that the run has ended
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         headers = request.headers
@@ -265,18 +244,12 @@ class Server:
                         self._news.set()
                     if why is not None:
                         broadcast([connection], refused(time.monotonic_ns(), why, self._source))
-                    await asyncio.sleep(COMMAND_PAUSE_S)
+                    await asyncio.sleep(0.02)  # so that who never stops asking does not delay the loop
             finally:
                 del self._viewers[connection]
                 self._watched = bool(self._viewers)
                 pinging.cancel()
                 self._news.set()
-
-
-def _tidy() -> None:
-    """Collect the garbage of lost connections, since the collector is off while the loop runs."""
-    if not gc.isenabled():
-        gc.collect()
 
 
 def _listen(host: str, port: int) -> socket.socket:

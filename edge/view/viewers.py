@@ -6,9 +6,9 @@ read take memory.
 
 import asyncio
 import contextlib
+import gc
 import math
 import time
-from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any, ClassVar, Final
 
@@ -25,23 +25,18 @@ from firmware_bridge.links.replay_player import Player
 MOST_VIEWERS: Final = 16
 MOST_CONNECTIONS: Final = 64
 """Most connections of viewers, of browsers that fetch the page, and of clients that are silent for OPEN_S."""
-MOST_BYTES: Final = 1 << 14
-"""Most bytes from one connection in PACE_S: a browser's request with its cookies, or some hundred commands."""
-PACE_S: Final = 1.0
 _GET: Final = b"GET "
 
 
+TIDY_S: Final = 10.0
+_TIDY_CONNECTIONS: Final = 64
+
+
 class Connections:
-    """All connections. Viewers keep their places; of all others the oldest makes room for the newest.
+    """All connections. Viewers keep their places; of all others the oldest makes room for the newest."""
 
-    Attributes:
-        gone: connections lost since this was last set to 0.
-    """
-
-    def __init__(self, lost: Callable[[], object]) -> None:
-        """Begin without a connection; `lost` is called after each that is lost."""
-        self.gone = 0
-        self._lost = lost
+    def __init__(self) -> None:
+        self._gone = 0  # since the last tidying up
         self._all: dict[Connection, None] = {}  # in order of arrival
         self._granted: set[Connection] = set()
 
@@ -69,8 +64,15 @@ class Connections:
         """Count one connection less."""
         self._all.pop(connection, None)
         self._granted.discard(connection)
-        self.gone += 1
-        self._lost()
+        self._gone += 1
+        if self._gone in (1, _TIDY_CONNECTIONS):
+            connection.loop.call_later(TIDY_S if self._gone == 1 else 0, self._tidy)
+
+    def _tidy(self) -> None:
+        """Collect the garbage of lost connections, since the collector is off while the loop runs."""
+        if self._gone and not gc.isenabled():
+            gc.collect()
+        self._gone = 0
 
 
 class Connection(ServerConnection):
@@ -94,10 +96,10 @@ class Connection(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Pass on the data, unless it is too much or no request for a page."""
         now_s = self.loop.time()
-        if now_s - self._since_s >= PACE_S:
+        if now_s - self._since_s >= 1.0:
             self._since_s, self._taken_bytes = now_s, 0
         self._taken_bytes += len(data)
-        if self._taken_bytes > MOST_BYTES:
+        if self._taken_bytes > 1 << 14:  # in a second: a browser's request with its cookies, or some hundred commands
             self.transport.abort()
             return
         if self._head is not None:
@@ -114,7 +116,6 @@ class Connection(ServerConnection):
         self._head = None
 
 
-PING_S: Final = 0.25
 LATE_S: Final = 0.5
 """Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 GONE_S: Final = 10.0
@@ -185,7 +186,7 @@ class AttendedViewer(Viewer):
                     self._connection.transport.abort()  # a regular close would wait for the viewer to read
                     return
                 self._asked_s = None
-                await asyncio.sleep(PING_S)
+                await asyncio.sleep(0.25)
 
 
 def execute(message: str | bytes, viewer: Viewer, commands: Commands, player: Player | None = None) -> str | None:

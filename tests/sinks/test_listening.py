@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from edge_samples import ROOT
+from edge_samples import ROOT, ended
 
 LISTENING = "0A"
 LOOPBACK = ("0100007F", "00000000000000000000000001000000")
@@ -50,24 +50,12 @@ def reachable(process_id: int) -> list[str]:
     return found
 
 
-def reachable_of_a_demo(*listeners: str) -> list[str]:
-    command = [sys.executable, "-c", RUN, *listeners]
+def test_a_running_demo_can_be_reached_only_where_the_test_opened_a_socket_itself():
+    """Planted sockets show that those of the demo would be seen."""
+    command = [sys.executable, "-c", RUN, "tcp", "0.0.0.0", "tcp", "127.0.0.1", "udp", "0.0.0.0"]
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as demo:
-        try:
-            assert demo.stdout.readline().startswith(b"{"), "the demo says nothing"
-            return reachable(demo.pid)
-        finally:
-            demo.terminate()
-            demo.stdout.close()
-
-
-def test_a_running_demo_can_be_reached_by_nobody():
-    assert reachable_of_a_demo() == []
-
-
-def test_and_those_that_could_would_be_seen():
-    found = reachable_of_a_demo("tcp", "0.0.0.0", "tcp", "127.0.0.1", "udp", "0.0.0.0")
+    with ended(subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)) as demo:
+        assert demo.stdout.readline().startswith(b"{"), "the demo says nothing"
+        found = reachable(demo.pid)
     assert sorted(one.partition(" ")[0] for one in found) == ["tcp", "udp"]

@@ -1,28 +1,27 @@
-"""Poses over zenoh and ROS 2, from publishers in processes of their own, and their geometry and time."""
+"""Poses over zenoh and ROS 2, and their geometry and time."""
 
 import json
 import math
-import os
-import subprocess
-import sys
 import time
 from math import cos, radians, sin
 
 import numpy as np
 import pytest
+
+pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+
 from bridge_samples import make_recording
 from cli_samples import base_options, files, records, start
-from edge_samples import BASELINE, ROOT, FakeModel, make_scan
+from edge_samples import BASELINE, FakeModel, make_scan, wait_for
 
 from edge.api import Runtime, UsageError
 from edge.pipeline.pose_queue import PoseError, PoseIntake, PoseQueue
 from edge.pose_sources.open_poses import check_poses, open_poses
-from edge.pose_sources.stamped_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
+from edge.pose_sources.ros2_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
 __all__ = ["files"]
-PATIENCE_S = 20
 DOWN = {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}
 
 
@@ -49,12 +48,8 @@ class TestForms:
 
 def until(queue, satisfied, act=lambda: None):
     """Act until the poses that came suffice, and return all of them."""
-    poses, end_s = [], time.monotonic() + PATIENCE_S
-    while not satisfied(poses):
-        assert time.monotonic() < end_s, f"{len(poses)} poses came"
-        act()
-        time.sleep(0.01)
-        poses += queue.take()
+    poses = []
+    wait_for(lambda: act() or poses.extend(queue.take()) or satisfied(poses), within_s=20)
     return poses
 
 
@@ -69,43 +64,26 @@ def used(poses, sensor, time_ns):
 
 
 class TestZenoh:
-    PUBLISH = """
-import json, sys, zenoh
-config = zenoh.Config()
-config.insert_json5("listen/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-with zenoh.open(config) as session:
-    print("ready", flush=True)
-    for line in sys.stdin:
-        key, text = json.loads(line)
-        session.put(key, text)
-"""
-
     @pytest.fixture
     def publisher(self):
         pytest.importorskip("zenoh")
-        from zenoh_samples import ENVIRONMENT, free_endpoint
+        from zenoh_samples import free_endpoint, listening
 
         endpoint = free_endpoint()
-        how = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
-        with subprocess.Popen([sys.executable, "-c", self.PUBLISH, endpoint], **how) as process:
-            assert process.stdout.readline() == "ready\n"
+        with listening(endpoint) as session:
+            yield endpoint, session.put
 
-            def put(key, text):
-                process.stdin.write(json.dumps([key, text]) + "\n")
-                process.stdin.flush()
-
-            yield endpoint, put
-            process.stdin.close()
-
-    def test_poses_of_another_process_come_to_the_runtime(self, publisher):
+    def test_poses_of_another_session_come_to_the_runtime(self, publisher):
         endpoint, put = publisher
         queue = PoseQueue()
         source = open_poses(f"4=zenoh:arm/pose?connect={endpoint}", queue)
         numbers = iter(range(10**6))
-        place = lambda: put("arm/pose", json.dumps({"x_mm": next(numbers), "y_mm": -2, "turn_deg": 3}))  # noqa: E731
         before_ns = time.monotonic_ns()
-        poses = until(queue, lambda poses: len(poses) >= 5, place)
+        poses = until(
+            queue,
+            lambda poses: len(poses) >= 5,
+            lambda: put("arm/pose", json.dumps({"x_mm": next(numbers), "y_mm": -2, "turn_deg": 3})),
+        )
         after_ns = time.monotonic_ns()
         assert all(before_ns < one.time_ns < after_ns for one in poses)
         assert {one.sensor for one in poses} == {"4"}
@@ -131,33 +109,29 @@ with zenoh.open(config) as session:
         source.close()
 
 
-class TestRos2:
-    POSE, UNCERTAIN = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-    TRANSFORM = "geometry_msgs/msg/TransformStamped"
+POSE, UNCERTAIN = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 
+
+def header(at_ns=None):
+    sec, nanosec = divmod(time.time_ns() if at_ns is None else at_ns, 10**9)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "base"}
+
+
+def pose_at(x_m, y_m, orientation=DOWN):
+    return {"position": {"x": x_m, "y": y_m, "z": 0.3}, "orientation": orientation}
+
+
+class TestRos2:
     @pytest.fixture
     def publish(self):
-        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
-        from ros2_samples import ENVIRONMENT, LISTENERS_CONFIGURATION, PYTHONPATH
+        from ros2_samples import Speaker
 
-        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION, "PYTHONPATH": PYTHONPATH}
-        command = [sys.executable, str(ROOT / "tests/support/ros2_pose_writer.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
-        topics = [["arm/pose", kind] for kind in (self.POSE, self.UNCERTAIN, self.TRANSFORM)]
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        with subprocess.Popen([*command, json.dumps(topics)], env=environment, text=True, **pipes) as process:
-            assert process.stdout.readline() == "ready\n"  # else stamps would be old when they are published
-
-            def put(topic, kind, message):
-                assert process.poll() is None
-                process.stdin.write(json.dumps([topic, kind, message]) + "\n")
-                process.stdin.flush()
-
-            yield put
-            process.stdin.close()
+        with Speaker(*(("arm/pose", kind) for kind in (POSE, UNCERTAIN, TRANSFORM))) as speaker:
+            yield lambda kind, message: speaker.say("arm/pose", kind, message)
 
     @pytest.fixture
     def opened(self, monkeypatch):
-        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
         from ros2_samples import ENVIRONMENT
 
         for name, value in ENVIRONMENT.items():
@@ -172,26 +146,13 @@ class TestRos2:
         for source in sources:
             source.close()
 
-    def header(self, frame="base", at_ns=None):
-        sec, nanosec = divmod(time.time_ns() if at_ns is None else at_ns, 10**9)
-        return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
-
-    def pose(self, x_m, y_m):
-        return {"position": {"x": x_m, "y": y_m, "z": 0.3}, "orientation": DOWN}
-
-    def transform(self, parent, child, x_m, y_m, rotation):
-        place = {"x": x_m, "y": y_m, "z": 0.0}
-        moved = {"translation": place, "rotation": rotation}
-        return {"header": self.header(parent), "child_frame_id": child, "transform": moved}
-
     def test_a_pose_with_its_stamp_comes_to_the_runtime(self, opened, publish):
         queue = opened("4=ros2:/arm/pose")
         sent = []
 
         def act():
-            place = self.pose(0.001 * len(sent), -0.5)
             sent.append(time.time_ns() - 20_000_000)  # measured 20 ms ago
-            publish("arm/pose", self.POSE, {"header": self.header(at_ns=sent[-1]), "pose": place})
+            publish(POSE, {"header": header(sent[-1]), "pose": pose_at(0.001 * (len(sent) - 1), -0.5)})
 
         offset_ns = time.time_ns() - time.monotonic_ns()
 
@@ -208,11 +169,12 @@ class TestRos2:
         covariance = [0.0] * 36
         covariance[0] = covariance[7] = 1e-6
         covariance[35] = 0.0004
+        moved = {"translation": {"x": 0.25, "y": 0.5, "z": 0.0}, "rotation": DOWN}
 
         def act():
-            pose = {"pose": self.pose(0.001, 0.002), "covariance": covariance}
-            publish("arm/pose", self.UNCERTAIN, {"header": self.header(), "pose": pose})
-            publish("arm/pose", self.TRANSFORM, self.transform("base", "pad", 0.25, 0.5, DOWN))
+            pose = {"pose": pose_at(0.001, 0.002), "covariance": covariance}
+            publish(UNCERTAIN, {"header": header(), "pose": pose})
+            publish(TRANSFORM, {"header": header(), "child_frame_id": "pad", "transform": moved})
 
         poses = until(queue, lambda poses: {1.0, 250.0} <= {one.pose.x_mm for one in poses}, act)
         errors = {one.pose.x_mm: (one.pose.error_mm, one.pose.error_deg) for one in poses}
@@ -220,12 +182,12 @@ class TestRos2:
 
     def test_a_tilted_pad_and_clocks_that_differ_are_reported(self, opened, publish):
         queue = opened("ros2:arm/pose")
-        tilted = self.pose(0, 0) | {"orientation": {"x": 0.9, "y": 0.0, "z": 0.0, "w": 0.19**0.5}}
+        tilted = {"x": 0.9, "y": 0.0, "z": 0.0, "w": 0.19**0.5}
         old_ns = time.time_ns() - 3600 * 10**9
 
         def act():
-            publish("arm/pose", self.POSE, {"header": self.header(), "pose": tilted})
-            publish("arm/pose", self.POSE, {"header": self.header(at_ns=old_ns), "pose": self.pose(0, 0)})
+            publish(POSE, {"header": header(), "pose": pose_at(0, 0, tilted)})
+            publish(POSE, {"header": header(old_ns), "pose": pose_at(0, 0)})
 
         poses = until(queue, lambda poses: len(poses) >= 2 and queue.refused >= 2, act)
         now_ns = time.monotonic_ns()
@@ -233,8 +195,7 @@ class TestRos2:
         reasons = queue.take_reasons()
         assert "tilted" in reasons["tilt"] and "3.6e+03 s behind" in reasons["clock"]
 
-    def test_a_program_counts_them(self, opened, publish, files, monkeypatch):
-        pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
+    def test_a_program_counts_them(self, opened, publish, files):
         opened("ros2:unused")  # sets the environment
         options = [*base_options(files), "--duration-s", "2", "--poses", "4=ros2:/arm/pose", "--sink", "jsonl:-"]
         with (
@@ -244,8 +205,7 @@ class TestRos2:
             lines = []
             for line in process.stdout:
                 lines.append(line)
-                pose = {"header": self.header(), "pose": self.pose(0.001 * len(lines), 0)}
-                publish("arm/pose", self.POSE, pose)
+                publish(POSE, {"header": header(), "pose": pose_at(0.001 * len(lines), 0)})
             err = process.stderr.read()
             assert process.wait() == 0, err
         # The first ones may have waited for the program, and then be refused as out of order.

@@ -12,7 +12,7 @@ from ros2_samples import ENVIRONMENT, Listener, Speaker, contact, keep_published
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
-from edge_samples import make_contract, make_wrench_result
+from edge_samples import make_contract, make_wrench_result, wait_for
 
 from edge.api import Command, Commands, Event
 from edge.pipeline.sink import RunFacts
@@ -26,7 +26,7 @@ from firmware_bridge.scans.scan import VendorReading
 from firmware_bridge.sensor_file.model import PadFrame
 
 __all__ = ["sink"]
-IMAGE, WRENCH = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped"
+IMAGE, WRENCH, STRING = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped", "std_msgs/msg/String"
 CLOUD, FLOAT, FRAMES = "sensor_msgs/msg/PointCloud2", "std_msgs/msg/Float64", "tf2_msgs/msg/TFMessage"
 TOPICS = {
     "skin/s4/taxels": IMAGE,
@@ -34,13 +34,13 @@ TOPICS = {
     "skin/s4/deviation": IMAGE,
     "skin/s4/points": CLOUD,
     "skin/s4/wrench": WRENCH,
-    "skin/s4/state": "std_msgs/msg/String",
+    "skin/s4/state": STRING,
     "skin/s4/trusted": "std_msgs/msg/Int8",
     "skin/s4/area_m2": FLOAT,
     "skin/s4/centroid": "geometry_msgs/msg/PointStamped",
     "skin/left/s4/pattern": IMAGE,
     "skin/left/s4/wrench": WRENCH,
-    "skin/events": "std_msgs/msg/String",
+    "skin/events": STRING,
     "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 
@@ -254,15 +254,17 @@ def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back()
         asked.extend(commands.poll())
         return command in asked
 
-    for topic, word, command in (
-        ("skin/zero", "left", Command("zero", "left")),
-        ("skin/zero", "", Command("zero")),
-        ("skin/reset", "", Command("reset")),
-    ):
-        with Speaker(topic, word) as speaker:
-            speaker.until(lambda command=command: waits_for(command))
-    with Speaker("skin/zero", "a\nb") as speaker:
-        speaker.until(lambda: commands.poll() or commands.refused)
+    topics = [("skin/zero", STRING), ("skin/reset", STRING)]
+    with Speaker(*topics) as speaker:
+        for topic, word, command in (
+            ("skin/zero", "left", Command("zero", "left")),
+            ("skin/zero", "", Command("zero")),
+            ("skin/reset", "", Command("reset")),
+        ):
+            said = topic, STRING, {"data": word}
+            wait_for(lambda said=said, command=command: speaker.say(*said) or waits_for(command))
+        said = "skin/zero", STRING, {"data": "a\nb"}
+        wait_for(lambda: speaker.say(*said) or waits_for(None) or commands.refused)
     sink.close()
     assert commands.poll() == [], "asked of a sink that is closed"
 

@@ -146,37 +146,31 @@ def test_every_sensor_has_topics_of_its_own_that_ros_can_hold(one, other):
     assert (topics[0] == topics[1]) == (one == other)
 
 
-@pytest.mark.parametrize(
-    ("sensor", "topic"),
-    [("4", "s4"), ("left/4", "left/s4"), ("left_1", "left_1"), ("s4", "x_7334"), ("x_1", "x_785f31"), ("/", "x_0/x_0")],
-)
-def test_sensors_names_as_topics(sensor, topic):
-    assert sensor_topic("skin", sensor, "pattern") == f"skin/{topic}/pattern"
-
-
-def test_names_that_ros_cannot_hold_are_refused():
+def test_sensors_names_as_topics_and_names_that_ros_cannot_hold():
+    names = {"4": "s4", "left/4": "left/s4", "left_1": "left_1", "s4": "x_7334", "x_1": "x_785f31", "/": "x_0/x_0"}
+    assert {sensor: sensor_topic("skin", sensor, "p") for sensor in names} == {
+        sensor: f"skin/{topic}/p" for sensor, topic in names.items()
+    }
     assert base_topic("/gripper/skin_1") == "gripper/skin_1"
     with pytest.raises(SinkError, match=rf"ROS holds {LONGEST_TOPIC - 1}: name sensor"):
-        sensor_topic("skin", "ä" * 64, "pattern")
+        sensor_topic("skin", "\u00e4" * 64, "pattern")
+
+
+NONSENSE = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
 
 
 @pytest.mark.parametrize(
-    ("environment", "said"),
+    ("environment", "error", "said"),
     [
-        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
-        ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID is '233'"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, r"is OFF, which hides edge-sr from other nodes"),
+        ({"ROS_DOMAIN_ID": "-1"}, UsageError, r"ROS_DOMAIN_ID is '-1', expected a whole number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "233"}, UsageError, r"ROS_DOMAIN_ID is '233'"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "off"}, UsageError, r"is OFF, which hides edge-sr from other nodes"),
+        ({"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": NONSENSE}, SinkError, r"cannot join DDS domain 7 .*CYCLONEDDS_URI"),
     ],
 )
-def test_an_environment_that_ros_would_not_take_is_refused(environment, said):
-    with pytest.raises(UsageError, match=said):
+def test_an_environment_that_ros_would_not_take_is_refused(environment, error, said):
+    with pytest.raises(error, match=said):
         Ros2Sink("skin", environment)
-
-
-def test_a_configuration_that_is_none_is_told(capfd):
-    with pytest.raises(SinkError, match=r"cannot join DDS domain 7 .*CYCLONEDDS_URI"):
-        nonsense = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
-        Ros2Sink("skin", {"ROS_DOMAIN_ID": "7", "CYCLONEDDS_URI": nonsense})
 
 
 def test_without_the_package_one_line_says_how_to_get_it():

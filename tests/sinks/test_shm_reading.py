@@ -68,21 +68,20 @@ class TestReading:
         half = latest(memory, "4")
         assert half is not None and fields(half)["scan"] == 2 and len(copies) == 3
 
-    def test_broken_memory_is_given_up(self, sink, name):
-        sink.write(make_result(), {})
-        with Path("/dev/shm", name).open("r+b") as file:
-            file.seek(192 + 64 + 13696 + 500)
-            file.write(b"\xff")
-        assert latest(attach(name), "4") is None
-
-    def test_a_half_that_is_being_written_hides_nothing(self, sink, name):
-        """A writer killed half-way leaves the newest whole value."""
+    @pytest.mark.parametrize(
+        ("at", "broken", "scan"),
+        [
+            (192 + 64 + 13696 + 500, 1, None),  # in the newest half
+            (192 + 64, 5000, 5),  # of a writer that was killed half-way in the other: the newest whole value stays
+        ],
+    )
+    def test_broken_memory_is_given_up_and_hides_nothing_that_is_whole(self, sink, name, at, broken, scan):
         sink.write(make_result(5), {})
-        with Path("/dev/shm", name).open("r+b") as file:  # of sequence 2
-            file.seek(192 + 64)
-            file.write(b"\xff" * 5000)
+        with Path("/dev/shm", name).open("r+b") as file:
+            file.seek(at)
+            file.write(b"\xff" * broken)
         half = latest(attach(name), "4")
-        assert half is not None and fields(half)["scan"] == 5
+        assert (half and fields(half)["scan"]) == scan
 
     def test_only_what_is_young_and_of_a_device_is_acted_on(self, sink, name):
         memory, now_ns = attach(name), time.monotonic_ns()

@@ -22,9 +22,9 @@ from test_listening import reachable
 from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts, listening, make_results
 
 from edge.api import Event, SinkError
+from edge.cli.main import main
 from edge.pipeline.sink import RunFacts
-from edge.sinks.binary_message import unpack
-from edge.sinks.json_encoding import event_record, record
+from edge.sinks.json_encoding import event_record, record, unpack
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.stop_signals import EXIT_FORCED
@@ -74,26 +74,36 @@ class TestMessages:
             for name, values in maps.items():
                 np.testing.assert_array_equal(got[name], values)
 
-    def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path):
+    def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path, capsys):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
-        write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
-        command = [sys.executable, "-m", "edge.cli.main", "--source", f"replay:{tmp_path}/free.csv", "--rate-hz", "100"]
-        command += ["--model", str(model), "--sink", f"zenoh:grip?connect={endpoint}"]
+        path = write_recording(tmp_path / "free.csv", np.stack([make_scan(n, noise=2).counts for n in range(150)]))
+        source = ["--source", f"replay:{path}", "--rate-hz", "100", "--model", str(model)]
         with listening(endpoint):
-            done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
+            assert main([*source, "--sink", f"zenoh:grip?connect={endpoint}"]) == 0
         why = f"nobody subscribes to zenoh:grip?connect={endpoint}: check its reader, or the router"
-        assert done.returncode == 0 and f"edge-sr: {why}\n" in done.stderr and f"\nsinks: {why}\n" in done.stderr
+        told = capsys.readouterr().err
+        assert f"edge-sr: {why}\n" in told and f"\nsinks: {why}\n" in told
 
-    @pytest.mark.parametrize("sensor", ["4", "left/4", "/4", "a//b", "a*?#$b", "%2F", "@left", "右 手"])
-    def test_every_name_of_a_sensor_makes_a_key_and_is_told(self, sensor):
-        part = chunks(sensor)
-        assert unquote(part) == sensor
-        key = zenoh.KeyExpr(f"grip/{part}/scan")
-        assert zenoh.KeyExpr("grip/**").includes(key) and not set("*$#?") & set(part)
-
-    def test_different_names_make_different_keys(self):
-        names = ["a//b", "a/b", "a%2F%2Fb", "a%2Fb", "/a/b", "a b", "a%20b", "event", "alive"]
-        assert len({chunks(name) for name in names}) == len(names)
+    def test_every_name_of_a_sensor_makes_a_key_of_its_own_and_is_told(self):
+        names = [
+            "4",
+            "left/4",
+            "/4",
+            "a//b",
+            "a/b",
+            "a%2F%2Fb",
+            "a%2Fb",
+            "a*?#$b",
+            "%2F",
+            "@left",
+            "a b",
+            "a%20b",
+            "右",
+        ]
+        parts = [chunks(name) for name in names]
+        assert list(map(unquote, parts)) == names and len(set(parts)) == len(names)
+        for part in parts:
+            assert zenoh.KeyExpr("grip/**").includes(zenoh.KeyExpr(f"grip/{part}/scan")) and not set("*$#?") & set(part)
 
 
 class TestWhoComesAndGoes:
@@ -112,7 +122,7 @@ class TestWhoComesAndGoes:
 
     def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
         consumer, result = consume(endpoint), make_results(2)[1]
-        sink = ZenohSink(f"grip?connect={endpoint}")
+        sink = ZenohSink(f"grip?connect={endpoint}", RunFacts(lossless=False))
         wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
         consumer.process.send_signal(signal.SIGSTOP)
         for number in range(1000):  # 15 MB, more than sockets and queues hold
@@ -135,33 +145,28 @@ class TestWhoComesAndGoes:
             writer.kill()
             assert consumer.next()[0] == "went"
 
-    def test_the_example_tells_patterns_events_and_grippers(self, endpoint):
+    @pytest.mark.parametrize("reader_goes", [True, False])
+    def test_the_example_tells_what_comes_and_ends_quietly_with_its_reader_and_with_ctrl_c(self, endpoint, reader_goes):
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)) as listener:
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
             assert listener.stdout.readline() == "listens\n"
             sink, (free, pressed) = ZenohSink(f"grip/left?connect={endpoint}"), make_results(2)
             wait_for(lambda: sink.write(free, {}) or sink.trouble is None)
             sink.write(pressed, {})
             sink.tell(Event(5, "lost", None, "the cable is out"), {})
             lines = {listener.stdout.readline() for _ in range(3)}
-            sink.close()
-            lines.add(listener.stdout.readline())
-        alive = f"grip/left/alive/{sink.zid}"
-        pattern = "4 emulated scan 1: 3000.0 counts, 3.000 mm at most\n"
-        assert lines == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
-
-    @pytest.mark.parametrize("reader_goes", [True, False])
-    def test_the_example_ends_quietly_with_its_reader_and_with_ctrl_c(self, endpoint, reader_goes):
-        command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
-        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
-            assert listener.stdout.readline() == "listens\n"
             if reader_goes:
-                listener.stdout.close()
-                ZenohSink(f"grip/left?connect={endpoint}").close()  # its arrival is what would be reported
+                listener.stdout.close()  # that the sink goes is what would be reported
+                sink.close()
             else:
+                sink.close()
+                lines.add(listener.stdout.readline())
                 listener.send_signal(signal.SIGINT)
             assert (listener.stderr.read(), listener.wait(60)) == ("", 0)
+        alive = f"grip/left/alive/{sink.zid}"
+        pattern = "4 emulated scan 1: 3000.0 counts, 3.000 mm at most\n"
+        assert lines | {f"{alive} went\n"} == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
 
 
 class TestOpening:
@@ -184,26 +189,22 @@ class TestOpening:
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
 class TestListening:
-    def opened(self, target):
-        """Return the sockets that such a sink opens to more than this machine."""
+    @pytest.mark.parametrize(
+        ("configuration", "protocol"),
+        [
+            (None, None),
+            ("{connect: {endpoints: ['tcp/127.0.0.1:1']}}", None),
+            ("{listen: {endpoints: ['tcp/0.0.0.0:0']}}", "tcp"),
+            ("{scouting: {multicast: {enabled: true}}}", "udp"),
+        ],
+    )
+    def test_nobody_can_reach_it_unless_a_configuration_says_so(self, tmp_path, configuration, protocol):
+        (tmp_path / "zenoh.json5").write_text(configuration or "")
         before = reachable(os.getpid())
-        sink = ZenohSink(target)
-        after = reachable(os.getpid())
+        sink = ZenohSink("grip" if configuration is None else f"grip?config={tmp_path}/zenoh.json5")
+        opened = {one.split()[0] for one in reachable(os.getpid()) if one not in before}
         sink.close()
-        return [one for one in after if one not in before]
-
-    def test_nobody_can_reach_it_unless_a_configuration_says_so(self, tmp_path):
-        assert self.opened("grip") == []
-        config = tmp_path / "zenoh.json5"
-        config.write_text("{connect: {endpoints: ['tcp/127.0.0.1:1']}}")
-        assert self.opened(f"grip?config={config}") == []
-
-    def test_and_one_that_says_so_is_obeyed(self, tmp_path):
-        config = tmp_path / "zenoh.json5"
-        config.write_text("{listen: {endpoints: ['tcp/0.0.0.0:0']}}")
-        assert [one.split()[0] for one in self.opened(f"grip?config={config}")] == ["tcp"]
-        config.write_text("{scouting: {multicast: {enabled: true}}}")
-        assert "udp" in {one.split()[0] for one in self.opened(f"grip?config={config}")}
+        assert protocol in opened if protocol else not opened
 
 
 @pytest.mark.parametrize("by_file", [False, True])

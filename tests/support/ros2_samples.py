@@ -119,26 +119,24 @@ class Listener:
 
 
 class Speaker:
-    """A node that says a word on a topic until it is heard."""
+    """A node that publishes on topics, given by their names and types, with types made of ROS's definitions."""
 
-    def __init__(self, topic, word):
+    def __init__(self, *topics):
         self._domain, self._participant = ros2_domain.join(ENVIRONMENT)
-        kind: Any = ros2_messages.dds_type("std_msgs/msg/String")
-        self._writer = DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), CDR)
-        self._message = kind(data=word)
+        self._writers = {}
+        for topic, name in topics:
+            kind: Any = ros2_messages.dds_type(name)
+            writer = DataWriter(self._participant, Topic(self._participant, f"rt/{topic}", kind), CDR)
+            self._writers[topic, name] = writer
 
-    def until(self, satisfied):
-        end_s = time.monotonic() + PATIENCE_S
-        while not satisfied():
-            assert time.monotonic() < end_s
-            self._writer.write(self._message)
-            time.sleep(0.01)
+    def say(self, topic, name, message):
+        self._writers[topic, name].write(ros2_messages.built(name, message))
 
     def __enter__(self):
         return self
 
     def __exit__(self, *exc_info):
-        del self._writer, self._participant, self._domain
+        del self._writers, self._participant, self._domain
 
 
 @pytest.fixture

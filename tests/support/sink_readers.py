@@ -185,7 +185,7 @@ class Zenoh(Opened):
         self._consumer.stop()
 
     def results(self) -> list[Back]:
-        from edge.sinks.binary_message import unpack
+        from edge.sinks.json_encoding import unpack
 
         heard = self._heard
         packed = [unpack(data) for key, *_, data in heard if key.endswith("/pattern")]

@@ -19,7 +19,7 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
-from edge.sinks.binary_message import unpack
+from edge.sinks.json_encoding import unpack
 from edge.sinks.registry import open_sink
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose

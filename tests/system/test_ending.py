@@ -20,7 +20,7 @@ from view_samples import HANDSHAKE, LONG_PING, Swallowing
 from websockets.sync.client import connect
 
 from edge.cli import main as cli
-from edge.sinks.binary_message import unpack
+from edge.sinks.json_encoding import unpack
 from edge.terminal.stop_signals import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}

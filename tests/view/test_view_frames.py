@@ -10,8 +10,7 @@ from edge_samples import PERIOD_NS
 from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
-from edge.sinks.binary_message import unpack
-from edge.sinks.json_encoding import event_record, record
+from edge.sinks.json_encoding import event_record, record, unpack
 from edge.view.frames import Frames, Run, hello, state
 from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
 from edge.view.viewers import Viewer

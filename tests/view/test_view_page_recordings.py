@@ -1,12 +1,10 @@
-"""The live page of the demo, of a recording and of a hand, and the pictures that are taken of it."""
+"""The live page of the demo, of a recording and of a hand."""
 
 import contextlib
 import csv
-import importlib.util
 import json
 import re
 import signal
-import struct
 
 import numpy as np
 from bridge_samples import write_recording
@@ -40,10 +38,9 @@ from browser_samples import (
     then_held,
     word,
 )
-from edge_samples import ROOT, wait_for
+from edge_samples import wait_for
 from websockets.sync.client import connect
 
-from edge.terminal.progress_bar import Progress
 from edge.view.server import MOST_VIEWERS
 
 __all__ = ["browser", "demo", "folder", "open_page"]
@@ -262,24 +259,6 @@ def check_saved(page):
     rows = list(csv.DictReader(files[name.replace(".npz", ".csv")].read_text().splitlines()[1:]))
     table = [float(row["value"]) for row in rows if row["map"] == "pattern"]
     np.testing.assert_allclose(np.reshape(table, (40, 40)), pattern, rtol=1e-5)
-
-
-def test_the_pictures_of_the_pages_can_still_be_taken(browser, tmp_path, capsys):
-    """One of those of docs/live_pictures.py, without its waiting for the last tap."""
-    spec = importlib.util.spec_from_file_location("live_pictures", ROOT / "docs" / "live_pictures.py")
-    pictures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(pictures)
-    pictures.PICTURES = tmp_path
-    counts = pictures.held_demo()
-    with pictures.emulator(tmp_path, counts) as bus, pictures.live_page(bus.port) as (_, url):
-        page = pictures.look(browser, url, pictures.PHONE, "dark")
-        page.locator('[data-number="taps_used"]').first.wait_for()
-        with Progress("pictures", 1, "picture") as bar:
-            pictures.keep(page, "phone", bar)
-        page.close()
-    taken = (tmp_path / "live-phone.png").read_bytes()
-    assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
-    assert capsys.readouterr().out.startswith(f"{tmp_path}/live-phone.png: ")
 
 
 HAND = ("4", "6", "8", "10")

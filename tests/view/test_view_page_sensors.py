@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -35,15 +37,17 @@ from browser_samples import (
     then_held,
     word,
 )
-from edge_samples import wait_for
+from edge_samples import ROOT, wait_for
 
+from edge.terminal.progress_bar import Progress
 from firmware_bridge.recording.formats import load_recording
+
+sys.path.append(str(ROOT / "docs"))
+import live_pictures as pictures
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 
-RECONNECTS = 50
-FIRST_RECONNECTS = 15
-"""Reconnects after which all that is made once exists."""
+RECONNECTS, FIRST_RECONNECTS = 30, 10  # after the first, all that is made once exists
 
 # Unknown to the page's own program, its sockets are counted but not kept, and its waits are shortened.
 WATCH_SOCKETS = """
@@ -102,7 +106,7 @@ def held(demo, folder):
         yield run
 
 
-def test_a_held_pad_is_shown_measured_and_recorded(held, open_page):
+def test_a_held_pad_is_shown_measured_and_recorded(held, open_page, tmp_path):
     page = open_page(held.url)
     live(page)
     word(page, "contact")
@@ -220,6 +224,13 @@ def test_a_held_pad_is_shown_measured_and_recorded(held, open_page):
     fits(page, *PHONE)
     field = part(page, "field").bounding_box()
     assert field["width"] > 330 and field["y"] + field["height"] < page.locator("#keys").bounding_box()["y"]
+
+    # The pictures of the pages can still be taken.
+    assert pictures.held_demo().shape[1:] == pictures.magnet_near().shape[1:] == (3, 4, 4)
+    pictures.PICTURES = tmp_path
+    pictures.keep(page, "phone", Progress("pictures", 1, "picture"))
+    taken = (tmp_path / "live-phone.png").read_bytes()
+    assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
 
 
 def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
@@ -366,7 +377,6 @@ def test_two_sensors_are_zeroed_forced_and_lost(demo, folder, open_page):
         logged(other, "earlier taps forgotten")
         painted(page)  # after all that it has sent is known here
         assert sent == [{"cmd": "reset"}]
-        zero(page, "6", page.locator("#zero").click)
 
         for name, text in (("scale", "idle"), ("pause", "paused")):  # a pause makes no old pattern look new
             page.locator(f"#{name}").click()

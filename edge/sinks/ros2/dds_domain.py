@@ -19,10 +19,7 @@ from cyclonedds.topic import Topic
 from edge.errors import SinkError, UsageError
 from firmware_bridge.recording.cdr import Field, MessageType
 
-LARGEST_DOMAIN: Final = 232  # largest domain number that still has ports
 _LOOPBACK: Final = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
-# The default lets each writer wait a second at its end for a reader that has stopped.
-_QUICK_END: Final = "<Internal><WriterLingerDuration>100ms</WriterLingerDuration></Internal>"
 # Fast DDS 3, under ROS's default middleware, describes a sequence of bytes in a way that Cyclone DDS takes for no type,
 # and images reached no such node. Names of types, and ROS's hashes of them, are compared as before.
 _FAST_DDS: Final = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # its vendor id
@@ -44,8 +41,8 @@ _OPEN: WeakValueDictionary[int, Domain] = WeakValueDictionary()
 def domain_id(environment: Mapping[str, str]) -> int:
     """Return ROS_DOMAIN_ID, 0 by default."""
     text = environment.get("ROS_DOMAIN_ID") or "0"
-    if not (text.isascii() and text.isdigit() and int(text) <= LARGEST_DOMAIN):
-        raise UsageError(f"ROS_DOMAIN_ID is {text!r}, expected a whole number from 0 to {LARGEST_DOMAIN}")
+    if not (text.isascii() and text.isdigit() and int(text) <= 232):  # the largest that still has ports
+        raise UsageError(f"ROS_DOMAIN_ID is {text!r}, expected a whole number from 0 to 232")
     return int(text)
 
 
@@ -66,7 +63,9 @@ def configuration(environment: Mapping[str, str]) -> str:
     if peers:  # peers are tried on the ports of so many participants of a machine, the number that ROS takes
         auto = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
         discovery = f"{auto}<Peers>{discovery}</Peers>"
-    parts = f"<General>{general}</General><Discovery>{discovery}</Discovery>{_FAST_DDS}{_QUICK_END}"
+    # The default lets each writer wait a second at its end for a reader that has stopped.
+    quick_end = "<Internal><WriterLingerDuration>100ms</WriterLingerDuration></Internal>"
+    parts = f"<General>{general}</General><Discovery>{discovery}</Discovery>{_FAST_DDS}{quick_end}"
     wanted = f"<CycloneDDS><Domain>{parts}</Domain></CycloneDDS>"
     return ",".join(filter(None, (wanted, environment.get("CYCLONEDDS_URI", ""))))
 
@@ -74,9 +73,7 @@ def configuration(environment: Mapping[str, str]) -> str:
 def join(environment: Mapping[str, str]) -> tuple[Domain | None, DomainParticipant]:
     """Take part in the domain (None where this process had opened it otherwise), until nothing holds the two objects.
 
-    Raises:
-        UsageError: a variable of the environment has a value that cannot be used.
-        SinkError: the domain cannot be joined.
+    Raises a UsageError where a variable of the environment cannot be used, a SinkError where the domain is not joined.
     """
     number, wanted = domain_id(environment), configuration(environment)
     domain = _OPEN.get(number)

@@ -55,17 +55,16 @@ def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
     )
 
 
-def image_map(data: bytes) -> NDArray[np.float32]:
-    """Return the map (H, W) in an Image that `image` made.
+def image_map(data: bytes | memoryview) -> NDArray[np.float32]:
+    """Return the map (H, W) in an Image that `image` made, or (3, H, W) of an earlier release's traction.
 
-    Raises:
-        CdrError: it is not an Image.
-        ValueError: the Image is of another encoding or byte order.
+    Raises a CdrError where it is no Image, a ValueError where that is of another encoding or byte order.
     """
     image = IMAGE.decode(data)
-    if image["encoding"] != "32FC1" or image["is_bigendian"]:
+    if image["encoding"] not in ("32FC1", "32FC3") or image["is_bigendian"]:
         raise ValueError(f"an image of encoding {image['encoding'][:20]!r}, expected 32FC1, little-endian")
-    return image["data"].view("<f4").reshape(image["height"], image["width"])
+    values = image["data"].view("<f4").reshape(image["height"], image["width"], -1)
+    return values[..., 0] if image["encoding"] == "32FC1" else values.transpose(2, 0, 1)
 
 
 def taxels(scan: Scan) -> NDArray[np.float32]:

@@ -43,8 +43,6 @@ from edge.sinks.ros2.map_messages import image, in_si, points, taxels
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
-DIAGNOSTICS_S: Final = 1.0
-_EVENTS_KEPT: Final = 100
 _COMMANDS_KEPT: Final = 16
 _OUTAGES: Final = ("lost", "silent")
 NUMBERS: Final[Mapping[str, Callable[[Result], float | None]]] = {
@@ -99,7 +97,7 @@ class Ros2Sink(Sink):
         self._diagnosed_ns = clock_ns()
         self._domain, self._participant = join(environment)
         self._diagnostics = writer(self._participant, "diagnostics", DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
-        self._events = writer(self._participant, f"{self._base}/events", STRING, _EVENTS_KEPT)
+        self._events = writer(self._participant, f"{self._base}/events", STRING, depth=100)
         self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if run.frames else None
         self._asked = None if run.commands is None else self._subscribed(run.commands)
 
@@ -145,8 +143,8 @@ class Ros2Sink(Sink):
         self.wait()
 
     def wait(self) -> None:
-        """Publish the diagnostics where they are due, also while no scan comes."""
-        if self._clock_ns() - self._diagnosed_ns >= DIAGNOSTICS_S * 1e9:
+        """Publish the diagnostics once a second, also while no scan comes."""
+        if self._clock_ns() - self._diagnosed_ns >= 1e9:
             self._diagnose()
 
     def close(self) -> None:

@@ -85,11 +85,7 @@ const hand = {
     pad.querySelector(".link").dataset.up = sensor.comes() ? "yes" : "no";
     const doubt = sensor.doubted() ? `; ${sensor.verdict()}` : "";
     pad.setAttribute("aria-label", `sensor ${sensor.name}: ${word}${doubt}`);
-    const canvas = pad.querySelector("canvas");
-    if (sensor.pattern === null) return canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
-    const [rows, cols] = sensor.pattern.shape;
-    const high = Math.max(...[...page.sensors.values()].map((one) => one.high()));
-    return paintMap(canvas, sensor.pattern.values, rows, cols, high, VIRIDIS);
+    paintMap(pad.querySelector("canvas"), sensor.pattern, Math.max(...[...page.sensors.values()].map((one) => one.high())), VIRIDIS);
   },
 };
 

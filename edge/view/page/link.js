@@ -22,7 +22,7 @@ function takeToken() {
 
 // ---- Frames ----
 
-/** Unpack a frame of the program (edge/sinks/binary_message.py): {header, maps by name}. */
+/** Unpack a frame of the program (edge/sinks/json_encoding.py): {header, maps by name}. */
 function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -41,10 +41,6 @@ function unpack(buffer) {
 const SILENT_S = 2.5; // the program sends a frame every second
 const WAITS_S = [0.25, 0.5, 1, 2, 4];
 const VERSION = 1;
-const GOING_AWAY = 1001; // the run has ended
-const REFUSED = [403, 503]; // access refused; too many viewers
-const GRANTED = 426; // the answer to a plain request where a socket is granted
-const LOST_SOCKETS = 3; // so many in a row are not chance, as where the program begins between a socket and a request
 
 class Link {
   constructor({ onFrame, onChange }) {
@@ -86,7 +82,7 @@ class Link {
     if (socket !== this.socket) return;
     socket.onmessage = socket.onclose = null;
     this.socket = null;
-    if (this.up) this.ended = code === GOING_AWAY;
+    if (this.up) this.ended = code === 1001; // "going away": the run has ended
     else this.inquire();
     this.up = false;
     const wait = WAITS_S[Math.min(this.tries++, WAITS_S.length - 1)];
@@ -103,9 +99,10 @@ class Link {
     try {
       const answer = await fetch(address, { signal: AbortSignal.timeout(1000 * SILENT_S) });
       const plain = answer.headers.get("Content-Type")?.startsWith("text/plain");
-      if (REFUSED.includes(answer.status) && plain) why = (await answer.text()).trim();
-      else if (answer.status !== GRANTED) why = `${location.host} answers ${answer.status} for ${address.pathname}, and not edge-sr`;
-      else if (this.tries >= LOST_SOCKETS) why = "something between does not pass the socket on: a proxy must send HTTP/1.1 with the headers Upgrade and Connection";
+      if ([403, 503].includes(answer.status) && plain) why = (await answer.text()).trim(); // access refused; too many viewers
+      else if (answer.status !== 426) why = `${location.host} answers ${answer.status} for ${address.pathname}, and not edge-sr`;
+      // A plain request is answered by 426 where a socket is granted. One lost may be chance, as where the program has just begun.
+      else if (this.tries >= 3) why = "something between does not pass the socket on: a proxy must send HTTP/1.1 with the headers Upgrade and Connection";
     } catch { /* no server answers */ }
     if (this.up || why === this.why) return;
     this.why = why;

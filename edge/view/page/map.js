@@ -1,8 +1,5 @@
 // ---- The map of the object, larger than the pad ----
 
-const MAP_MARKS = { doubted: [200, 40, 30], nothing: [0, 0, 0, 0] };
-const PATTERN_COUNTS = [["doubted", "not believed"], ["light", "too light"], ["outside", "outside the map"], ["without_pose", "without a pose"], ["together", "of two pads at one place"]];
-
 class MapPane {
   constructor() {
     Object.assign(this, { header: null, shown: null, contact: null, doubted: null, dirty: false });
@@ -42,7 +39,8 @@ class MapPane {
     const { pixels, counts } = this.header;
     this.paintContact(byId("map-contact"), pixels);
     paintBar(byId("map-bar"), VIRIDIS);
-    const left = PATTERN_COUNTS.filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
+    const fates = { doubted: "not believed", light: "too light", outside: "outside the map", without_pose: "without a pose", together: "of two pads at one place" };
+    const left = Object.entries(fates).filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
     const mark = page.hello?.source === "emulated" ? "EMULATED: " : "";
     say(byId("map-counts"), `${mark}${[`${counts.fused} patterns`, ...left].join(", ")}`);
     show(byId("map-empty"), counts.fused === 0);
@@ -54,14 +52,11 @@ class MapPane {
     if (canvas.width !== count) [canvas.width, canvas.height] = [count, count];
     const context = canvas.getContext("2d");
     const image = context.createImageData(count, count);
-    const { data } = image;
-    for (let pixel = 0, to = 0; pixel < count * count; pixel++, to += 4) {
-      if (Number.isNaN(this.contact[pixel])) {
-        data.set(this.doubted[pixel] > 0 ? [...MAP_MARKS.doubted, 255] : MAP_MARKS.nothing, to);
-        continue;
-      }
+    for (let pixel = 0; pixel < count * count; pixel++) {
+      const unknown = Number.isNaN(this.contact[pixel]);
+      if (unknown && !(this.doubted[pixel] > 0)) continue; // transparent
       const at = 3 * level(this.contact[pixel], 1);
-      [data[to], data[to + 1], data[to + 2], data[to + 3]] = [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255];
+      image.data.set(unknown ? [200, 40, 30, 255] : [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255], 4 * pixel);
     }
     context.putImageData(image, 0, 0);
   }

@@ -107,7 +107,7 @@ function savePng(sensor, moment) {
   const mark = source === "device" ? "" : `${source.toUpperCase()}: `;
   context.fillText(`${mark}sensor ${record.sensor}, scan ${record.scan}: ${record.state}`, edge, 34, size);
   context.font = '15px system-ui, "DejaVu Sans", sans-serif';
-  const numbers = ["force", "area", "centroid_mm", "interval_mm"].map((key) => `${key.replace(/_mm$/, "")} ${sensor.fields[key].textContent}`);
+  const numbers = ["force", "area", "centroid_mm", "interval_mm"].map((key) => `${key.replace(/_mm$/, "")} ${sensor.fields[key].element.textContent}`);
   context.fillText(`0 to ${sensor.part["pattern-high"].textContent}; ${there ? sensor.part["pattern-most"].textContent : "no pattern"}`, edge, tall + 90, size);
   context.fillText(numbers.join(", "), edge, tall + 112, size);
   context.fillText(`model ${record.model}, ${new Date().toISOString()}`, edge, tall + 134, size);

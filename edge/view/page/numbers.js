@@ -1,85 +1,179 @@
+// ---- Words and numbers ----
+
+const THIN = "\u202f";
+const MINUS = "\u2212";
+
+const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
+const number = (value, digits = 0) => value.toFixed(digits).replace(/^-(?=.*[1-9])/, MINUS).replace(/^-/, "");
+const amount = (value, digits, unit) => (known(value) ? `${number(value, digits)}${THIN}${unit}` : "\u2013");
+/** Return the largest value; Math.max would get more arguments than a call may have. */
+function largest(values, least = 0) {
+  let most = least;
+  for (const value of values) if (value > most) most = value;
+  return most;
+}
+
+const short = (value) => String(Number(value.toPrecision(3))).replace("-", MINUS);
+
+/** Return the next larger number that is easy to read on a scale. */
+function roundUp(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return power * [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((factor) => factor * power >= value * (1 - 1e-9));
+}
+
+function duration(seconds) {
+  if (!known(seconds)) return "unknown";
+  if (seconds < 100) return `${Math.floor(seconds)}${THIN}s`;
+  return seconds < 6000 ? `${Math.floor(seconds / 60)}${THIN}min` : `${Math.floor(seconds / 3600)}${THIN}h`;
+}
+
+const ago = (seconds) => (seconds < 1 ? "a moment ago" : `${duration(seconds)} ago`);
+
+function say(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+function show(element, shown) {
+  if (element.hidden === shown) element.hidden = !shown;
+}
+
+const byId = (id) => document.getElementById(id);
+const nowS = () => performance.now() / 1000;
+const style = getComputedStyle(document.documentElement);
+const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+
 // ---- Numbers of a sensor ----
 
-const NUMBERS = {
-  Contact: [
-    ["force", "force", "big"], ["area", "area", "big"], ["centre", "centroid_mm"], ["size", "ellipse"], ["long axis", "axis"], ["taps used", "taps_used"], ["another tap", "another_tap"],
-    ["next tap", "next_tap"],
-  ],
-  Wrench: [
-    ["force x y z", "wrench_force"], ["torque x y", "wrench_torque"], ["twist", "wrench_twist"], ["pressure centre", "centre_of_pressure_mm"],
-    ["sensitivity", "wrench_origin"],
-  ],
-  Uncertainty: [
-    ["to be believed", "trusted"], ["mismatch", "mismatch"], ["tap mismatch", "tap_mismatch"], ["90 % within", "interval_mm"],
-    ["expected RMSE", "expected_rmse_mm"], ["gains", "gains_certainty"],
-  ],
-  Timing: [["rate", "rate_hz"], ["run time", "run_time_us"], ["latency", "latency_us"], ["pattern", "reused_from"], ["model", "model"]],
-  Losses: [["dropped", "dropped"], ["missed", "missed"], ["late", "late"], ["torn on the wire", "torn_wire"], ["unwritten", "unwritten"]],
-  Baseline: [["id", "baseline"], ["origin", "baseline_origin"], ["age", "baseline_age_s"], ["drift x y z", "drift"], ["taxel, step", "own"]],
-};
-const LOSS_SHARE = 0.01; // of the scans: fewer losses, as in the first second of a run, are no reason to worry
-const LOSSES = new Set(["dropped", "missed", "late", "torn_wire", "unwritten"]);
-const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand", recording: "this recording", unsure: "this recording, maybe held" };
 const TOO_LIGHT = "too light to check";
-
-/** Return the texts of the numbers by which a pattern is believed or not; `checks`: whether the model has any. */
-function trustTexts({ state, trusted, untrusted_reason: reason, mismatch, tap_mismatch: taps }, checks) {
-  const unknown = state !== "contact" ? "\u2013" : checks ? TOO_LIGHT : "not checked";
-  return {
-    trusted: trusted === true ? "yes" : trusted === false ? `no: ${reason}` : unknown,
-    mismatch: percent(mismatch),
-    tap_mismatch: taps?.length ? taps.map((share) => number(share, 2)).join(", ") : "\u2013",
-  };
-}
+const ORIGINS = { "start-up": "start-up", file: "file", demand: "on demand", recording: "this recording", unsure: "this recording, maybe held" };
+const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");
 
 /** Return where to touch next, in words for the pad as it is drawn. */
 function nextTapText(next) {
   if (!next) return "\u2013";
   const ways = [[next.dx_mm, "left", "right"], [next.dy_mm, "up", "down"]].filter(([mm]) => mm !== 0);
-  const moves = ways.map(([mm, less, more]) => `${amount(Math.abs(mm), 1, "mm")} ${mm < 0 ? less : more}`);
-  return moves.join(", ");
+  return ways.map(([mm, less, more]) => `${amount(Math.abs(mm), 1, "mm")} ${mm < 0 ? less : more}`).join(", ");
 }
 
-function wrenchTexts({ wrench, wrench_origin: origin }) {
-  const list = (values, decimals, unit) => (values ? `${values.map((value) => number(value, decimals)).join(", ")}${THIN}${unit}` : "\u2013");
-  return {
-    wrench_force: list(wrench?.force_n, 2, "N"),
-    wrench_torque: list(wrench?.torque_n_mm.slice(0, 2), 1, "N\u00a0mm"),
-    wrench_twist: amount(wrench?.torque_n_mm[2], 1, "N\u00a0mm"),
-    centre_of_pressure_mm: list(wrench?.centre_of_pressure_mm, 1, "mm"),
-    wrench_origin: origin ?? "\u2013",
-  };
+function trustText({ state, trusted, untrusted_reason: reason }) {
+  if (trusted === true || trusted === false) return trusted ? "yes" : `no: ${reason}`;
+  return state !== "contact" ? "\u2013" : page.hello.checks ? TOO_LIGHT : "not checked";
 }
 
-/** Return the texts of a sensor's numbers, without losses, by key. */
-function numberTexts(sensor) {
-  const { result, hello } = sensor;
-  const made = sensor.made();
-  const drift = result.drift_counts;
-  const ellipse = made.state === "contact" && made.trusted !== false && sensor.newest() ? sensor.ellipse() : null;
-  return {
-    force: sensor.part["force-now"].textContent,
-    area: sensor.part["area-now"].textContent,
-    centroid_mm: made.centroid_mm ? `${made.centroid_mm.map((mm) => number(mm, 1)).join(", ")}${THIN}mm` : "\u2013",
-    ellipse: ellipseText(ellipse),
-    axis: axisText(ellipse),
-    ...wrenchTexts(made),
-    ...trustTexts(made, hello.checks),
-    taps_used: made.taps_used ? `${made.taps_used} of ${hello.taps}` : "\u2013",
-    another_tap: made.another_tap === true ? "would help" : made.another_tap === false ? "would not help" : "\u2013",
-    next_tap: nextTapText(result.next_tap),
-    interval_mm: known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013",
-    expected_rmse_mm: amount(made.expected_rmse_mm, 4, "mm"),
-    gains_certainty: known(result.gains_certainty) ? `${number(100 * result.gains_certainty, 0)}${THIN}% certain` : "not known",
-    reused_from: sensor.live() ? (known(made.reused_from) ? "unchanged" : "new") : "\u2013",
-    rate_hz: amount(result.rate_hz, 1, "Hz"),
-    run_time_us: amount(made.run_time_us, 0, "\u00b5s"),
-    latency_us: amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms"),
-    model: result.model ?? "\u2013",
-    baseline: result.baseline ?? "none",
-    baseline_origin: ORIGINS[result.baseline_origin] ?? result.baseline_origin ?? "\u2013",
-    baseline_age_s: result.baseline === null ? "\u2013" : duration(result.baseline_age_s),
-    drift: drift ? `${drift.common.map((counts) => number(counts, 1)).join(" ")}` : "\u2013",
-    own: drift ? `${number(drift.own, 1)}, ${number(drift.step, 0)} counts` : "\u2013",
-  };
+/**
+ * Numbers by group: label, key, what it means, and its text, made of the newest result, of that of the pattern shown
+ * (`made`), of the contact's ellipse and of the sensor. Those without a text are losses, which are counted.
+ */
+const NUMBERS = {
+  Contact: [
+    ["force", "force", "Force into the pad: z of all taxels over the baseline, in counts; in newtons where the sensor's counts per newton are known.",
+      ({ sensor }) => sensor.part["force-now"].textContent],
+    ["area", "area", "Area of the touched pixels: those near enough to the pattern's largest value, by the model's own share.",
+      ({ sensor }) => sensor.part["area-now"].textContent],
+    ["centre", "centroid_mm", "Centre of the touched area, weighted by depth: x to the right, y down, from the pad's centre.",
+      ({ made }) => list(made.centroid_mm, 1, "mm")],
+    ["size", "ellipse", "Length and width of the ellipse that has the moments of the touched pixels.",
+      ({ ellipse }) => (ellipse === null ? "\u2013" : `${number(2 * ellipse.halves[0], 1)} \u00d7 ${number(2 * ellipse.halves[1], 1)}${THIN}mm`)],
+    ["long axis", "axis", "Direction of the ellipse's long axis, from x to the right towards y down; round if it is hardly longer than wide.",
+      ({ ellipse }) => (ellipse === null ? "\u2013" : isRound(ellipse) ? "round" : `${number(ellipse.turn)}\u00b0`)],
+    ["taps used", "taps_used", "Taps that the pattern was made of, and the most that the model takes.",
+      ({ made }) => (made.taps_used ? `${made.taps_used} of ${page.hello.taps}` : "\u2013")],
+    ["another tap", "another_tap", "Whether one more tap is expected to make the error smaller.",
+      ({ made }) => ({ true: "would help", false: "would not help" })[made.another_tap] ?? "\u2013"],
+    ["next tap", "next_tap", "Where to touch next: half a pitch from the taps so far.", ({ result }) => nextTapText(result.next_tap)],
+  ],
+  Wrench: [
+    ["force x y z", "wrench_force", "Force on the pad along x, y and z, as the model integrates it.", ({ made }) => list(made.wrench?.force_n, 2, "N")],
+    ["torque x y", "wrench_torque", "Torque about x and y at the pad's centre.", ({ made }) => list(made.wrench?.torque_n_mm.slice(0, 2), 1, "N\u00a0mm")],
+    ["twist", "wrench_twist", "Torque about the pad's normal.", ({ made }) => amount(made.wrench?.torque_n_mm[2], 1, "N\u00a0mm")],
+    ["pressure centre", "centre_of_pressure_mm", "Point where the normal force acts; the ring on the pattern. Its line is the path of the last five seconds.",
+      ({ made }) => list(made.wrench?.centre_of_pressure_mm, 1, "mm")],
+    ["sensitivity", "wrench_origin", "Where the force scale comes from: nominal is that of the average sensor.", ({ made }) => made.wrench_origin ?? "\u2013"],
+  ],
+  Uncertainty: [
+    ["to be believed", "trusted", "Whether the readings fit the pattern; one that is not checked, or a pattern that is not to be believed must not be acted on.",
+      ({ made }) => trustText(made)],
+    ["mismatch", "mismatch", "Share of the readings that the pattern does not explain.",
+      ({ made }) => amount(known(made.mismatch) ? 100 * made.mismatch : null, 1, "%")],
+    ["tap mismatch", "tap_mismatch", "The same for each earlier tap, against the newest one.",
+      ({ made }) => made.tap_mismatch?.map((share) => number(share, 2)).join(", ") || "\u2013"],
+    ["90 % within", "interval_mm", "Nine of ten pixels are expected within this distance of the truth.",
+      ({ made }) => (known(made.interval_mm) ? `\u00b1 ${amount(made.interval_mm, 3, "mm")}` : "\u2013")],
+    ["expected RMSE", "expected_rmse_mm", "Error of the pattern that the model itself expects.", ({ made }) => amount(made.expected_rmse_mm, 4, "mm")],
+    ["gains", "gains_certainty", "How well the gains of this sensor's taxels are known.",
+      ({ result }) => (known(result.gains_certainty) ? `${number(100 * result.gains_certainty)}${THIN}% certain` : "not known")],
+  ],
+  Timing: [
+    ["rate", "rate_hz", "Scans a second from the sensor.", ({ result }) => amount(result.rate_hz, 1, "Hz")],
+    ["run time", "run_time_us", "Time of one inference.", ({ made }) => amount(made.run_time_us, 0, "\u00b5s")],
+    ["latency", "latency_us", "Time from the scan's last byte to its pattern; of a recording there is none.",
+      ({ made }) => amount(known(made.latency_us) ? made.latency_us / 1000 : null, 2, "ms")],
+    ["pattern", "reused_from", "Whether the pattern was made of this scan, or the scan changed too little to make another.",
+      ({ made, sensor }) => (sensor.live() ? (known(made.reused_from) ? "unchanged" : "new") : "\u2013")],
+    ["model", "model", "Network that makes the patterns.", ({ result }) => result.model ?? "\u2013"],
+  ],
+  Losses: [
+    ["dropped", "dropped", "Scans without a pattern, since a newer one was waiting. Their force is followed all the same."],
+    ["missed", "missed", "Scans that never came, by the sensor's own period."],
+    ["late", "late", "Patterns that were ready later than one scan period after their scan."],
+    ["torn on the wire", "torn_wire", "Scans of which a part did not arrive."],
+    ["unwritten", "unwritten", "Records that a slow disk or reader did not take."],
+  ],
+  Baseline: [
+    ["id", "baseline", "Short name of the zero that is subtracted.", ({ result }) => result.baseline ?? "none"],
+    ["origin", "baseline_origin", "Whether it was taken at the start, on demand, from this recording, or comes from a file.",
+      ({ result }) => ORIGINS[result.baseline_origin] ?? result.baseline_origin ?? "\u2013"],
+    ["age", "baseline_age_s", "Time since it was taken; unknown if the clock, or a recording, does not state it.",
+      ({ result }) => (result.baseline === null ? "\u2013" : duration(result.baseline_age_s))],
+    ["drift x y z", "drift", "Drift of the free pad since it was zeroed, mean of all taxels.",
+      ({ result }) => result.drift_counts?.common.map((counts) => number(counts, 1)).join(" ") ?? "\u2013"],
+    ["taxel, step", "own", "Largest drift of a single taxel, and the latest step of its rest level.",
+      ({ result: { drift_counts: drift } }) => (drift ? `${number(drift.own, 1)}, ${number(drift.step)} counts` : "\u2013")],
+  ],
+};
+
+// ---- Explanations: by the pointer, by the keyboard, or by a tap ----
+
+function explain(element, text) {
+  element.dataset.tip = text;
+  element.tabIndex = element.matches("dt:not(:first-child)") ? -1 : 0; // one stop of the tab key for a list, whose arrow keys go on
+  element.setAttribute("aria-description", text);
 }
+
+const tip = {
+  of: null,
+  show(element) {
+    const bubble = byId("tip");
+    this.of = element;
+    say(bubble, element.dataset.tip);
+    show(bubble, true);
+    const [box, own] = [element.getBoundingClientRect(), bubble.getBoundingClientRect()];
+    const below = box.bottom + 6 + own.height < innerHeight;
+    bubble.style.left = `${Math.max(8, Math.min(box.left, innerWidth - own.width - 8))}px`;
+    bubble.style.top = `${below ? box.bottom + 6 : Math.max(8, box.top - own.height - 6)}px`;
+  },
+  hide() { this.of = null; show(byId("tip"), false); },
+  listen() {
+    const about = (event) => event.target.closest?.("[data-tip]") ?? null;
+    document.addEventListener("pointerover", (event) => {
+      if (event.pointerType !== "mouse") return;
+      const element = about(event);
+      if (element !== null) this.show(element); else if (this.of !== null) this.hide();
+    });
+    document.addEventListener("click", (event) => {
+      const element = about(event);
+      if (element !== null) this.show(element); else this.hide();
+    });
+    document.addEventListener("focusin", (event) => { if (about(event) !== null && event.target.matches(":focus-visible")) this.show(about(event)); });
+    document.addEventListener("focusout", () => this.hide());
+    document.addEventListener("scroll", () => this.hide(), { passive: true });
+    document.addEventListener("keydown", (event) => {
+      if (event.key === "Escape") this.hide();
+      const terms = event.target.matches?.("dt") ? [...event.target.parentElement.querySelectorAll("dt")] : [];
+      const to = terms[terms.indexOf(event.target) + ({ ArrowDown: 1, ArrowUp: -1 }[event.key] ?? NaN)];
+      if (to === undefined) return;
+      event.preventDefault();
+      to.focus({ focusVisible: true });
+    });
+  },
+};

@@ -27,8 +27,6 @@ const painter = {
 
 // ---- The page ----
 
-const MOST_LINES = 100;
-const COUNTED = ["reset", "zeroing", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"]; // events that differ by numbers alone
 const REFUSAL_S = 10; // time for which a refusal is shown, and may be forced
 
 const page = {
@@ -75,7 +73,7 @@ function log(what, { key = what, bad = false, ageS = 0, again = false } = {}) {
   words.classList.toggle("bad", bad);
   line.append(document.createElement("span"));
   list.prepend(line);
-  while (list.children.length > MOST_LINES) list.lastChild.remove();
+  while (list.children.length > 100) list.lastChild.remove();
   if (bad) announce(what);
 }
 
@@ -144,7 +142,6 @@ const frameHandlers = {
     page.hello = header;
     document.documentElement.style.setProperty("--pad", `${header.cols} / ${header.rows}`);
     page.state.recording = header.recording;
-    for (const sensor of page.sensors.values()) sensor.hello = header;
     if (page.paused) page.link.send({ cmd: "pause", on: true });
   },
   result(header, maps, buffer) {
@@ -160,7 +157,8 @@ const frameHandlers = {
     if (number <= page.eventNumber) return; // a new connection, also a reconnect, gets the latest events again
     page.eventNumber = number ?? page.eventNumber; // the answer to this page alone has no number
     const refused = ["refused", "in_contact", "given_up"].includes(event);
-    const key = COUNTED.includes(event) ? `${event} ${sensor}` : note;
+    const byNumbers = ["reset", "zeroing", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"]; // differ by them alone
+    const key = byNumbers.includes(event) ? `${event} ${sensor}` : note;
     log(note, { key, bad: refused || ["lost", "silent", "trouble", "sink", "suspected", "baseline_doubted"].includes(event), ageS: age_s });
     if (refused && age_s < REFUSAL_S) refuse(note, event === "in_contact" ? sensor : null);
   },
@@ -199,7 +197,7 @@ function forgetRefusal() {
 function sensorOf(name) {
   if (!page.sensors.has(name)) {
     const later = [...page.sensors.values()].filter((other) => other.name.localeCompare(name, "en", { numeric: true }) > 0);
-    const sensor = new Sensor(name, page.hello);
+    const sensor = new Sensor(name);
     sensor.trace.hold(page.paused);
     const next = [...byId("sensors").children].find((root) => later.some((other) => other.root === root));
     byId("sensors").insertBefore(sensor.root, next ?? null);

@@ -4,9 +4,9 @@ const NOTHING = { result: null, receivedS: 0, pattern: null, deviation: null, to
 const SHOWN = Object.keys(NOTHING);
 
 class Sensor {
-  constructor(name, hello) {
-    Object.assign(this, { name, hello, result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, zeroed: null, taps: null, cursor: null });
-    Object.assign(this, { trace: new Trace(), history: new History(), path: new Path(), later: null, touched: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
+  constructor(name) {
+    Object.assign(this, NOTHING, { name, cursor: null, trace: new Trace(), history: new History(), path: new Path() });
+    Object.assign(this, { later: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
     this.part = Object.fromEntries([...root.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
@@ -29,19 +29,19 @@ class Sensor {
   addNumbers() {
     const fields = {};
     for (const [title, rows] of Object.entries(NUMBERS)) {
-      if (title === "Wrench" && !this.hello.wrench) continue;
+      if (title === "Wrench" && !page.hello.wrench) continue;
       const group = document.createElement("div");
       const heading = group.appendChild(document.createElement("h3"));
       heading.textContent = title;
       const list = group.appendChild(document.createElement("dl"));
-      for (const [label, key, size] of rows) {
+      for (const [label, key, meaning, text] of rows) {
         const term = list.appendChild(document.createElement("dt"));
-        const value = list.appendChild(document.createElement("dd"));
+        const element = list.appendChild(document.createElement("dd"));
         term.textContent = label;
-        explain(term, EXPLAIN[key]);
-        value.dataset.number = key;
-        if (size) { term.className = value.className = size; }
-        fields[key] = value;
+        explain(term, meaning);
+        element.dataset.number = key;
+        if (key === "force" || key === "area") term.className = element.className = "big";
+        fields[key] = { element, text };
       }
       this.part.numbers.append(group);
     }
@@ -125,7 +125,7 @@ class Sensor {
 
   // -- reading a pixel --
 
-  size() { return this.pattern?.shape ?? [this.hello.height, this.hello.width]; }
+  size() { return this.pattern?.shape ?? [page.hello.height, page.hello.width]; }
 
   point(x, y) {
     const [rows, cols] = this.size();
@@ -154,7 +154,7 @@ class Sensor {
   reading() {
     const [rows, cols] = this.size();
     const [row, col] = this.cursor;
-    const pitch = this.hello.pixel_pitch_mm;
+    const pitch = page.hello.pixel_pitch_mm;
     const place = `x ${number((col + 0.5 - cols / 2) * pitch, 1)}, y ${number((row + 0.5 - rows / 2) * pitch, 1)}${THIN}mm`;
     if (this.pattern === null) return `${place}: no pattern`;
     const unit = this.unit();
@@ -165,7 +165,7 @@ class Sensor {
 
   // -- state --
 
-  unit() { return this.result?.pattern_unit || this.hello.pattern_unit || "mm"; }
+  unit() { return this.result?.pattern_unit || page.hello.pattern_unit || "mm"; }
 
   ageS() { return nowS() - this.receivedS; }
   unsure() { return this.result?.state === "baseline_in_doubt"; }
@@ -181,7 +181,7 @@ class Sensor {
   /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
     if (this.pattern === null) return false;
-    return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < FRESH_S);
+    return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < 0.3);
   }
 
   live() { return page.atS === null && !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
@@ -199,10 +199,10 @@ class Sensor {
   verdict() {
     if (this.doubted()) return `not to be believed: ${this.touched.untrusted_text}`;
     if (this.pattern === null || this.touched.trusted !== null) return null;
-    return this.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
+    return page.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
   }
 
-  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, this.hello.pixel_pitch_mm, this.hello.contact_level); }
+  ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
 
   word() {
     if (page.atS !== null) return ["past", this.result === null ? "no scan then" : `${this.newest() && this.doubted() ? "contact, not believed" : this.result.state}, ${number(this.trace.newestS - page.atS, 1)}${THIN}s ago`];
@@ -238,7 +238,7 @@ class Sensor {
   paintWord() {
     const [state, word] = this.word();
     const { badge, why, zero } = this.part;
-    const source = this.result?.source ?? this.hello.source;
+    const source = this.result?.source ?? page.hello.source;
     if (this.part.word.dataset.state !== state) {
       announce(`sensor ${this.name}: ${word}`);
       this.part.word.dataset.state = state;
@@ -266,8 +266,8 @@ class Sensor {
   }
 
   high() {
-    const full = this.hello.full_scale || 1;
-    return page.auto ? Math.max(this.highest, LEAST_MM) : full;
+    const full = page.hello.full_scale || 1;
+    return page.auto ? Math.max(this.highest, 0.02) : full;
   }
 
   paintPattern() {
@@ -279,15 +279,9 @@ class Sensor {
     say(stamp, this.stampText());
     show(stamp, this.unsure() || (!live && !(page.atS !== null && this.newest())));
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
-    if (this.pattern !== null) {
-      const [rows, cols] = this.pattern.shape;
-      paintMap(pattern, this.pattern.values, rows, cols, high, VIRIDIS);
-      const most = largest(this.pattern.values);
-      say(this.part["pattern-most"], live || page.atS !== null ? `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}` : "");
-    } else {
-      pattern.getContext("2d").clearRect(0, 0, pattern.width, pattern.height);
-      say(this.part["pattern-most"], "");
-    }
+    paintMap(pattern, this.pattern, high, VIRIDIS);
+    const most = this.pattern !== null && (live || page.atS !== null) ? largest(this.pattern.values) : null;
+    say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
     const relief = page.relief && this.pattern !== null;
     field.classList.toggle("relief", relief);
     if (relief) paintRelief(this.part.relief, this.pattern, high, VIRIDIS);
@@ -316,7 +310,7 @@ class Sensor {
     show(dead, deaths.length > 0);
     say(dead, `dead, not used: ${deaths.map(([taxel, reason]) => `taxel ${taxel} ${reason}`).join(", ")}`);
     if (this.zeroed === null) {
-      taxels.getContext("2d").clearRect(0, 0, taxels.width, taxels.height);
+      paintMap(taxels, null);
       say(this.part["taxels-high"], "counts");
     } else {
       const [, rows, cols] = this.zeroed.shape;
@@ -324,44 +318,36 @@ class Sensor {
       const z = values.subarray(2 * count, 3 * count);
       const believed = Array.from(z, (value, taxel) => (this.result.dead?.[taxel] ? 0 : value));
       const high = roundUp(largest(believed, LEAST_COUNTS));
-      paintMap(taxels, z, rows, cols, high, CIVIDIS);
+      paintMap(taxels, { values: z, shape: [rows, cols] }, high, CIVIDIS);
       say(this.part["taxels-high"], `${short(high)}${THIN}counts`);
       if (width > 0) paintShear(this, context, width, height, rows, cols, values, high);
     }
-    const [rows, cols] = [this.hello.rows, this.hello.cols];
+    const [rows, cols] = [page.hello.rows, page.hello.cols];
     for (const [taxel] of deaths) cross(context, width, height, rows, cols, Number(taxel));
   }
 
   paintDeviation() {
     const { deviation } = this.part;
-    const field = this.part["deviation-field"];
-    const stamp = this.part["deviation-stamp"];
-    const there = this.deviation !== null;
+    const [field, stamp] = [this.part["deviation-field"], this.part["deviation-stamp"]];
     field.classList.toggle("old", this.old());
-    show(stamp, !there);
+    show(stamp, this.deviation === null);
     say(stamp, this.pattern !== null ? "not given by this model" : page.atS === null ? "no contact yet" : "no contact then");
-    if (!there) {
-      deviation.getContext("2d").clearRect(0, 0, deviation.width, deviation.height);
-      return say(this.part["deviation-high"], this.unit());
-    }
-    const [rows, cols] = this.deviation.shape;
-    const high = roundUp(largest(this.deviation.values, LEAST_DEVIATION_MM));
-    paintMap(deviation, this.deviation.values, rows, cols, high, MAGMA);
-    return say(this.part["deviation-high"], `${short(high)}${THIN}${this.unit()}`);
+    const high = this.deviation === null ? null : roundUp(largest(this.deviation.values, 0.01));
+    paintMap(deviation, this.deviation, high, MAGMA);
+    say(this.part["deviation-high"], high === null ? this.unit() : `${short(high)}${THIN}${this.unit()}`);
   }
 
   paintTaps() {
     const { thumbs } = this.part;
-    const slots = Math.max(this.hello.taps || 1, this.taps?.shape[0] ?? 0);
+    const slots = Math.max(page.hello.taps || 1, this.taps?.shape[0] ?? 0);
     while (thumbs.children.length > slots) thumbs.lastChild.remove();
     while (thumbs.children.length < slots) thumbs.append(thumb(thumbs.children.length));
-    const [there, rows, cols] = this.taps?.shape ?? [0, this.hello.rows, this.hello.cols];
+    const [there, rows, cols] = this.taps?.shape ?? [0, page.hello.rows, page.hello.cols];
     const high = there ? largest(this.taps.values, LEAST_COUNTS) : 1;
     [...thumbs.children].forEach((item, tap) => {
       item.classList.toggle("empty", tap >= there);
-      const canvas = item.firstChild;
-      if (tap < there) paintMap(canvas, this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), rows, cols, high, CIVIDIS);
-      else canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+      const map = tap < there ? { values: this.taps.values.subarray(tap * rows * cols, (tap + 1) * rows * cols), shape: [rows, cols] } : null;
+      paintMap(item.firstChild, map, high, CIVIDIS);
     });
   }
 
@@ -370,9 +356,9 @@ class Sensor {
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
     paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts", page.atS, this.limits.of("force"));
-    if (page.shear && this.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
+    if (page.shear && page.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
     else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2", page.atS, this.limits.of("area"));
-    show(this.part.shear_toggle, this.hello.wrench);
+    show(this.part.shear_toggle, page.hello.wrench);
     this.part.shear_toggle.setAttribute("aria-pressed", String(page.shear));
     this.limits.paint();
     say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
@@ -384,15 +370,13 @@ class Sensor {
     const made = this.made();
     if (result === null) return;
     const counters = result.counters ?? {};
-    const texts = numberTexts(this);
-    for (const [key, element] of Object.entries(this.fields)) {
-      if (!LOSSES.has(key)) say(element, texts[key]);
-      else {
-        say(element, String(counters[key] ?? 0));
-        element.classList.toggle("warn", counters[key] > LOSS_SHARE * (counters.scans ?? 0));
-      }
+    const ellipse = made.state === "contact" && made.trusted !== false && this.newest() ? this.ellipse() : null;
+    for (const [key, { element, text }] of Object.entries(this.fields)) {
+      say(element, text?.({ sensor: this, result, made, ellipse }) ?? String(counters[key] ?? 0));
+      // Fewer losses, as in the first second of a run, are no reason to worry.
+      if (!text) element.classList.toggle("warn", counters[key] > 0.01 * (counters.scans ?? 0));
     }
-    this.fields.trusted.classList.toggle("warn", made.trusted === false);
-    this.fields.baseline_age_s.classList.toggle("warn", result.baseline !== null && !known(result.baseline_age_s));
+    this.fields.trusted.element.classList.toggle("warn", made.trusted === false);
+    this.fields.baseline_age_s.element.classList.toggle("warn", result.baseline !== null && !known(result.baseline_age_s));
   }
 }

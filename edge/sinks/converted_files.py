@@ -1,5 +1,6 @@
-"""Recording as npz, for numpy: arrays with a row for each scan, as docs/formats.md lists them."""
+"""Files that `edge-sr convert` writes: npz with a row for each scan, as docs/formats.md lists them, and CSV."""
 
+import csv
 import json
 import shutil
 import zipfile
@@ -23,11 +24,12 @@ from edge.errors import SinkError
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS, MAPS
 from edge.sinks.ros2.cdr_messages import IMAGE, RESULT
-from edge.sinks.ros2.map_messages import UNITS
+from edge.sinks.ros2.map_messages import UNITS, image_map
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.poses import TimedPose
+from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.poses import PoseTrack, TimedPose
 from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
 from firmware_bridge.recording.mcap_reader import mcap_files
 from firmware_bridge.recording.mcap_records import MESSAGE, DamageError, records
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
@@ -38,7 +40,9 @@ from firmware_bridge.recording.scan_messages import (
     decode_scan,
     mounting_text,
 )
+from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -47,7 +51,6 @@ KINDS: Final[Mapping[str, tuple[str, Any]]] = {
     "origin": ("<U8", ""),
 }
 """numpy's type of each array, and the value of a row where it is unknown."""
-_PIECE_BYTES: Final = 1 << 20
 _MAP_NAMES: Final = frozenset(field.name for field in MAPS)
 _OF_SCANS: Final = {"time_ns", "sensor", "scan", "device_time_ns", "counts", "has_pattern", "baseline_counts"}
 _OF_RECORDS: Final = tuple(
@@ -62,9 +65,7 @@ def write_npz(
 ) -> None:
     """Write a recording of rows, each the values of a scan by the names of KINDS; what a row lacks is unknown there.
 
-    Raises:
-        SinkError: patterns change their size.
-        OSError: the file cannot be written.
+    Raises a SinkError where patterns change their size.
     """
     with ExitStack() as opened:
         columns = _Columns(path.parent, opened)
@@ -114,7 +115,7 @@ class _Columns:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 header = {"descr": dtype.str, "fortran_order": False, "shape": (self._rows, *shape)}
                 npy.write_array_header_1_0(entry, header)
-                shutil.copyfileobj(file, entry, _PIECE_BYTES)
+                shutil.copyfileobj(file, entry, 1 << 20)
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
@@ -137,9 +138,7 @@ def _pose_arrays(poses: Sequence[TimedPose]) -> dict[str, NDArray[Any]]:
 def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator[dict[str, Any]]:
     """Yield the rows of a recording that `load_recording` has read, in the order of its messages.
 
-    Raises:
-        RecordingError: a result or a map cannot be read.
-        OSError: the file cannot be read.
+    Raises a RecordingError where a result or a map cannot be read.
     """
     baselines: dict[str, Baseline] = {}
     for file in mcap_files(path)[0]:
@@ -254,11 +253,8 @@ def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
 
 
 def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:
-    image = IMAGE.decode(data)
-    values = image["data"].view("<f4") / np.float32(topic.factor)
-    if image["encoding"] == "32FC3":  # a traction of an earlier release
-        return values.reshape(image["height"], image["width"], 3).transpose(2, 0, 1)
-    return values.reshape((3, -1, image["width"]) if topic.name == "traction" else (-1, image["width"]))
+    values = image_map(data) / np.float32(topic.factor)
+    return values.reshape(3, -1, values.shape[-1]) if topic.name == "traction" else values
 
 
 def _flat(value: Any) -> list[float | None]:
@@ -268,3 +264,41 @@ def _flat(value: Any) -> list[float | None]:
     if isinstance(value, list):
         return [number for one in value for number in _flat(one)]
     return [value]
+
+
+def write_csv(
+    path: Path,
+    track: Track,
+    times_ns: NDArray[np.int64],
+    mounting: Mounting,
+    poses: Sequence[TimedPose],
+    *,
+    emulated: bool,
+) -> None:
+    """Write the scans of a sensor that have all readings, since a CSV has no cell for an absent one.
+
+    Args:
+        path: of the file.
+        track: scans of the sensor, each taxel in its place; written in the order of the id map, by the mounting.
+        times_ns: (n,) times of the scans since the first one, in [ns].
+        mounting: of the sensor.
+        poses: of the pad, on the same clock, in the order of the scans that they served first.
+        emulated: the sensor is emulated.
+    """
+    taxels = track.geometry.taxel_count
+    counts = track.counts.reshape(len(times_ns), len(AXES), taxels)[:, :, np.argsort(mounting.order)]
+    whole = (counts != ABSENT).all(axis=(1, 2))
+    course, taken = PoseTrack(), 0
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        mark = (EMULATED,) if emulated else ()
+        writer.writerow(("time_s", *csv_header(taxels), *(CSV_POSES if poses else ()), *mark))
+        for row in np.flatnonzero(whole):
+            time_ns = int(times_ns[row])
+            while taken < len(poses) and (poses[taken].used_from_ns or poses[taken].time_ns) <= time_ns:
+                course.add(poses[taken].time_ns, poses[taken].pose, holds=poses[taken].holds)
+                taken += 1
+            pose = course.at(time_ns)
+            place = ("", "", "") if pose is None else (pose.x_mm, pose.y_mm, pose.turn_deg)
+            readings = counts[row].T.ravel().tolist()
+            writer.writerow((f"{time_ns / 1e9:.6f}", *readings, *(place if poses else ()), *("1" for _ in mark)))

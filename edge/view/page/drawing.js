@@ -1,0 +1,297 @@
+// ---- Colours: a few stops of maps that grow steadily lighter, and are readable for the colour-blind ----
+
+const STOPS = {
+  viridis: "440154 482878 3e4989 31688e 26828e 1f9e89 35b779 6ece58 b5de2b fde725",
+  cividis: "00224e 123570 3b496c 575d6d 707173 8a8678 a59c74 c3b369 e1cc55 fee838",
+  magma: "000004 180f3d 440f76 721f81 9e2f7f cd4071 f1605d fd9668 feca8d fcfdbf",
+};
+const LEVELS = 256;
+
+/** Return 256 colours, as red, green and blue one after the other. */
+function colourTable(name) {
+  const stops = STOPS[name].split(" ").map((hex) => [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16)));
+  const table = new Uint8ClampedArray(3 * LEVELS);
+  for (let level = 0; level < LEVELS; level++) {
+    const place = (level / (LEVELS - 1)) * (stops.length - 1);
+    const lower = Math.min(Math.floor(place), stops.length - 2);
+    for (let channel = 0; channel < 3; channel++) {
+      const [from, to] = [stops[lower][channel], stops[lower + 1][channel]];
+      table[3 * level + channel] = from + (to - from) * (place - lower);
+    }
+  }
+  return table;
+}
+
+const VIRIDIS = colourTable("viridis");
+const CIVIDIS = colourTable("cividis");
+const MAGMA = colourTable("magma");
+
+const level = (value, high) => Math.max(0, Math.min(LEVELS - 1, Math.round((value / high) * (LEVELS - 1))));
+
+/** Paint one canvas pixel for each value of a map, which the style sheet enlarges; null clears the canvas. */
+function paintMap(canvas, map, high, table) {
+  const context = canvas.getContext("2d");
+  if (map === null) return context.clearRect(0, 0, canvas.width, canvas.height);
+  const [rows, cols] = map.shape;
+  if (canvas.width !== cols || canvas.height !== rows) [canvas.width, canvas.height] = [cols, rows];
+  const image = context.createImageData(cols, rows);
+  for (let pixel = 0; pixel < rows * cols; pixel++) {
+    const at = 3 * level(map.values[pixel], high);
+    for (let channel = 0; channel < 3; channel++) image.data[4 * pixel + channel] = table[at + channel];
+    image.data[4 * pixel + 3] = 255;
+  }
+  return context.putImageData(image, 0, 0);
+}
+
+const paintBar = (canvas, table) => paintMap(canvas, { values: Float32Array.from({ length: LEVELS }, (_, at) => at), shape: [1, LEVELS] }, LEVELS - 1, table);
+
+// ---- Marks on maps ----
+
+/** Draw a path in one ink over a wider one, so that it is visible on any background. */
+function haloed(context, [ink, halo], width, path) {
+  for (const [strokeStyle, lineWidth] of [[halo, width + 2], [ink, width]]) {
+    Object.assign(context, { strokeStyle, lineWidth });
+    context.beginPath();
+    path();
+    context.stroke();
+  }
+}
+
+function haloedText(context, [ink, halo], text, x, y) {
+  Object.assign(context, { strokeStyle: halo, lineWidth: 3, fillStyle: ink, lineJoin: "round" });
+  context.strokeText(text, x, y);
+  context.fillText(text, x, y);
+}
+
+/** Draw a bar of a round length at the lower left of a canvas that shows so many mm across. */
+function scaleBar(context, ink, widthMm, width, height) {
+  const barMm = [50, 20, 10, 5, 2, 1, 0.5].find((mm) => mm <= widthMm / 3) ?? widthMm;
+  const bar = (barMm / widthMm) * width;
+  haloed(context, ink, 2, () => {
+    context.moveTo(10, height - 16);
+    context.lineTo(10, height - 10);
+    context.lineTo(10 + bar, height - 10);
+    context.lineTo(10 + bar, height - 16);
+  });
+  context.font = FONT;
+  context.textAlign = "center";
+  haloedText(context, ink, `${barMm}${THIN}mm`, 10 + bar / 2, height - 16);
+}
+
+function arrow(context, ink, x, y, dx, dy) {
+  const length = Math.hypot(dx, dy);
+  haloed(context, ink, 1.6, () => {
+    context.moveTo(x, y);
+    context.lineTo(x + dx, y + dy);
+    if (length > 4) {
+      const [along, across] = [[dx / length, dy / length], [-dy / length, dx / length]];
+      const head = Math.min(5, length / 2);
+      for (const side of [-1, 1]) {
+        context.moveTo(x + dx, y + dy);
+        context.lineTo(x + dx - head * (along[0] + 0.6 * side * across[0]), y + dy - head * (along[1] + 0.6 * side * across[1]));
+      }
+    }
+  });
+  context.beginPath();
+  context.fillStyle = ink[0];
+  context.arc(x, y, 1.8, 0, 2 * Math.PI);
+  context.fill();
+}
+
+/** Cover a taxel that is left out, rather than only mark it: its colour means nothing. */
+function cross(context, width, height, rows, cols, taxel) {
+  const [w, h] = [width / cols, height / rows];
+  const [x, y] = [(taxel % cols) * w, Math.floor(taxel / cols) * h];
+  context.fillStyle = "#111";
+  context.fillRect(x, y, w, h);
+  haloed(context, ["#ff8a7d", "#0008"], 2.5, () => {
+    const edge = 0.22;
+    context.moveTo(x + edge * w, y + edge * h);
+    context.lineTo(x + (1 - edge) * w, y + (1 - edge) * h);
+    context.moveTo(x + (1 - edge) * w, y + edge * h);
+    context.lineTo(x + edge * w, y + (1 - edge) * h);
+  });
+}
+
+/** Draw where to touch next: an arrow from the pad's centre to its next place, and its outline there. */
+function outlinePad(context, ink, width, height, pxPerMm, next) {
+  const [dx, dy] = [next.dx_mm * pxPerMm, next.dy_mm * pxPerMm];
+  arrow(context, ink, width / 2, height / 2, dx, dy);
+  context.save();
+  context.translate(width / 2 + dx, height / 2 + dy);
+  context.rotate((next.turn_deg / 180) * Math.PI);
+  context.setLineDash([6, 4]);
+  haloed(context, ink, 1.5, () => context.rect(-width / 2, -height / 2, width, height));
+  context.restore();
+}
+
+function thumb(tap) {
+  const item = document.createElement("li");
+  const canvas = item.appendChild(document.createElement("canvas"));
+  [canvas.width, canvas.height] = [4, 4];
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", tap === 0 ? "this tap" : `${tap} taps before`);
+  item.append(tap === 0 ? "now" : `${MINUS}${tap}`);
+  return item;
+}
+
+const LEAST_COUNTS = 200; // so that noise at rest stays dark
+
+// ---- Marks over the pattern and the taxels ----
+
+/** Draw the marks over a pattern; those of a contact only where the pattern is of the moment shown. */
+function paintOver(sensor, canvas, current) {
+  const [context, width, height] = blank(canvas);
+  const [rows, cols] = sensor.size();
+  const widthMm = cols * page.hello.pixel_pitch_mm;
+  if (!(widthMm > 0) || width === 0) return;
+  const ink = sensor.pattern === null ? [colour("text"), colour("card")] : ["#fff", "#0009"];
+  scaleBar(context, ink, widthMm, width, height);
+  const place = ([xMm, yMm]) => [width / 2 + (xMm / widthMm) * width, height / 2 + (yMm / widthMm) * width];
+  const ellipse = current && !sensor.doubted() ? sensor.ellipse() : null;
+  if (ellipse !== null) drawEllipse(context, ink, place, width / widthMm, ellipse);
+  if (current) sensor.path.draw(context, ink, place, page.atS ?? sensor.trace.newestS);
+  const centre = current ? sensor.touched.centroid_mm : null;
+  if (centre) {
+    const [x, y] = place(centre);
+    haloed(context, ink, 1.5, () => { context.moveTo(x - 6, y); context.lineTo(x + 6, y); context.moveTo(x, y - 6); context.lineTo(x, y + 6); });
+  }
+  const wrench = current ? sensor.touched.wrench : null;
+  if (wrench?.centre_of_pressure_mm) {
+    const [x, y] = place(wrench.centre_of_pressure_mm);
+    const [fx, fy] = wrench.force_n;
+    const length = (0.4 * width) / Math.hypot(...wrench.force_n); // of the arrow of a force that is all shear: 0.4 of the width
+    haloed(context, ink, 1.5, () => context.arc(x, y, 5, 0, 2 * Math.PI));
+    arrow(context, ink, x, y, fx * length, fy * length);
+  }
+  const next = sensor.pattern === null || sensor.away() || !page.link.up ? null : sensor.result?.next_tap;
+  if (next) outlinePad(context, ink, width, height, width / widthMm, next);
+  if (sensor.cursor !== null) {
+    const [row, col] = sensor.cursor;
+    haloed(context, ink, 2, () => context.rect((col * width) / cols, (row * height) / rows, width / cols, height / rows));
+  }
+}
+
+function paintShear(sensor, context, width, height, rows, cols, values, high) {
+  const count = rows * cols;
+  let longest = 100;
+  for (let taxel = 0; taxel < count; taxel++) {
+    if (!sensor.result.dead?.[taxel]) longest = Math.max(longest, Math.hypot(values[taxel], values[count + taxel]));
+  }
+  longest = roundUp(longest);
+  const cell = Math.min(width / cols, height / rows);
+  sensor.part.ruler.style.width = `${0.45 * cell}px`;
+  say(sensor.part["shear-most"], `${short(longest)}${THIN}counts`);
+  context.font = '10px system-ui, "DejaVu Sans", sans-serif';
+  context.textAlign = "center";
+  for (let taxel = 0; taxel < count; taxel++) {
+    if (sensor.result.dead?.[taxel]) continue;
+    const [x, y] = [((taxel % cols) + 0.5) * (width / cols), (Math.floor(taxel / cols) + 0.5) * (height / rows)];
+    const z = values[2 * count + taxel];
+    const ink = level(z, high) > 0.6 * LEVELS ? ["#000", "#fff6"] : ["#fff", "#0006"];
+    arrow(context, ink, x, y, (values[taxel] / longest) * 0.45 * cell, (values[count + taxel] / longest) * 0.45 * cell);
+    if (cell > 34) {
+      context.fillStyle = ink[0];
+      context.fillText(number(z), x, y + cell / 2 - 4);
+    }
+  }
+}
+
+// ---- Shape of the contact: its ellipse, and the path of its centre ----
+
+/** Return the ellipse with the moments of the touched pixels: centre and half axes in mm, and the turn of the long one in degrees; null without any, or if they fill the pad. */
+function contactEllipse({ values, shape: [rows, cols] }, pitchMm, share) {
+  const least = share * largest(values);
+  if (!(least > 0)) return null;
+  let [sum, sumX, sumY, sumXx, sumXy, sumYy] = [0, 0, 0, 0, 0, 0];
+  for (let row = 0, at = 0; row < rows; row++) {
+    for (let col = 0; col < cols; col++, at++) {
+      if (values[at] < least) continue;
+      sum += 1; sumX += col; sumY += row; sumXx += col * col; sumXy += col * row; sumYy += row * row;
+    }
+  }
+  if (sum > 0.9 * rows * cols) return null; // the whole pad has no shape
+  const [x, y] = [sumX / sum, sumY / sum];
+  const [xx, xy, yy] = [sumXx / sum - x * x + 1 / 12, sumXy / sum - x * y, sumYy / sum - y * y + 1 / 12];
+  const [mean, spread] = [(xx + yy) / 2, Math.hypot((xx - yy) / 2, xy)];
+  const halves = [mean + spread, Math.max(mean - spread, 0)].map((moment) => 2 * Math.sqrt(moment) * pitchMm);
+  const turn = (0.5 * Math.atan2(2 * xy, xx - yy) * 180) / Math.PI;
+  return { x: (x - (cols - 1) / 2) * pitchMm, y: (y - (rows - 1) / 2) * pitchMm, halves, turn, pixels: sum };
+}
+
+/** Draw the ellipse, and its long axis where it has one. */
+function drawEllipse(context, ink, place, pxPerMm, ellipse) {
+  const { x, y, halves: [long, wide], turn } = ellipse;
+  const angle = (turn * Math.PI) / 180;
+  const [centreX, centreY] = place([x, y]);
+  haloed(context, ink, 1.2, () => context.ellipse(centreX, centreY, long * pxPerMm, wide * pxPerMm, angle, 0, 2 * Math.PI));
+  if (isRound(ellipse)) return;
+  const [dx, dy] = [Math.cos(angle) * long * pxPerMm, Math.sin(angle) * long * pxPerMm];
+  context.save();
+  context.setLineDash([5, 4]);
+  haloed(context, ink, 1.2, () => { context.moveTo(centreX - dx, centreY - dy); context.lineTo(centreX + dx, centreY + dy); });
+  context.restore();
+}
+
+const isRound = ({ halves: [long, wide] }) => long < 1.15 * wide;
+
+/** Path of the centre of pressure, or of the touched area where the model gives no force. */
+class Path {
+  constructor() { this.points = []; }
+
+  add(atS, { state, trusted, wrench, centroid_mm: centroid }) {
+    if (!known(atS)) return;
+    const touched = state === "contact" && trusted !== false;
+    const centre = touched ? wrench?.centre_of_pressure_mm ?? centroid : null;
+    if (!centre && this.points.at(-1)?.[1] === null) return; // one point parts two contacts
+    this.points.push([atS, centre ?? null]);
+    if (this.points.length > 600) this.points.shift();
+  }
+
+  draw(context, ink, place, endS) {
+    const shown = this.points.filter(([atS]) => atS <= endS + 1e-6 && endS - atS <= 5);
+    haloed(context, ink, 1.2, () => {
+      let drawing = false;
+      for (const [, centre] of shown) {
+        if (centre !== null) context[drawing ? "lineTo" : "moveTo"](...place(centre));
+        drawing = centre !== null;
+      }
+    });
+  }
+}
+
+// ---- Relief: the pattern as a surface, seen from above at a slant ----
+
+const RELIEF_SHARE = 0.3; // height of the scale's end, as a share of the width
+
+/** Paint the surface from its far edge to its near one, in the colours of the map and lit from the upper left. */
+function paintRelief(canvas, { values, shape: [rows, cols] }, high, table) {
+  const [context, width, height] = blank(canvas);
+  if (width === 0) return;
+  const rise = RELIEF_SHARE * width;
+  const [across, along] = [0.86 * width, 0.56 * height];
+  const value = (row, col) => Math.max(0, Math.min(1.2, values[row * cols + col] / high));
+  const place = (row, col) => {
+    const near = row / (rows - 1);
+    const span = across * (0.8 + 0.2 * near);
+    return [width / 2 + (col / (cols - 1) - 0.5) * span, 0.36 * height + near * along - value(row, col) * rise];
+  };
+  const steep = (RELIEF_SHARE * cols) / 1.4;
+  for (let row = 0; row < rows - 1; row++) {
+    for (let col = 0; col < cols - 1; col++) {
+      const corners = [[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]];
+      const [a, b, c, d] = corners.map(([r, k]) => value(r, k));
+      const slope = [-(b + c - a - d) * 0.5 * steep, -(c + d - a - b) * 0.5 * steep, 1];
+      const lit = (-0.5 * slope[0] - 0.6 * slope[1] + 0.62) / Math.hypot(...slope);
+      const shade = 0.45 + 0.75 * Math.max(0, lit);
+      const at = 3 * level((a + b + c + d) / 4, 1);
+      context.fillStyle = `rgb(${[0, 1, 2].map((channel) => Math.min(255, Math.round(table[at + channel] * shade))).join()})`;
+      context.strokeStyle = context.fillStyle;
+      context.beginPath();
+      corners.forEach(([r, k], corner) => context[corner === 0 ? "moveTo" : "lineTo"](...place(r, k)));
+      context.closePath();
+      context.fill();
+      context.stroke(); // closes the hair lines between neighbours
+    }
+  }
+}
