@@ -9,7 +9,6 @@ import shtab
 from argparse_manpage.manpage import Manpage
 
 from edge import __version__
-from edge.bench.options import bench_parser
 from edge.cli.main import COMMANDS
 from edge.cli.run_help import parser
 from edge.inference.bundled import bundled_models
@@ -18,25 +17,14 @@ SHELLS: Final = {
     "bash": "bash-completion/completions/edge-sr",
     "zsh": "zsh/site-functions/_edge-sr",
 }
-MAN_PAGE: Final = "man/man1/edge-sr.1"
-PAGE: Final = {
-    "version": __version__,
-    "manual_title": "Tactile super-resolution",
-    "description": "tactile super-resolution at the sensor's rate",
-}
-MAN_COLUMNS: Final = "72"
-"""Width of texts that a man page keeps as they are: 80 columns less the margin."""
 
 
 def write_terminal_files(folder: Path) -> dict[Path, str]:
-    """Write completions and man page below a folder; returns each file's path and its place in an environment.
-
-    Args:
-        folder: an empty folder.
-    """
+    """Write completions and man page below an empty folder; returns each file's path, and its place in a wheel."""
     texts = {place: shtab.complete(command_tree(), shell) for shell, place in SHELLS.items()}
-    os.environ["COLUMNS"] = MAN_COLUMNS
-    texts[MAN_PAGE] = str(Manpage(command_tree(), dict(PAGE)))
+    os.environ["COLUMNS"] = "72"  # of texts that a man page keeps as they are: 80 less the margin
+    about = {"manual_title": "Tactile super-resolution", "description": "tactile super-resolution at the sensor's rate"}
+    texts["man/man1/edge-sr.1"] = str(Manpage(command_tree(), {"version": __version__} | about))
     written = {}
     for place, text in texts.items():
         path = folder / place
@@ -51,7 +39,7 @@ def command_tree() -> argparse.ArgumentParser:
     tree = parser()
     commands: Any = tree.add_subparsers(title="commands", metavar="COMMAND")
     for name in COMMANDS:
-        one = bench_parser() if name == "bench" else parser(name)
+        one = parser(name)
         commands.add_parser(
             name,
             parents=[one],

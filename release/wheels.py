@@ -20,17 +20,10 @@ from edge import __version__
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ["firmware_bridge", "edge", "train", "export"]
-SECOND: Final = "tactile-edge-sr-train"
-ITS_EXTRAS: Final = ("train", "export")
 
 
 def runtime_settings(project: dict[str, Any], shared: dict[Path, str]) -> dict[str, Any]:
-    """Return the settings of pyproject.toml, with files that a wheel installs beside its packages.
-
-    Args:
-        project: content of pyproject.toml.
-        shared: path of each such file, and its place in an environment.
-    """
+    """Return the settings of pyproject.toml, with files, by path, and their places beside the packages."""
     settings = copy.deepcopy(project)
     _wheel(settings)["shared-data"] = {str(path): place for path, place in shared.items()}
     return settings
@@ -43,9 +36,9 @@ def training_settings(project: dict[str, Any]) -> dict[str, Any]:
     _wheel(settings).update(packages=PACKAGES, exclude=first)
     about = settings["project"]
     extras = about.pop("optional-dependencies")
-    wanted = [one for extra in ITS_EXTRAS for one in extras[extra] if not one.startswith(about["name"])]
+    wanted = [one for extra in ("train", "export") for one in extras[extra] if not one.startswith(about["name"])]
     about.update(
-        name=SECOND,
+        name="tactile-edge-sr-train",
         description="Training, export, bench and emulation for tactile-edge-sr.",
         dependencies=[f"{about['name']}=={__version__}", *dict.fromkeys(wanted)],
     )

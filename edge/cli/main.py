@@ -35,10 +35,8 @@ from firmware_bridge.in_place import BACKUP_SUFFIX
 if TYPE_CHECKING:
     from edge.api import MapSink
 
-EXIT_DEVICE: Final = 3
-EXIT_MODEL: Final = 4
-EXIT_SINK: Final = 5
-EXIT_INTERRUPTED: Final = 130  # exit code of a shell after Ctrl-C, used until a run has begun that ends well
+_EXIT_CODES: Final = {DeviceError: 3, BaselineRefusedError: 3, ModelError: 4, SinkError: 5}
+"""Exit codes of errors; of all others it is that of wrong usage."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,25 +55,17 @@ def _main(arguments: Sequence[str]) -> int:
             return _command(arguments) or 0
         return 0
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return 130  # as a shell's, until a run has begun that ends well
     except (BridgeError, EdgeError) as error:
         with contextlib.suppress(OSError):  # the terminal may have gone
             print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
-        return _exit_code(error)
+        return next((code for kind, code in _EXIT_CODES.items() if isinstance(error, kind)), EXIT_USAGE)
     except OSError as error:
         if error.errno not in (errno.EMFILE, errno.ENFILE):
             raise
         # Anything may meet it: a thread, a link, or Python as it loads a module.
         print(f"edge-sr: {error.strerror}: allow more of them, ulimit -n 256", file=sys.stderr)
-        return EXIT_SINK
-
-
-def _exit_code(error: BridgeError | EdgeError) -> int:
-    if isinstance(error, (DeviceError, BaselineRefusedError)):
-        return EXIT_DEVICE
-    if isinstance(error, ModelError):
-        return EXIT_MODEL
-    return EXIT_SINK if isinstance(error, SinkError) else EXIT_USAGE
+        return _EXIT_CODES[SinkError]
 
 
 def _command(arguments: Sequence[str]) -> int | None:
@@ -170,13 +160,13 @@ def _baseline(options: argparse.Namespace) -> None:
 
 def _bench(arguments: Sequence[str]) -> int:
     try:
-        from edge.bench.options import bench_parser
+        import edge.bench  # noqa: F401
     except ModuleNotFoundError as error:
         raise UsageError(
             "edge-sr bench is in another wheel, which is not installed: install tactile-edge-sr-train as well"
         ) from error
 
-    options = bench_parser().parse_args(arguments)
+    options = parsed_options("bench", arguments)
     from edge.bench.command import run
 
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:

@@ -23,8 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from edge.bench.options import BenchError
-from edge.bench.system import Ratio, ratio_of, tree_of
+from edge.bench.system import BenchError, Ratio, ratio_of, tree_of
 
 ROOT: Final = Path(__file__).parents[2]
 MOST_RATIO: Final = 1.1
