@@ -18,11 +18,6 @@ RATE_HZ: Final = 100.0
 ROUNDS: Final = 3
 """Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
 ROUND_TICKS: Final = 50
-WINDOWS: Final = 16
-SEED: Final = 1
-_SHOWN: Final = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
-"""Metrics that are shown, and how wide."""
-UNEVEN: Final = 3.0  # ratio of 99th percentile to median from which run times are uneven, 1.2 to 1.4 on a quiet machine
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
@@ -34,12 +29,13 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     measure, took_us = options.measure, run_times_us(models) if options.measure else []
     widest = max(len(path.stem) for path in paths)
     times = " p50 us p99 us" if measure else ""
+    shown = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
     out.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
     for index, (path, model) in enumerate(zip(paths, models, strict=True)):
         contract = model.contract
         error = contract.test_error.get(str(contract.taps), {})
         figures = "".join(
-            f" {error[name]:{width}}" if name in error else f" {'-':>{width[0]}s}" for name, width in _SHOWN.items()
+            f" {error[name]:{width}}" if name in error else f" {'-':>{width[0]}s}" for name, width in shown.items()
         )
         cells = f"{path.stem:{widest}s} {contract.taps:4d} {path.stat().st_size / 1e6:4.1f} {contract.arithmetic:10s}"
         times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
@@ -49,7 +45,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if not measure:
         return
     out.write(f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
-    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > UNEVEN * p50]
+    # The ratio is 1.2 to 1.4 on a quiet machine.
+    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > 3 * p50]
     if uneven:
         named = ", ".join(uneven)
         out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
@@ -60,19 +57,19 @@ def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
 
     Windows are random, with all taps: run time does not depend on their values.
     """
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(1)
     took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
     with Progress("run times", took_us.size, "run") as bar:
         for round_ in range(ROUNDS):
             for index, model in enumerate(models):
                 contract = model.contract
-                shape = (WINDOWS, contract.taps, 3, contract.rows, contract.cols)
+                shape = (16, contract.taps, 3, contract.rows, contract.cols)
                 windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
                 ticker = Ticker(RATE_HZ)
                 for tick in range(ROUND_TICKS):
                     ticker.wait()
                     start_ns = time.perf_counter_ns()
-                    model.run(contract.scale_window(windows[tick % WINDOWS]))
+                    model.run(contract.scale_window(windows[tick % len(windows)]))
                     took_us[index, round_, tick] = (time.perf_counter_ns() - start_ns) / 1e3
                 bar.advance(ROUND_TICKS)  # not while it measures
     both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")

@@ -5,6 +5,7 @@ Modules that only some runs need are imported where they are used.
 
 import argparse
 import contextlib
+import ctypes
 import os
 import sys
 import time
@@ -14,7 +15,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any
 
 from edge.api import (
     DEFAULT_MODEL,
@@ -42,7 +43,6 @@ from edge.errors import SinkError
 from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
-from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -51,9 +51,6 @@ if TYPE_CHECKING:
     from edge.pipeline.replay_setup import Player
     from edge.view.server import LiveView
 
-_NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
-"""Suffixes of other formats, which a recording must not be named after."""
-
 
 @contextmanager
 def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
@@ -61,7 +58,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     path = Path(options.file)
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
-    if path.suffix.lower() in _NOT_WRITTEN:
+    if path.suffix.lower() in (".csv", ".npz", ".json", ".jsonl"):
         made = path.with_suffix(".mcap")
         then = "for records in JSON use edge-sr --sink jsonl:FILE"
         if path.suffix.lower() in (".csv", ".npz"):
@@ -106,12 +103,6 @@ def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
                 sys.stderr.write(f"{sink.summary()}\n")
 
 
-DAY_S: Final = 86_400
-DEMO_HZ: Final = 100.0
-DEMO_REST_SCANS: Final = 100
-"""Scans without contact after which a repeating demo is at its first tap: 180 lie before it, 34 between taps."""
-
-
 def run(
     options: argparse.Namespace,
     source: Source,
@@ -125,7 +116,8 @@ def run(
     into a map, which the live page shows; it is closed here. `player` is of the recording that is the source.
     """
     stdout_taken = "jsonl:-" in options.sink
-    share_one_heap()
+    # glibc gives each thread a heap of its own, in which other threads' free memory is of no use: -8 is M_ARENA_MAX.
+    _of_glibc("mallopt", -8, 1)
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands, contextlib.closing(source):
@@ -166,13 +158,13 @@ def run(
                 played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
             asked = runtime_options(options)
             if loops:
-                rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
-                asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
+                # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.
+                asked = replace(asked, idle_reset_s=min(100 / (options.rate_hz or 100.0), asked.idle_reset_s))
             if is_demo:  # it shows the run time of every scan
                 asked = replace(asked, every_scan=True)
             per_newton = options.counts_per_newton
             runtime = open_runtime(model, source, baselines=baselines, counts_per_newton=per_newton, **asdict(asked))
-            give_back()
+            give_back_memory()
             sinks: list[Sink] = []
             if played is not None:
                 sinks += [played, *([] if played.map is None else [played.map])]
@@ -213,6 +205,17 @@ def run(
             played.finish()
 
 
+def give_back_memory() -> None:
+    """Give free memory back to the system: a network takes more while it is loaded than afterwards."""
+    _of_glibc("malloc_trim", ctypes.c_size_t(0))
+
+
+def _of_glibc(name: str, *arguments: Any) -> None:
+    """Call a function of glibc's malloc; other C libraries have none of these, and stay as they are."""
+    if (function := getattr(ctypes.CDLL(None), name, None)) is not None:
+        function(*arguments)
+
+
 def _open_view(
     options: argparse.Namespace, contract: Contract, commands: Commands
 ) -> "contextlib.AbstractContextManager[LiveView | None]":
@@ -250,7 +253,7 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
 
 def recorded_text(made_s: float, now_s: float) -> str:
     """Return when a recording was made, both in [s] since 1970: a pad wears, and its rest level moves."""
-    days = max(now_s - made_s, 0.0) / DAY_S
+    days = max(now_s - made_s, 0.0) / 86_400
     ago = (
         f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
     )

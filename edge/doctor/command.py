@@ -30,11 +30,6 @@ from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing.baseline import deformation
 
-EXIT_WRONG: Final = 1
-EXIT_STOPPED: Final = 130
-
-
-REFRESH_S: Final = 0.1
 BAR: Final = 10
 
 
@@ -54,7 +49,7 @@ class FeltLine:
     def show(self, guide: GuidedPress) -> None:
         """Show the load on the pad, at most ten times a second."""
         now_s = self._clock_s()
-        if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
+        if now_s - self._shown_s < 0.1 or not rewritable(self._stream):
             return
         self._shown_s = now_s
         full = min(int(BAR * guide.felt), BAR)
@@ -259,5 +254,5 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
         if stop.is_set():
             if options.out is not None and not kept:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
-            return EXIT_STOPPED
-    return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
+            return 130
+    return 1 if visit.unfinished or worst(examined.findings) == "wrong" else 0

@@ -165,14 +165,10 @@ def judge(
     half_width_mm: NDArray[np.floating] | None = None,
     pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each.
+    """Return every metric of every frame, (n,) each, of patterns (n, H, W) in [mm].
 
-    Args:
-        patterns: (n, H, W) in [mm].
-        frozen: the test set.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        half_width_mm: (n, H, W), half widths of the 90 % intervals; "coverage_90" is left out without them.
-        pitch_mm: of the taxels, in [mm].
+    A pixel counts as touched from `contact_level`, a share of its pattern's maximum. Without the half widths of the
+    90 % intervals, (n, H, W), "coverage_90" is left out.
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {
