@@ -297,28 +297,15 @@ def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
     assert "-> keep the motors away" in text and "?     load: nothing" in text
 
 
-PAGE = (ROOT / "docs" / "trouble.md").read_text()
-
-
-def trees() -> list[ast.AST]:
-    return [ast.parse(path.read_text()) for path in sorted((ROOT / "edge" / "doctor").glob("*.py"))]
-
-
-def findings() -> list[ast.Call]:
-    return [
+def test_each_finding_has_a_row():
+    nodes = [
         node
-        for tree in trees()
-        for node in ast.walk(tree)
+        for path in (ROOT / "edge" / "doctor").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
     ]
-
-
-def texts(node: ast.AST) -> list[str]:
-    return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-
-
-def test_each_finding_has_a_row():
-    names = {text for call in findings() for text in texts(call.args[0])}
+    names = {one.value for node in nodes for one in ast.walk(node.args[0]) if isinstance(one, ast.Constant)}
     assert {"link", "noise", "taxel order"} <= names
-    rows = {one.strip() for line in PAGE.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
+    page = (ROOT / "docs" / "trouble.md").read_text()
+    rows = {one.strip() for line in page.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
     assert names <= rows, names - rows

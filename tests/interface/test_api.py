@@ -88,19 +88,11 @@ def test_records_of_the_command_line_are_those_of_the_api(files, options, settin
     assert [timeless(one) for one in made] == [timeless(one) for one in said]
 
 
-def test_a_source_is_used_open_and_once():
+def test_a_source_is_used_open():
     source = open_source("demo")
     for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
         with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement"):
             use()
-    source = Source(FakeLink([[make_scan(n)] for n in range(9)]))
-    with source:
-        results = iter(stream(source))
-        assert next(results).scan.number == 0
-    with pytest.raises(UsageError, match="fake is not open"):
-        list(stream(source))  # what still waits is old
-    with pytest.raises(UsageError, match="fake was opened before"), source:
-        pass
 
 
 def stream(source, model=None, **settings):
@@ -153,25 +145,12 @@ def footprint():
     return threading.active_count(), len(list(Path("/proc/self/fd").iterdir())), len(children)
 
 
-@pytest.mark.parametrize("way", ["break", "exception", "return"])
-def test_leaving_the_loop_closes_everything(way):
-    def leave():
-        with open_source("demo") as source:
-            results = stream(source)
-            for _ in results:
-                assert footprint() > before
-                if way == "break":
-                    break
-                if way == "exception":
-                    raise ZeroDivisionError
-                return
-
+def test_leaving_the_loop_closes_everything():
     before = footprint()
-    if way == "exception":
-        with pytest.raises(ZeroDivisionError):
-            leave()
-    else:
-        leave()
+    with pytest.raises(ZeroDivisionError), open_source("demo") as source:
+        for _ in stream(source):
+            assert footprint() > before
+            raise ZeroDivisionError
     assert footprint() == before
 
 
@@ -267,18 +246,11 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     assert stream.statistics.poses == len(PRESSES) - 1
 
 
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"x_mm": float("nan")}, "a pose: x_mm is nan, expected a number from"),
-        ({"time_ns": 10**18}, "a pose: time_ns is .* ahead of now"),
-    ],
-)
-def test_a_pose_that_cannot_be_is_refused_where_it_is_stated(wrong, match):
+def test_a_pose_that_cannot_be_is_refused_where_it_is_stated():
     with Source(FakeLink([[make_scan(0)]])) as source:
         stream = Stream(source, open_runtime(FakeModel(), source), clock_ns=lambda: 0)
-        with pytest.raises(UsageError, match=match):
-            stream.pose(**({"x_mm": 0, "y_mm": 0} | wrong))
+        with pytest.raises(UsageError, match=r"a pose: time_ns is .* ahead of now"):
+            stream.pose(x_mm=0, y_mm=0, time_ns=10**18)
 
 
 def test_of_a_recording_poses_are_stated_at_its_own_times(tmp_path):

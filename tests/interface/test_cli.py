@@ -31,7 +31,7 @@ def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_po
 
 class TestHelp:
     def test_help_fits_the_terminal_and_80_columns(self, capsys, monkeypatch):
-        for columns, most in (("40", 40), ("80", 80), ("200", 80)):
+        for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
             monkeypatch.setenv("COLUMNS", columns)
             for command in (None, *cli.COMMANDS):
                 with pytest.raises(SystemExit, match="0"):
@@ -49,9 +49,8 @@ class TestHelp:
         demo = run("demo", "--help").stdout
         assert "usage: edge-sr demo [options]" in demo and "--view" in demo and "--source" not in demo
 
-    @pytest.mark.parametrize("command", [[], ["doctor"]])
-    def test_the_version(self, command):
-        done = run(*command, "--version")
+    def test_the_version(self):
+        done = run("doctor", "--version")
         assert (done.returncode, done.stdout, done.stderr) == (0, f"edge-sr {__version__}\n", "")
 
     def test_help_loads_no_onnxruntime(self):
@@ -129,8 +128,7 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
     [
         (2, "--rate-hz 1e-300", ["--rate-hz: '1e-300' is not a positive number, 1e-09 to 1e+09"]),
         (2, "--counts-per-newton 1e8", ["--counts-per-newton: '1e8' is not a positive number, 0.001 to 1e+06"]),
-        (2, "--mode x", ["unrecognized arguments: --mode", "did you mean --model? edge-sr --help"]),
-        (2, "replay x.csv --vieww", ["did you mean --view? edge-sr replay --help lists all options"]),
+        (2, "replay x --mode x", ["unrecognized arguments: --mode", "did you mean --model? edge-sr replay --help"]),
         (2, "demo --source gs_usb", ["unrecognized arguments: --source gs_usb"]),
         (2, "model", ["no command 'model': did you mean models?"]),
         (2, "baseline", ["--out"]),
@@ -139,7 +137,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "baseline --out x --skip -1", ["--skip"]),
         (2, "replay --view a.mcap", ["'a.mcap' is not a port", "write FILE or command before it"]),
         (2, "--source demo --view-host 0.0.0.0", ["--view-host requires --view"]),
-        (2, "--source demo --view-token xxxxxxxxxxxxxxxxxxxx", ["--view-token requires --view"]),
         (2, "--source demo --view-record-dir .", ["--view-record-dir requires --view"]),
         (2, "--source demo --view 0 --view-record-dir /no/such", ["--view-record-dir /no/such: expected a folder"]),
         (2, "--source demo --view 0 --view-token short", ["a token of 5 characters for the live page: expected at"]),
@@ -150,7 +147,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "--source demo --baseline none.json", ["none.json", "No such file"]),
         (2, "--source demo --sensor {tmp}/bad.toml", ["'format': 1, expected 'tactile-sensor'"]),
         (2, "--sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
-        (2, "baseline --out x --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
         (2, "doctor --sensor {tmp}/s.toml --id-map A", ["is of a XR1944"]),
         (5, f"{MAP} {{tmp}}/kept.npz", ["exists: give another name"]),
         (2, f"{MAP} {{tmp}}/m.mcap", ["ends in .npz"]),
@@ -159,7 +155,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, f"{MAP} {{tmp}}/m.npz --centre-mm 0 nan", ["finite numbers"]),
         (2, f"{MAP} {{tmp}}/m.npz", ["none.npz"]),
         (3, f"{KNOWN} --source slcan:/dev/none --sink jsonl:{{tmp}}/kept.jsonl", ["/dev/none", "no such port"]),
-        (3, f"{KNOWN} --source slcan:/dev/null", ["/dev/null"]),
         (3, f"{KNOWN} --source slcan:serial=NOSUCH", ["NOSUCH"]),
         (3, f"{ZERO}{{tmp}}/moving.npz", ["nowhere free and still for 30 scans", "taxel (1, 1) z", "moved by"]),
         (3, f"{ZERO}{{files}}/taps.npz --skip 1", ["ended before 100 complete scans"]),

@@ -134,10 +134,9 @@ def test_what_is_left_out_is_one_line(fresh, tmp_path):
     assert (done.returncode, done.stdout, done.stderr.splitlines()) == (2, "", [line])
 
 
-@pytest.mark.parametrize("name", ["mtsr4.onnx", "mtsr4"])
-def test_a_model_is_named_without_its_precision(fresh, name):
-    command = [str(fresh / "edge-sr"), "--source", "demo", "--model", name, "--duration-s", "1", "--sink", "jsonl:-"]
-    records = [json.loads(line) for line in run(command).splitlines()]
+def test_a_model_is_named_without_its_precision(fresh):
+    command = [str(fresh / "edge-sr"), "--source", "demo", "--model", "mtsr4.onnx", "--duration-s", "1"]
+    records = [json.loads(line) for line in run([*command, "--sink", "jsonl:-"]).splitlines()]
     assert {record["model"] for record in records if "model" in record} == {"mtsr4-int8"}
 
 
