@@ -29,8 +29,7 @@ _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us"
 def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
     """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
 
-    Raises:
-        EdgeError: an input cannot be used, or a measurement failed; the measurements so far are written first.
+    Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
     """
     page = Page(out, err)
     try:
@@ -135,11 +134,7 @@ def _run_times(
 
 
 def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
-    """Return a child's result of a job of `edge.bench.timing`.
-
-    Raises:
-        BenchError: the child failed; its last line is in the message.
-    """
+    """Return a child's result of a job of `edge.bench.timing`; raises BenchError, with its last line, if it failed."""
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
     libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")

@@ -13,7 +13,7 @@ import tarfile
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TextIO, TypeVar
@@ -45,7 +45,7 @@ once. Lost: scans without a pattern or a record, and frames that did not arrive,
 _Thing = TypeVar("_Thing")
 
 
-def line(cells: Sequence[str]) -> str:
+def line(cells: Iterable[str]) -> str:
     """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
@@ -142,11 +142,7 @@ class Program:
 
 
 def tree_of(commit: str, folder: Path) -> Path:
-    """Write the runtime of a commit into a folder.
-
-    Raises:
-        BenchError: there is no such commit here.
-    """
+    """Write the runtime of a commit into a folder; raises BenchError if there is no such commit here."""
     command = ["git", "-C", str(ROOT), "archive", commit, "edge", "firmware_bridge"]
     archive = subprocess.run(command, capture_output=True, check=False)
     if archive.returncode:
@@ -159,10 +155,8 @@ def tree_of(commit: str, folder: Path) -> Path:
 def show_system(scans: int, sensors: int, against: str | None, page: Page) -> list[dict[str, Any]]:
     """Measure the whole program, in turn with another commit where one is named, and show it row by row.
 
-    Each sensor makes so many scans in all rounds of a row.
-
-    Raises:
-        BenchError: a process ended, or there is no such commit.
+    Each sensor makes so many scans in all rounds of a row. Raises BenchError if a process ended, or there is no such
+    commit.
     """
     found: list[dict[str, Any]] = []
     round_s = scans / RATE_HZ / ROUNDS
@@ -184,7 +178,7 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
                     cells = map(_middle, zip(*costs[part + tree], strict=True))
                     what = f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}"
                     found.append({"method": what} | dict(zip(COLUMNS[1:], cells, strict=True)))
-                    page.say(line([str(cell) for cell in found[-1].values()]))
+                    page.say(line(map(str, found[-1].values())))
                 if against is not None:
                     page.say(line(_ratios(f"{part}, ratio", costs[part], costs[f"{part}, {against}"])))
     return found
@@ -298,10 +292,7 @@ class Ratio(NamedTuple):
 def ratio_of(over: Sequence[float], under: Sequence[float]) -> Ratio:
     """Return the ratio of the medians of two measurements' blocks, of which those of one place belong together.
 
-    The interval is that of 2000 resamples of the blocks.
-
-    Raises:
-        ValueError: no blocks, or not as many of both.
+    The interval is that of 2000 resamples of the blocks. Raises ValueError for no blocks, or not as many of both.
     """
     above, below = np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64)
     if not len(above) or len(above) != len(below):

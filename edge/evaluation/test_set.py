@@ -25,7 +25,6 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 
-_MOST_BYTES: Final = 1 << 31
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "newest": ("int16", "n3rc"),
     "earlier": ("int16", "tk3rc"),
@@ -75,8 +74,7 @@ class FrozenSet:
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
         """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero.
 
-        Raises:
-            FrozenSetError: the set has fewer taps.
+        Raises FrozenSetError if the set has fewer taps.
         """
         if not 1 <= taps <= 1 + self.earlier.shape[1]:
             raise FrozenSetError(
@@ -115,13 +113,9 @@ class FrozenSet:
 
 
 def load_frozen_set(path: Path) -> FrozenSet:
-    """Load a frozen test set.
-
-    Raises:
-        FrozenSetError: the file is missing, or an array is missing or of another type or shape; the message names it.
-    """
+    """Load a frozen test set; raises FrozenSetError, which names what is missing, or of another type or shape."""
     try:
-        arrays = read_npz(path, _AXES, _MOST_BYTES)
+        arrays = read_npz(path, _AXES, 1 << 31)
         _check_axes(arrays)
     except (OSError, ValueError) as error:
         raise FrozenSetError(
@@ -132,11 +126,7 @@ def load_frozen_set(path: Path) -> FrozenSet:
 
 
 def check_axes(axes_of: Mapping[str, tuple[str, str]], arrays: Mapping[str, NDArray[Any]]) -> Mapping[str, int]:
-    """Return the length of each axis of arrays whose type and axes are stated.
-
-    Raises:
-        ValueError: an array is missing, or of another type or shape.
-    """
+    """Return the length of each axis of arrays whose type and axes are stated; raises ValueError if one differs."""
     lengths = {"3": 3}
     for name, (kind, axes) in axes_of.items():
         if name not in arrays:
