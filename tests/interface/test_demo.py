@@ -10,8 +10,9 @@ from trust_samples import make_posed_trust
 
 from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, UsageError, demo_recording, load_model
 from edge.cli import main as cli
-from edge.cli import run_command as run
+from edge.cli import run_command
 from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
+from edge.cli.run_help import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
@@ -184,9 +185,9 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
         return [waiting.pop(0) for one in tuple(waiting) if one.time_ns < now_ns]
 
     link.poses = stated
-    monkeypatch.setattr(cli, "_open_source", lambda options, give_up_s: Source(link))
-    monkeypatch.setattr(run, "open_sink", lambda text, **facts: sink)
-    assert cli.main(["--source", "demo:loop", "--sink", "status", "--model", posed]) == 0
+    monkeypatch.setattr(run_command, "open_sink", lambda text, **facts: sink)
+    options = parsed_options("", ["--source", "demo:loop", "--sink", "status", "--model", posed])
+    run_command.run(options, Source(link))
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
     assert out.count("map of a letter of 50 mm") == 1

@@ -19,7 +19,6 @@ from edge_samples import ROOT, wait_for, write_model
 from view_samples import HANDSHAKE, LONG_PING, Swallowing
 from websockets.sync.client import connect
 
-from edge.cli import main as cli
 from edge.sinks.binary_message import unpack
 from edge.terminal.stop_signals import EXIT_FORCED
 
@@ -204,15 +203,6 @@ def test_the_terminal_is_given_back_before_force():
 def test_a_file_that_is_being_finished_has_time_for_as_long_as_it_grows(tmp_path, how, code):
     done = subprocess.run([sys.executable, "-c", FINISHING, tmp_path / "file", how], env=ENVIRONMENT, timeout=60)
     assert done.returncode == code
-
-
-def test_ctrl_c_before_anything_has_begun_is_no_traceback(monkeypatch, capsys):
-    def interrupt(arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "_command", interrupt)
-    assert cli.main(["models"]) == 130
-    assert capsys.readouterr().err == ""
 
 
 def test_kill_9_leaves_whole_records(tmp_path):
