@@ -108,7 +108,6 @@ def test_all_that_is_bundled_is_measured():
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--only", "stsr", "nobody"], "--only nobody: not one of bicubic, bilinear, "),
         (["--models", "/nowhere"], "--models /nowhere: not a folder"),
         (["--models", str(ROOT / "docs")], "holds no .onnx file"),
         (["--out", str(ROOT / "README.md")], "cannot be made"),

@@ -40,10 +40,9 @@ from firmware_bridge.zeroing.baseline import save_baselines
 
 COMMANDS = written_samples.commands()
 RATE_HZ = 500
-ENOUGH = 60
+ENOUGH = 60  # results of a sensor that would go on for ever
 TAPS_SCANS = 460
 """Scans of the demo up to the end of its four taps."""
-"""Results of a sensor that would go on for ever."""
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",

@@ -100,22 +100,20 @@ def stream(source, model=None, **settings):
 
 
 @pytest.mark.parametrize(
-    ("ask", "error", "words"),
+    ("ask", "words"),
     [
-        (lambda: open_source("nothing"), api.SourceError, "source is 'nothing', expected one of: slcan:"),
-        (lambda: open_source("demo", rate_hz=0), UsageError, "rate_hz is 0, expected a positive number"),
-        (lambda: open_source("demo", give_up_s=NAN), UsageError, "give_up_s is nan, expected 0 or more"),
-        (lambda: open_source(["demo"]), UsageError, r"source is \['demo'\], expected text"),
-        (lambda: api.examine("demo", rate_hz=-1), UsageError, "rate_hz is -1, expected a positive number"),
-        (lambda: api.examine("demo", duration_s=-1), UsageError, "duration_s is -1, expected a positive number"),
-        (lambda: api.examine("demo", baselines={"4": 1}), UsageError, "baseline of sensor 4 is a int, expected"),
-        (lambda: api.examine("demo", "demo"), UsageError, "^2 sources, expected one: examine them one after"),
-        (lambda: load_model("stsr", threads=-1), UsageError, "threads is -1, expected a whole number from 1"),
-        (lambda: load_model("nothing"), api.ModelError, r"no model 'nothing': .*bundled: .*stsr-int8\.onnx"),
+        (lambda: open_source("demo", rate_hz=0), "rate_hz is 0, expected a positive number"),
+        (lambda: open_source("demo", give_up_s=NAN), "give_up_s is nan, expected 0 or more"),
+        (lambda: open_source(["demo"]), r"source is \['demo'\], expected text"),
+        (lambda: api.examine("demo", rate_hz=-1), "rate_hz is -1, expected a positive number"),
+        (lambda: api.examine("demo", duration_s=-1), "duration_s is -1, expected a positive number"),
+        (lambda: api.examine("demo", baselines={"4": 1}), "baseline of sensor 4 is a int, expected"),
+        (lambda: api.examine("demo", "demo"), "^2 sources, expected one: examine them one after"),
+        (lambda: load_model("stsr", threads=-1), "threads is -1, expected a whole number from 1"),
     ],
 )
-def test_what_cannot_be_is_one_line(ask, error, words):
-    with pytest.raises(error, match=words) as raised:
+def test_what_cannot_be_is_one_line(ask, words):
+    with pytest.raises(UsageError, match=words) as raised:
         ask()
     assert "\n" not in str(raised.value)
 
