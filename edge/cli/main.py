@@ -174,9 +174,9 @@ def _bench(arguments: Sequence[str]) -> int:
     return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
 
 
-def _apart(module: str) -> Callable[[argparse.Namespace], int | None]:
+def _apart(module: str, function: str = "run") -> Callable[[argparse.Namespace], int | None]:
     """Return the command that a module of its own runs, which is loaded when it is used."""
-    return lambda options: importlib.import_module(module).run(options, sys.stdout, sys.stderr)
+    return lambda options: getattr(importlib.import_module(module), function)(options, sys.stdout, sys.stderr)
 
 
 _ACTIONS: Final[dict[str, Callable[[argparse.Namespace], int | None]]] = {
@@ -186,9 +186,9 @@ _ACTIONS: Final[dict[str, Callable[[argparse.Namespace], int | None]]] = {
     "replay": _replay,
     "convert": _apart("edge.cli.convert_command"),
     "map": _map,
-    "models": _apart("edge.cli.models_command"),
+    "models": _apart("edge.cli.listings", "show_models"),
     "baseline": _baseline,
-    "devices": _apart("edge.cli.devices_command"),
+    "devices": _apart("edge.cli.listings", "show_devices"),
     "doctor": _apart("edge.doctor.command"),
 }
 COMMANDS: Final = (*filter(None, _ACTIONS), "bench")

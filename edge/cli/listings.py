@@ -1,27 +1,36 @@
-"""`edge-sr models`: the bundled models with their error, and with --measure their run time on this machine."""
+"""`edge-sr models` and `edge-sr devices`: what is bundled, and what is plugged in."""
 
 import argparse
+import json
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import Final, TextIO
 
 import numpy as np
 
-from edge.api import DEFAULT_MODEL, POSED_MODEL, ModelError, bundled_models, load_model
+from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
 from edge.terminal.progress_bar import Progress
+from edge.terminal.text_wrap import columns, wrapped
+from firmware_bridge.errors import DeviceError
+from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
-
-if TYPE_CHECKING:
-    from edge.api import Model
 
 RATE_HZ: Final = 100.0
 ROUNDS: Final = 3
 """Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
 ROUND_TICKS: Final = 50
+NOTHING = (
+    "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
+    "it was plugged in, and that this user is in the group dialout"
+)
+SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
 
 
-def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
-    """Print the bundled models; raises ModelError if there is none, or one cannot be used."""
+def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Print the bundled models with their error, and with --measure their run time on this machine.
+
+    Raises ModelError if there is none, or one cannot be used.
+    """
     paths = bundled_models()
     if not paths:
         raise ModelError("no models are bundled with this installation")
@@ -52,7 +61,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
 
 
-def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
+def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
     """Return median and 99th percentile of each model's run time in [us], each run at its tick as on a robot.
 
     Windows are random, with all taps: run time does not depend on their values.
@@ -74,3 +83,32 @@ def run_times_us(models: "Sequence[Model]") -> list[tuple[float, float]]:
                 bar.advance(ROUND_TICKS)  # not while it measures
     both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
     return [(float(p50), float(p99)) for p50, p99 in both.T]
+
+
+def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Print the devices, opening none, what to type to read each, and what prevents its use; with --json for programs.
+
+    Raises DeviceError if no adapter is among them.
+    """
+    found, notes = devices()
+    if options.json:
+        out.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+    else:
+        out.write("".join(f"{line}\n" for line in page(found, notes, columns())))
+    if not any(one.adapter for one in found):
+        raise DeviceError(NOTHING)
+
+
+def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
+    """Return lines for a reader, adapters first; only text to be typed and longer words are wider than `width`."""
+    lines: list[str] = []
+    for one in sorted(found, key=lambda one: not one.adapter):
+        serial = f"serial {one.serial_number}" if one.serial_number else None
+        lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
+        lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
+        lines.append(f"  --source {one.source}")
+        for problem in one.problems:
+            lines += wrapped(problem, width, "  ! ", "    ")
+    for note in (*notes, SERVER_HINT):
+        lines += wrapped(note, width)
+    return lines
