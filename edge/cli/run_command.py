@@ -10,12 +10,12 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from edge.api import (
     DEFAULT_MODEL,
@@ -35,7 +35,9 @@ from edge.api import (
     load_model,
     open_runtime,
     open_sink,
+    open_source,
     pump,
+    save_baselines,
 )
 from edge.cli.run_help import runtime_options
 from edge.cli.user_commands import user_commands
@@ -44,6 +46,7 @@ from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
+from firmware_bridge.in_place import BACKUP_SUFFIX
 
 if TYPE_CHECKING:
     from edge.api import MapSink
@@ -52,9 +55,81 @@ if TYPE_CHECKING:
     from edge.view.server import LiveView
 
 
-@contextmanager
-def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Add a recording to the options of a run, and report it at the end, however the run ends."""
+def follow(
+    options: argparse.Namespace,
+    out: TextIO,
+    err: TextIO,
+    statistics: Statistics | None = None,
+    mapping: "MapSink | None" = None,
+) -> None:
+    """Run `edge-sr` without a command, or with one that adds to it."""
+    if options.source == ["demo"] and options.view is not None and not set(options.sink) - {"status"}:
+        options.source = [DEMO_LOOP]  # a person may look at a page for long; a sink gets one round
+    run(options, _source(options, inf if options.give_up_s is None else options.give_up_s), statistics, mapping)
+
+
+def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr demo`."""
+    options.source = ["demo"]
+    follow(options, out, err)
+
+
+def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr replay`."""
+    from edge.pipeline.replay_setup import Player, open_recording
+
+    # A person looks for as long as he likes; a sink gets each result once.
+    player = Player() if options.view is not None and not set(options.sink) - {"status"} else None
+    paced = options.paced or options.view is not None
+    source = open_recording(
+        *options.file,
+        sensor=options.sensor,
+        zero=options.zero or options.baseline is not None,
+        paced=paced,
+        rate_hz=options.rate_hz,
+        bar=not paced and "status" not in options.sink,
+        player=player,
+    )
+    run(options, source, player=player)
+
+
+def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr baseline`."""
+    from edge.api import take_baselines
+
+    replaced = options.out.exists()
+    if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
+        from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
+
+        kind, known = "replay", sensor_settings(options.sensor, options.id_map)
+        baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
+        print("\n".join(notes), file=err)
+    else:
+        with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
+            kind, known = source.kind, source.sensor_file
+            asked = {name: value for name in ("scans", "skip") if (value := getattr(options, name)) is not None}
+            baselines = take_baselines(source, **asked, stop=stop)
+    save_baselines(options.out, baselines.values(), known.orders)
+    for name, one in sorted(baselines.items()):
+        emulated = "" if kind == "device" else f" ({kind.upper()})"
+        print(f"sensor {name}: baseline {one.id} of {one.scans} scans{emulated} -> {options.out}", file=out)
+    if replaced:
+        print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)
+
+
+def _source(options: argparse.Namespace, give_up_s: float) -> Source:
+    return open_source(
+        *options.source,
+        sensor=options.sensor,
+        id_map=options.id_map,
+        rate_hz=options.rate_hz,
+        give_up_s=give_up_s,
+        force=options.force,
+    )
+
+
+def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr record`: a run with a recording, which is reported at the end, however the run ends."""
     path = Path(options.file)
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
@@ -72,7 +147,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     check_apart(options.sink)
     statistics = Statistics()
     try:
-        yield statistics
+        follow(options, out, err, statistics)
     finally:
         if path.exists():
             size_mb = path.stat().st_size / 1e6
@@ -80,12 +155,11 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
             sure = sys.exception() is None and not statistics.unwritten  # else a sink has reported what it lacks
             held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
             with suppress(OSError):  # the terminal may have gone
-                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
+                err.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
 
 
-@contextmanager
-def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
-    """Yield the sink of a map, and report what is on it at the end, however the run ends."""
+def map_object(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr map`: a run whose results make a map, which is reported at the end, however the run ends."""
     from edge.api import MapSink, ObjectMap
 
     for path, ending in ((options.out, ".npz"), (options.png, ".png")):
@@ -96,11 +170,11 @@ def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
     whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
     sink = MapSink(whole, npz=options.out, png=options.png)
     try:
-        yield sink
+        follow(options, out, err, mapping=sink)
     finally:
         if sink.fused or sys.exception() is None:
             with suppress(OSError):  # the terminal may have gone
-                sys.stderr.write(f"{sink.summary()}\n")
+                err.write(f"{sink.summary()}\n")
 
 
 def run(

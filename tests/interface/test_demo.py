@@ -281,5 +281,5 @@ def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(mo
     def ask(*names, **_):
         raise UsageError(*names)
 
-    monkeypatch.setattr(cli, "open_source", ask)
+    monkeypatch.setattr(run_command, "open_source", ask)
     assert cli.main(arguments) == 2 and capsys.readouterr().err == f"edge-sr: {source}\n"
