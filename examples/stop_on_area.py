@@ -61,23 +61,13 @@ class PrintedGripper:
 class Grip:
     """One closing of a gripper, from the time when every pad is ready and free until it ends.
 
-    Attributes:
-        why: reason for its end.
-        reached: True if it ended because the area was large enough.
+    Then `why` is the reason for its end, and `reached` is true if the area was large enough.
     """
 
     def __init__(
         self, gripper: Gripper, area_mm2: float, *, most_counts: float, oldest_ms: float, name: str | None = None
     ) -> None:
-        """Prepare to grip.
-
-        Args:
-            gripper: at rest.
-            area_mm2: touched area at which to stop.
-            most_counts: summed z over the baseline at which to stop in any case.
-            oldest_ms: age of a reading, or time without one, at which to stop.
-            name: of the one sensor to use; None for all.
-        """
+        """Prepare to grip, with the limits of the command line; `name` is of the one sensor to use, None for all."""
         self.why = "it never began: no scan arrived"
         self.reached = False
         self._gripper = gripper
@@ -104,7 +94,8 @@ class Grip:
                 for latest in stream.latest_of_all().values():
                     if latest.new and latest.result is not None and not self._ended:
                         self.follow(latest.result)
-                self._mind_silence()
+                if (silent := self._silent()) is not None:
+                    self._end(silent)
             self._end("no more readings: the time is over, or the source")
         finally:
             self._gripper.stop()
@@ -156,11 +147,6 @@ class Grip:
         if result.force_counts > self._most_counts:
             return f"the force is {result.force_counts:.0f} counts"
         return None
-
-    def _mind_silence(self) -> None:
-        silent = self._silent()
-        if silent is not None:
-            self._end(silent)
 
     def _silent(self) -> str | None:
         """Return a message about the first sensor that is silent for too long, or None."""

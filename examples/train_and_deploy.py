@@ -56,15 +56,12 @@ from train.fit import main as fit
 from train.networks.registry import build
 
 NETWORK = "compact-stsr"
-BATCH = 64
 TRIED = 8
 """Presses, and steps, that are tried for an estimate."""
 REST_STEPS = 150
 """Steps that take as long as all else: importing, the validation set, the export and its checks."""
 JUDGED = 60
 """Presses, each on a pad of its own, by which the model is compared with others."""
-LEAST_SHARE = 0.005
-"""Smallest share of presses and steps, whatever minutes are given."""
 
 
 def tried(mesh: Path) -> tuple[float, float]:
@@ -76,7 +73,7 @@ def tried(mesh: Path) -> tuple[float, float]:
             taps(Path(folder) / f"{name}.npz", ["--families", "none", "--mesh", str(mesh)], TRIED, 1)
             seconds.append(time.monotonic() - start_s)
     press_s = min(seconds) / TRIED / len(os.sched_getaffinity(0))
-    net, window, seconds = build(NETWORK, 10), torch.randn(BATCH, 3, 4, 4), []
+    net, window, seconds = build(NETWORK, 10), torch.randn(64, 3, 4, 4), []
     for _ in range(TRIED):
         start_s = time.monotonic()
         outputs: tuple[torch.Tensor, ...] = net(window)
@@ -89,7 +86,7 @@ def tried(mesh: Path) -> tuple[float, float]:
 def fitted(minutes: float, presses: int, steps: int, press_s: float, step_s: float) -> tuple[int, int]:
     """Return fewer presses and steps, in their proportion, that take so many minutes together."""
     share = (60 * minutes - REST_STEPS * step_s) / (presses * press_s + steps * step_s)
-    share = min(max(share, LEAST_SHARE), 1.0)
+    share = min(max(share, 0.005), 1.0)
     return max(round(share * presses), 1), max(round(share * steps), 1)
 
 

@@ -17,37 +17,19 @@ import numpy as np
 from edge.bench import contenders
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
 from edge.bench.contenders import Subject
-from edge.bench.options import BenchError
 from edge.bench.provenance import provenance, this_machine, with_head
-from edge.bench.system import Page, line, show_system
+from edge.bench.system import BenchError, Page, line, show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 
 STARTS: Final = 5  # number of starts whose median is the start-up
-INTERRUPTED: Final = 130
-"""Exit code that a shell gives for Ctrl-C: unlike a run that is stopped, a bench is then not whole."""
-FULL_TICKS: Final = 3000  # fewest ticks for which p99.9 rests on more than the longest few
-_BLAS: Final = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
-_ERROR_COLUMNS: Final = (
-    *("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %"),
-    "force error %",
-)
-_FIGURES: Final = ("p50_us", "p99_us", "p999_us", "max_us")
-_PERCENTILES: Final = ("p50 us", "p99 us", "p99.9 us", "max us")
-_FRONT_COLUMNS: Final = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
-_RUN_TIME: Final = (
-    "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is faster "
-    "with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. Start-up is "
-    "from the spawn to the first pattern, MB the most memory resident till then."
-)
-_FRONT: Final = "On {} thread{}. * is on the Pareto front: no other is at least as good in both RMSE and paced p50."
+_FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 
 
 def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
     """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
 
-    Raises:
-        EdgeError: an input cannot be used, or a measurement failed; the measurements so far are written first.
+    Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
     """
     page = Page(out, err)
     try:
@@ -60,7 +42,8 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
     system = options.system or options.sensors is not None or options.against is not None
     threads = sorted(set(options.threads))
-    few = "" if options.ticks >= FULL_TICKS else f" (fewer than {FULL_TICKS}: p99.9 and misses mean little)"
+    # With fewer p99.9 rests on the longest few.
+    few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
     date = datetime.now(UTC).isoformat(timespec="seconds")
     page.say(
         f"# Error against run time\n\n{date}, `{command}`\n\n{this_machine()}. {options.ticks} ticks a row at "
@@ -77,7 +60,7 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
-        return INTERRUPTED
+        return 130  # as a shell's: unlike a run that is stopped, a bench is then not whole
     finally:
         if lines and options.out is not None:  # an earlier bench is not replaced by an empty one
             models = [Path(subject.path) for subject in everyone if subject.path]
@@ -91,7 +74,8 @@ def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str
         f"up to, by the one factor that suits true patterns best: those themselves are "
         f"{force_floor_percent(frozen):.2f} % off."
     )
-    page.section("Error", text, _ERROR_COLUMNS)
+    columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
+    page.section("Error", text, (*columns, "force error %"))
     rows: list[ErrorRow] = []
     for subject in page.tracked(everyone, "error"):
         page.progress(f"error of {subject.name}")
@@ -125,9 +109,14 @@ def _run_times(
     lines: list[dict[str, Any]],
     page: Page,
 ) -> None:
-    columns = ("method", "threads", *(f"back to back {figure}" for figure in _PERCENTILES))
-    columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _PERCENTILES), "missed", "CPU %")
-    page.section("Run time", _RUN_TIME, (*columns, "start-up ms", "MB"))
+    columns = ("method", "threads", *(f"back to back {figure}" for figure in _FIGURES.values()))
+    columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
+    text = (
+        "Each row in a process of its own, with all taps that the method takes; only a model that takes poses is "
+        "faster with fewer, and not measured so. Missed: ticks whose inference was not done when the next was due. "
+        "Start-up is from the spawn to the first pattern, MB the most memory resident till then."
+    )
+    page.section("Run time", text, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
     for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
         page.progress(f"run time of {subject.name}, {count} thread{'s' * (count > 1)}")
@@ -145,14 +134,11 @@ def _run_times(
 
 
 def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
-    """Return a child's result of a job of `edge.bench.timing`.
-
-    Raises:
-        BenchError: the child failed; its last line is in the message.
-    """
+    """Return a child's result of a job of `edge.bench.timing`; raises BenchError, with its last line, if it failed."""
     # The child imports the same modules as this process, however they were located.
     script = f"import sys; sys.path[:] = {sys.path!r}; from edge.bench.timing import main; sys.exit(main())"
-    variables = {f"{library}_THREADS": str(threads) for library in _BLAS}
+    libraries = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM")
+    variables = {f"{library}_THREADS": str(threads) for library in libraries}
     command, pipe = [sys.executable, "-c", script], subprocess.PIPE
     environment = os.environ | variables
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as child:
@@ -192,7 +178,9 @@ def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads:
     rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
     if not rows:
         return
-    page.section("Pareto front", _FRONT.format(threads, "s" * (threads > 1)), _FRONT_COLUMNS)
+    text = "* is on the Pareto front: no other is at least as good in both RMSE and paced p50."
+    columns = ("front", "method", "taps given", "RMSE %", "PSNR dB", "paced p50 us")
+    page.section("Pareto front", f"On {threads} thread{'s' * (threads > 1)}. {text}", columns)
     best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
     for row, is_best in zip(rows, best, strict=True):
         figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")

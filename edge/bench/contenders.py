@@ -30,10 +30,8 @@ class Subject(NamedTuple):
 def subjects(scale: int, folder: Path | None, refused: Callable[[str], object]) -> list[Subject]:
     """Return the methods without a network, the bundled models, and the user's own in a folder, named FOLDER/NAME.
 
-    `refused` gets a line for each file in it that is no usable model; `scale` is that of the test set.
-
-    Raises:
-        UsageError: no such folder, or no .onnx in it.
+    `refused` gets a line for each file in it that is no usable model; `scale` is that of the test set. Raises
+    UsageError where there is no such folder, or no .onnx in it.
     """
     everyone = [Subject(name, None, scale) for name in fitted_methods(CLASSICAL_FILE, scale)]
     everyone += [Subject(path.stem, str(path)) for path in bundled_models()]
@@ -55,11 +53,7 @@ def subjects(scale: int, folder: Path | None, refused: Callable[[str], object]) 
 
 
 def chosen(everyone: list[Subject], names: list[str] | None) -> list[Subject]:
-    """Return the subjects of these names, or all if there are no names.
-
-    Raises:
-        UsageError: no subject has this name; the names are listed.
-    """
+    """Return the subjects of these names, or all if there are no names; raises UsageError for an unknown one."""
     if names is None:
         return everyone
     known = {subject.name for subject in everyone}

@@ -13,14 +13,14 @@ import tarfile
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TextIO, TypeVar
 
 import numpy as np
 
-from edge.bench.options import BenchError
+from edge.errors import EdgeError
 from edge.pipeline.result_stream import uncollected
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.recording.csv_reader import CSV_HEADER
@@ -32,36 +32,30 @@ SETTLE_S: Final = 2.0
 RATE_HZ: Final = 100.0
 CONTROLLERS: Final = ("4", "6", "8", "10")  # names of the sensors on a bus: at 1 Mbit/s it carries no more
 FRAME_US: Final = 130
-PRESSED_SHARE: Final = 3  # in contact, one sensor in so many is pressed, rounded up
-PARTS: Final = ("at rest", "in contact")
 COLUMNS: Final = ("what", "CPU %", "last byte to record p50 us", "p99 us", "lost", "MB")
-LOST: Final = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")
-"""Counters of scans without a pattern or a record, and of frames; those of the start do not count."""
-UNMATCHED: Final = ("missing_taxels", "missed", "resynchronised", "abandoned")
-"""Counters of what makes the numbers of scans differ from those of the emulator."""
 _SCANS: Final = 500
 _TEXT: Final = """\
 edge-sr in a process of its own reads emulated sensors, a process too, over pseudo-terminals, by buses of four. CPU is
 of all its threads, by the scheduler, in % of one core. At rest there is the status line alone; in contact a third of
 the sensors, at least one, is pressed, each scan gets a pattern, and records of some 25 kB go to a pipe that is read at
 once. Lost: scans without a pattern or a record, and frames that did not arrive, which leave records without their scan.
-Medians of {} rounds of {:g} s, least to most in brackets."""
+"""
 
 
 _Thing = TypeVar("_Thing")
 
 
-def line(cells: Sequence[str]) -> str:
+def line(cells: Iterable[str]) -> str:
     """Return a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
-class Page:
-    """Page of lines that are shown at once and kept; progress is shown on a terminal alone, and overwritten.
+class BenchError(EdgeError, RuntimeError):
+    """Error of a measurement that could not be made, or of an earlier bench that cannot be used."""
 
-    Attributes:
-        lines: all lines so far.
-    """
+
+class Page:
+    """Page of `lines` that are shown at once and kept; progress is shown on a terminal alone, and overwritten."""
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
         self.lines: list[str] = []
@@ -148,11 +142,7 @@ class Program:
 
 
 def tree_of(commit: str, folder: Path) -> Path:
-    """Write the runtime of a commit into a folder.
-
-    Raises:
-        BenchError: there is no such commit here.
-    """
+    """Write the runtime of a commit into a folder; raises BenchError if there is no such commit here."""
     command = ["git", "-C", str(ROOT), "archive", commit, "edge", "firmware_bridge"]
     archive = subprocess.run(command, capture_output=True, check=False)
     if archive.returncode:
@@ -165,20 +155,19 @@ def tree_of(commit: str, folder: Path) -> Path:
 def show_system(scans: int, sensors: int, against: str | None, page: Page) -> list[dict[str, Any]]:
     """Measure the whole program, in turn with another commit where one is named, and show it row by row.
 
-    Each sensor makes so many scans in all rounds of a row.
-
-    Raises:
-        BenchError: a process ended, or there is no such commit.
+    Each sensor makes so many scans in all rounds of a row. Raises BenchError if a process ended, or there is no such
+    commit.
     """
     found: list[dict[str, Any]] = []
     round_s = scans / RATE_HZ / ROUNDS
-    page.section("The whole program", _TEXT.format(ROUNDS, round_s), COLUMNS)
+    medians = f"Medians of {ROUNDS} rounds of {round_s:g} s, least to most in brackets."
+    page.section("The whole program", _TEXT + medians, COLUMNS)
     with tempfile.TemporaryDirectory() as name:
         trees = {"": ROOT}
         if against is not None:
             (Path(name) / "tree").mkdir()
             trees[f", {against}"] = tree_of(against, Path(name) / "tree")
-        rounds = [(part, number) for part in PARTS for number in range(ROUNDS)]
+        rounds = [(part, number) for part in ("at rest", "in contact") for number in range(ROUNDS)]
         costs: dict[str, list[Cost]] = defaultdict(list)
         for part, number in page.tracked(rounds, "the program"):
             for tree, folder in trees.items():
@@ -189,7 +178,7 @@ def show_system(scans: int, sensors: int, against: str | None, page: Page) -> li
                     cells = map(_middle, zip(*costs[part + tree], strict=True))
                     what = f"{part}, {sensors} sensor{'s' * (sensors > 1)}{tree}"
                     found.append({"method": what} | dict(zip(COLUMNS[1:], cells, strict=True)))
-                    page.say(line([str(cell) for cell in found[-1].values()]))
+                    page.say(line(map(str, found[-1].values())))
                 if against is not None:
                     page.say(line(_ratios(f"{part}, ratio", costs[part], costs[f"{part}, {against}"])))
     return found
@@ -208,9 +197,13 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
         sensor, _, time_ns = one.partition(" ")
         times_ns[sensor].append(int(time_ns))
     first, last = (_newest_counters(some) for some in (settled, [*settled, *records]))
-    lost = sum(last.get(name, 0) - first.get(name, 0) for name in LOST)
+    # Scans without a pattern or a record, and frames; those of the start do not count.
+    counted = ("dropped", "overruns", "unwritten", "missing_taxels", "duplicates")
+    lost = sum(last.get(name, 0) - first.get(name, 0) for name in counted)
     beyond = any(record["scan"] >= len(times_ns[record["sensor"]]) for _, record in records)
-    if not records or beyond or any(last.get(name, 0) for name in UNMATCHED):
+    # What makes the numbers of scans differ from those of the emulator.
+    differ = any(last.get(name, 0) for name in ("missing_taxels", "missed", "resynchronised", "abandoned"))
+    if not records or beyond or differ:
         return Cost(cpu_percent, None, None, lost, resident_mb)
     took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
     p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
@@ -229,7 +222,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     names = [prefixes[number % buses] + CONTROLLERS[number // buses] for number in range(sensors)]
     rest = _rest_counts().reshape(4, 4, 3).transpose(2, 0, 1).astype(np.float32)
     save_baselines(folder / "zero.json", [Baseline.of(name, rest, time.time(), 100, "file") for name in names])
-    pressed = -(-sensors // PRESSED_SHARE) if part == "in contact" else 0
+    pressed = -(-sensors // 3) if part == "in contact" else 0
     played = [write_recording(folder / f"{number}.csv", number, pressed=number < pressed) for number in range(sensors)]
     command = ["-m", "edge.bench.emulated_buses", "--buses", str(buses)]
     command += ["--rate-hz", str(RATE_HZ), "--frame-us", str(FRAME_US * -(-sensors // buses))]
@@ -299,10 +292,7 @@ class Ratio(NamedTuple):
 def ratio_of(over: Sequence[float], under: Sequence[float]) -> Ratio:
     """Return the ratio of the medians of two measurements' blocks, of which those of one place belong together.
 
-    The interval is that of 2000 resamples of the blocks.
-
-    Raises:
-        ValueError: no blocks, or not as many of both.
+    The interval is that of 2000 resamples of the blocks. Raises ValueError for no blocks, or not as many of both.
     """
     above, below = np.asarray(over, dtype=np.float64), np.asarray(under, dtype=np.float64)
     if not len(above) or len(above) != len(below):

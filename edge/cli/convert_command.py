@@ -10,7 +10,6 @@ from typing import Any, Final, TextIO
 from edge.errors import SinkError, UsageError
 from edge.pipeline.sink import RunFacts, check_new
 from edge.terminal.progress_bar import Progress
-from firmware_bridge.errors import harmless
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses import TimedPose
@@ -47,7 +46,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     check_new(target)
     replay = ReplayLink([source], options.rate_hz, paced=False)
     for notice in replay.notices():
-        err.write(f"edge-sr: {harmless(notice.text)}\n")
+        err.write(f"edge-sr: {notice.text}\n")
     sensors = [track.sensor for track in replay.recordings[0].tracks]
     files: dict[Path, str | None] = {target: None}
     if ending == ".csv" and len(sensors) > 1:
@@ -58,7 +57,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     for path in files:
         check_new(path)
     for path, sensor in files.items():
-        out.writelines(f"{harmless(line)}\n" for line in _write(replay, path, sensor))
+        for line in _write(replay, path, sensor):
+            out.write(f"{line}\n")
     out.write(f"not in it: {_WITHOUT[was, ending]}\n")
 
 

@@ -37,20 +37,10 @@ _BEGINS: Final = {
     MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
     SLIDE: "demo: now the pad slides along another object, a long letter: a map is made of its patterns",
 }
-_MAP_MARGIN_MM: Final = 1.0
-_MAP_COLUMNS: Final = 72
 
 
 class DemoRecording:
-    """Facts on the demo's recording by the raw counts of its scans, so that a lost scan shifts nothing.
-
-    Attributes:
-        arrays: of the file.
-        scenes: scene of each scan.
-        taps: number of the tap of each scan of a tap, and its indentation in [mm]. The taps of the figure come first,
-            after them those that may be played in place of all but the first.
-        figure_taps: number of taps of the figure.
-    """
+    """Facts on the demo's recording by the raw counts of its scans, so that a lost scan shifts nothing."""
 
     def __init__(self, path: Path) -> None:
         with np.load(path, allow_pickle=False) as data:
@@ -58,6 +48,7 @@ class DemoRecording:
         counts = self.arrays["counts"]
         self.figure_taps = len(self.arrays["tap_pose"])
         self.scenes = dict(zip(map(_key, counts), self.arrays["scene"].tolist(), strict=True))
+        # Tap and indentation in [mm] of each scan of one; after those of the figure come those played in their place.
         played = zip(counts, self.arrays["tap"].tolist(), self.arrays["indentation_mm"].tolist(), strict=True)
         self.taps = {_key(scan): (tap, depth_mm) for scan, tap, depth_mm in played if tap >= 0}
         options = zip(self.arrays["option_counts"], self.arrays["option_indentation_mm"].tolist(), strict=True)
@@ -67,23 +58,6 @@ class DemoRecording:
 
 def _key(counts: NDArray[np.integer]) -> bytes:
     return counts.astype(np.int32).tobytes()
-
-
-class DemoRobot:
-    """Robot that goes, after each tap of the figure, where the next one is proposed."""
-
-    def __init__(self, recording: DemoRecording, touch: Callable[[PadPose | None], object]) -> None:
-        """Begin before the first tap; `touch` gets the pose of each proposal, None where nothing is proposed."""
-        self._recording, self._touch = recording, touch
-        self._tapping = False
-
-    def add(self, result: Result) -> None:
-        """Ask for the next tap once this one is over."""
-        if result.contact:
-            self._tapping |= _key(result.scan.counts) in self._recording.taps
-        elif self._tapping and result.contact is False:
-            self._tapping = False
-            self._touch(None if result.next_tap is None else result.next_tap.target)
 
 
 class DemoScenes:
@@ -144,17 +118,11 @@ class TapScore:
 
 
 class DemoScore:
-    """Score of the figure: of each tap the result with the largest force, until the last tap is over.
+    """Score of the figure: of each tap the result with the largest force; `complete` once the last tap is over."""
 
-    Attributes:
-        complete: True once the last tap is over.
-    """
-
-    def __init__(
-        self, recording: DemoRecording, model: Model, on_complete: Callable[["DemoScore"], object] = lambda score: None
-    ) -> None:
-        """Begin before the first tap; `on_complete` is called once, when the last tap is over."""
-        self._recording, self._model, self._on_complete = recording, model, on_complete
+    def __init__(self, recording: DemoRecording, model: Model) -> None:
+        """Begin before the first tap."""
+        self._recording, self._model = recording, model
         self._peaks: list[tuple[Result, int, float]] = []  # with number of the recording's tap, and indentation in [mm]
         self._between = True
         self.complete = False
@@ -168,7 +136,6 @@ class DemoScore:
         figure_over = self._between and len(self._peaks) == self._recording.figure_taps
         if figure_over or (self._peaks and self._recording.scenes.get(key, FREE) != FREE):
             self.complete = True
-            self._on_complete(self)
             return
         if key not in self._recording.taps or result.pattern is None or result.force_counts is None:
             return
@@ -265,15 +232,10 @@ def _score_picture(score: TapScore, palette: Palette) -> str:
 class DemoMap(MapSink):
     """Map of the slide alone, beside the truth, a letter: `complete` is true once the slide is over."""
 
-    def __init__(
-        self,
-        recording: DemoRecording,
-        show: Callable[[MapState], object] | None,
-        on_complete: Callable[["DemoMap"], object],
-    ) -> None:
-        """Begin before the slide; `on_complete` is called once, when it is over."""
+    def __init__(self, recording: DemoRecording, show: Callable[[MapState], object] | None) -> None:
+        """Begin before the slide."""
         arrays = recording.arrays
-        self._recording, self._letter, self._on_complete = recording, arrays["letter"], on_complete
+        self._recording, self._letter = recording, arrays["letter"]
         px_per_mm, (x_mm, y_mm) = float(arrays["letter_px_per_mm"]), arrays["letter_centre_mm"].tolist()
         super().__init__(ObjectMap(len(self._letter) / px_per_mm, px_per_mm, centre_mm=(x_mm, y_mm)), show=show)
         self._begun = self.complete = False
@@ -284,9 +246,8 @@ class DemoMap(MapSink):
         if scene == SLIDE:
             self._begun = True
             super().write(result, counters)
-        elif scene is not None and self._begun and not self.complete:
-            self.complete = True
-            self._on_complete(self)
+        elif scene is not None:
+            self.complete = self._begun
 
     def text(self, palette: Palette) -> str:
         """Return the map's distance from the truth, and both as pictures; nothing before the slide."""
@@ -298,7 +259,7 @@ class DemoMap(MapSink):
         px_per_mm = self.whole.grid.px_per_mm
         away_mm = float(boundary_distance_mm(contact[None], self._letter[None], 0.5, 1 / px_per_mm)[0])
         rows, cols = (np.flatnonzero(self._letter.any(axis=axis)) for axis in (1, 0))
-        margin = round(_MAP_MARGIN_MM * px_per_mm)
+        margin = round(1.0 * px_per_mm)  # of 1 mm
         shown = tuple(slice(max(0, one[0] - margin), one[-1] + 1 + margin) for one in (rows, cols))
         length_mm = (cols[-1] + 1 - cols[0]) / px_per_mm
         title = f"map of a letter of {length_mm:.0f} mm, from one slide: {self.whole.fused} patterns fused, "
@@ -306,7 +267,7 @@ class DemoMap(MapSink):
             Panel("map", contact[shown], 0.0, 1.0, "touched"),
             Panel("truth", self._letter[shown].astype(np.float64), 0.0, 1.0, "touched"),
         ]
-        pictures = "\n\n".join(draw([panel], columns(), palette, widest=_MAP_COLUMNS) for panel in panels)
+        pictures = "\n\n".join(draw([panel], columns(), palette, widest=72) for panel in panels)
         return f"{title}outline {away_mm:.2f} mm from the truth\n{pictures}"
 
 
@@ -332,45 +293,52 @@ class Demo(Sink):
         maps: bool,
     ) -> None:
         """Begin the demo; scenes are announced to the sinks that are `watching`."""
-        recording = DemoRecording(demo_recording())
+        self._recording = recording = DemoRecording(demo_recording())
         self._stream, self._view, self._loops = stream, view, loops
-        self._score = DemoScore(recording, model, self._completed)
-        self.map = DemoMap(recording, None if view is None else view.show_map, self._completed) if maps else None
+        self._score = DemoScore(recording, model)
+        self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
+        self._unprinted = [self._score, *([] if self.map is None else [self.map])]
         # Without poses a model's taps must follow the paper's schedule, as the recording does.
-        touch = source.steer() if model.contract.takes_poses else None
-        self._robot = None if touch is None else DemoRobot(recording, touch)
+        self._touch = source.steer() if model.contract.takes_poses else None
+        self._tapping = False
 
         def tell(event: Event) -> None:
             for sink in watching:
                 sink.tell(event, {})
 
         self._scenes = DemoScenes(recording, tell, lambda: commands.put(RESET))
-        how = "where it is proposed" if self._robot else "by a fixed schedule"
+        how = "where it is proposed" if self._touch else "by a fixed schedule"
         taps = f"{str(recording.arrays['surface'])!r} {recording.figure_taps} times"
         sys.stderr.write(f"demo: an emulated sensor taps {taps}, {how}, zeroed first\n")
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Follow the demo."""
         self._score.add(result)
-        if self._robot is not None:
-            self._robot.add(result)
+        if self._touch is not None:
+            self._steer(result, self._touch)
         self._scenes.add(result)
+        complete = [part for part in self._unprinted if part.complete] if self._loops else []
+        for part in complete:
+            self._print(part)
+        if complete and not self._unprinted:
+            page = "" if self._view is None else f"live page: {self._view.url}; "
+            sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
+
+    def _steer(self, result: Result, touch: Callable[[PadPose | None], object]) -> None:
+        """Send the robot, after each tap of the figure, where the next one is proposed."""
+        if result.contact:
+            self._tapping |= _key(result.scan.counts) in self._recording.taps
+        elif self._tapping and result.contact is False:
+            self._tapping = False
+            touch(None if result.next_tap is None else result.next_tap.target)
 
     def finish(self) -> None:
         """Print what was not printed while the demo went on."""
-        for part in (self._score, self.map):
-            if part is not None and not (self._loops and part.complete):
-                self._print(part)
-
-    def _completed(self, part: DemoScore | DemoMap) -> None:
-        if not self._loops:
-            return
-        self._print(part)
-        if part is self.map or self.map is None:
-            page = "" if self._view is None else f"live page: {self._view.url}; "
-            sys.stderr.write(f"\n{page}the demo continues until Ctrl-C\n")
+        for part in [*self._unprinted]:
+            self._print(part)
 
     def _print(self, part: DemoScore | DemoMap) -> None:
         stream = drawn(self._stream)
         if text := part.text(choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)):
             stream.write(f"\n{text}\n")
+        self._unprinted.remove(part)

@@ -1,4 +1,4 @@
-"""Options of `edge-sr` and its commands, one row each; those of the bench, which is in another wheel, are with it."""
+"""Options of `edge-sr` and its commands, one row each."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.mapping.evidence import PX_PER_MM, SIZE_MM
-from edge.perception.contact_options import DEFAULTS
+from edge.perception.contact_options import RuntimeOptions
 from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
@@ -27,6 +27,12 @@ class Option:
         self.name, *values = form.split(" ")
         shown: dict[str, Any] = {"metavar": values[0] if len(values) == 1 else tuple(values)} if values else {}
         self.settings: dict[str, Any] = _SETTINGS.get(kind, {"type": kind}) | shown | {"help": text} | more
+
+
+def _runtime(name: str, kind: Callable[[str], Any], **more: Any) -> Option:
+    """Return the row of an option of the runtime."""
+    field = RuntimeOptions.__dataclass_fields__[name]
+    return Option(field.metadata["form"], kind, field.metadata["text"], default=field.default, **more)
 
 
 class Group:
@@ -76,22 +82,17 @@ RESULTS: Final = (
         Option("--view-record-dir DIR", Path, "folder for recordings begun on the page (default: the current one)"),
     ),
     Group("contact",
-        Option("--contact-on-counts N", positive, "a tap begins when the z readings, summed over the pad, reach N "
-               "counts; some 1150 counts are 1 N (default %(default)g)", default=DEFAULTS.contact_on_counts),
-        Option("--contact-off-counts N", positive, "a tap ends when they fall below N (default %(default)g)",
-               default=DEFAULTS.contact_off_counts),
+        _runtime("contact_on_counts", positive),
+        _runtime("contact_off_counts", positive),
         Option("--counts-per-newton C", lambda text: positive(text, *PAD_RANGES["counts_per_newton"]),
                "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
-        Option("--idle-reset-s T", positive, "forget earlier taps after T seconds without contact (default "
-               "%(default)g)", default=DEFAULTS.idle_reset_s),
-        Option("--taps K", whole(1), "combine at most K taps to a pattern (default: as many as the model takes; if "
-               "it takes poses of the pad and there are none 1, or as many as its name states, such as mtsr4)"),
+        _runtime("idle_reset_s", positive),
+        _runtime("taps", whole(1)),
         about="A tap is one press, from touch to release. Counts are the units of raw readings.",
     ),
     Group("checks of patterns and sensor",
-        Option("--no-learn", bool, "do not learn from contacts how sensitive each taxel is",
-               dest="learn", action="store_false"),
-        Option("--every-scan", bool, "compute a pattern even if the readings have not changed"),
+        _runtime("learn", bool, dest="learn", action="store_false"),
+        _runtime("every_scan", bool),
     ),
 )
 PROCESSOR: Final = Group("processor",
@@ -150,4 +151,15 @@ DOCTOR: Final = (
         Option("--forget-gains SENSOR", str, "remove what the sensor of this name learned from contacts from the file "
                "of --sensor, and end"),
     ),
+)
+BENCH: Final = Group(None,
+    Option("--out DIR", Path, "folder for bench.csv and bench.md"),
+    Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
+    Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
+    Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
+    Option("--models DIR", Path, "folder of your own models, measured as well"),
+    Option("--only NAME", str, "measure only these methods", nargs="+"),
+    Option("--system", bool, "measure the whole program only: 2 minutes with 3000 ticks"),
+    Option("--sensors N", whole(1), "measure the whole program with so many sensors (default 1)"),
+    Option("--against COMMIT", str, "measure the whole program in turn with that of another commit"),
 )

@@ -1,7 +1,4 @@
-"""Real-time scheduling of `--realtime`: each part requested on its own, with one line for each that is refused.
-
-The pin is to the last of the processors that may be used, since interrupts and most other work run on the first.
-"""
+"""Real-time scheduling of `--realtime`: each part requested on its own, with one line for each that is refused."""
 
 import ctypes
 import os
@@ -12,13 +9,6 @@ from functools import partial
 from typing import Final
 
 PRIORITY: Final = 20  # modest priority: above every ordinary process, below the kernel's interrupt threads (50)
-MCL_CURRENT: Final = 1
-MCL_FUTURE: Final = 2
-MCL_ONFAULT: Final = 4
-"""Flag that locks only used memory: the untouched part of every thread's stack would be 8 MB each."""
-
-_SCHEDULER_REMEDY: Final = "a line '@GROUP - rtprio 20' in /etc/security/limits.conf, or CAP_SYS_NICE, permits it"
-_MEMORY_REMEDY: Final = "'ulimit -l unlimited', a line '@GROUP - memlock unlimited' there, or CAP_IPC_LOCK, permits it"
 
 
 @contextmanager
@@ -33,11 +23,13 @@ def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> I
         yield
         return
     threads = (0, *thread_ids)  # 0 is the caller's own
+    rights = "a line '@GROUP - rtprio 20' in /etc/security/limits.conf, or CAP_SYS_NICE, permits it"
+    memory = "'ulimit -l unlimited', a line '@GROUP - memlock unlimited' there, or CAP_IPC_LOCK, permits it"
     with ExitStack() as undo:
         for name, remedy, begin in (
-            ("SCHED_FIFO", _SCHEDULER_REMEDY, partial(_schedule, threads)),
+            ("SCHED_FIFO", rights, partial(_schedule, threads)),
             ("one processor of its own", "the container or cgroup must permit it", partial(_pin, threads)),
-            ("locked memory", _MEMORY_REMEDY, _lock_memory),
+            ("locked memory", memory, _lock_memory),
         ):
             try:
                 undo.callback(begin())
@@ -64,6 +56,7 @@ def _schedule(threads: Sequence[int]) -> Callable[[], object]:
 
 
 def _pin(threads: Sequence[int]) -> Callable[[], object]:
+    """Pin them to the last processor that may be used: interrupts and most other work run on the first."""
     allowed = os.sched_getaffinity(0)
 
     def pin(processors: set[int]) -> None:
@@ -76,7 +69,8 @@ def _pin(threads: Sequence[int]) -> Callable[[], object]:
 
 def _lock_memory() -> Callable[[], object]:
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) != 0:
+    # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT, which locks only used memory: the stack of a thread alone would be 8 MB.
+    if libc.mlockall(1 | 2 | 4) != 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
     return libc.munlockall

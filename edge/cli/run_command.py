@@ -5,16 +5,17 @@ Modules that only some runs need are imported where they are used.
 
 import argparse
 import contextlib
+import ctypes
 import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, TextIO
 
 from edge.api import (
     DEFAULT_MODEL,
@@ -34,7 +35,9 @@ from edge.api import (
     load_model,
     open_runtime,
     open_sink,
+    open_source,
     pump,
+    save_baselines,
 )
 from edge.cli.run_help import runtime_options
 from edge.cli.user_commands import user_commands
@@ -42,8 +45,8 @@ from edge.errors import SinkError
 from edge.pipeline.silence_hint import silence_hint
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
-from edge.terminal.heap import give_back, share_one_heap
 from edge.terminal.stop_signals import stop_on_signals
+from firmware_bridge.in_place import BACKUP_SUFFIX
 
 if TYPE_CHECKING:
     from edge.api import MapSink
@@ -51,17 +54,86 @@ if TYPE_CHECKING:
     from edge.pipeline.replay_setup import Player
     from edge.view.server import LiveView
 
-_NOT_WRITTEN: Final = (".csv", ".npz", ".json", ".jsonl")
-"""Suffixes of other formats, which a recording must not be named after."""
+
+def follow(
+    options: argparse.Namespace,
+    out: TextIO,
+    err: TextIO,
+    statistics: Statistics | None = None,
+    mapping: "MapSink | None" = None,
+) -> None:
+    """Run `edge-sr` without a command, or with one that adds to it."""
+    if options.source == ["demo"] and options.view is not None and not set(options.sink) - {"status"}:
+        options.source = [DEMO_LOOP]  # a person may look at a page for long; a sink gets one round
+    run(options, _source(options, inf if options.give_up_s is None else options.give_up_s), statistics, mapping)
 
 
-@contextmanager
-def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
-    """Add a recording to the options of a run, and report it at the end, however the run ends."""
+def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr demo`."""
+    options.source = ["demo"]
+    follow(options, out, err)
+
+
+def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr replay`."""
+    from edge.pipeline.replay_setup import Player, open_recording
+
+    # A person looks for as long as he likes; a sink gets each result once.
+    player = Player() if options.view is not None and not set(options.sink) - {"status"} else None
+    paced = options.paced or options.view is not None
+    source = open_recording(
+        *options.file,
+        sensor=options.sensor,
+        zero=options.zero or options.baseline is not None,
+        paced=paced,
+        rate_hz=options.rate_hz,
+        bar=not paced and "status" not in options.sink,
+        player=player,
+    )
+    run(options, source, player=player)
+
+
+def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr baseline`."""
+    from edge.api import take_baselines
+
+    replaced = options.out.exists()
+    if len(options.source) == 1 and options.source[0].startswith("replay:") and options.skip is options.scans is None:
+        from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
+
+        kind, known = "replay", sensor_settings(options.sensor, options.id_map)
+        baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
+        print("\n".join(notes), file=err)
+    else:
+        with stop_on_signals() as stop, _source(options, give_up_s=0) as source:
+            kind, known = source.kind, source.sensor_file
+            asked = {name: value for name in ("scans", "skip") if (value := getattr(options, name)) is not None}
+            baselines = take_baselines(source, **asked, stop=stop)
+    save_baselines(options.out, baselines.values(), known.orders)
+    for name, one in sorted(baselines.items()):
+        emulated = "" if kind == "device" else f" ({kind.upper()})"
+        print(f"sensor {name}: baseline {one.id} of {one.scans} scans{emulated} -> {options.out}", file=out)
+    if replaced:
+        print(f"the former file is now {options.out}{BACKUP_SUFFIX}", file=out)
+
+
+def _source(options: argparse.Namespace, give_up_s: float) -> Source:
+    return open_source(
+        *options.source,
+        sensor=options.sensor,
+        id_map=options.id_map,
+        rate_hz=options.rate_hz,
+        give_up_s=give_up_s,
+        force=options.force,
+    )
+
+
+def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr record`: a run with a recording, which is reported at the end, however the run ends."""
     path = Path(options.file)
     if path.is_dir():
         raise SinkError(f"cannot record into {path}: it is a directory; name a file in it")
-    if path.suffix.lower() in _NOT_WRITTEN:
+    if path.suffix.lower() in (".csv", ".npz", ".json", ".jsonl"):
         made = path.with_suffix(".mcap")
         then = "for records in JSON use edge-sr --sink jsonl:FILE"
         if path.suffix.lower() in (".csv", ".npz"):
@@ -75,7 +147,7 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
     check_apart(options.sink)
     statistics = Statistics()
     try:
-        yield statistics
+        follow(options, out, err, statistics)
     finally:
         if path.exists():
             size_mb = path.stat().st_size / 1e6
@@ -83,12 +155,11 @@ def new_recording(options: argparse.Namespace) -> Iterator[Statistics]:
             sure = sys.exception() is None and not statistics.unwritten  # else a sink has reported what it lacks
             held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
             with suppress(OSError):  # the terminal may have gone
-                sys.stderr.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
+                err.write(f"recorded {path}: {held}, {size_mb:.2f} MB{emulated}\n")
 
 
-@contextmanager
-def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
-    """Yield the sink of a map, and report what is on it at the end, however the run ends."""
+def map_object(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Run `edge-sr map`: a run whose results make a map, which is reported at the end, however the run ends."""
     from edge.api import MapSink, ObjectMap
 
     for path, ending in ((options.out, ".npz"), (options.png, ".png")):
@@ -99,17 +170,11 @@ def new_map(options: argparse.Namespace) -> Iterator["MapSink"]:
     whole = ObjectMap(options.size_mm, options.px_per_mm, centre_mm=tuple(options.centre_mm))
     sink = MapSink(whole, npz=options.out, png=options.png)
     try:
-        yield sink
+        follow(options, out, err, mapping=sink)
     finally:
         if sink.fused or sys.exception() is None:
             with suppress(OSError):  # the terminal may have gone
-                sys.stderr.write(f"{sink.summary()}\n")
-
-
-DAY_S: Final = 86_400
-DEMO_HZ: Final = 100.0
-DEMO_REST_SCANS: Final = 100
-"""Scans without contact after which a repeating demo is at its first tap: 180 lie before it, 34 between taps."""
+                err.write(f"{sink.summary()}\n")
 
 
 def run(
@@ -125,7 +190,8 @@ def run(
     into a map, which the live page shows; it is closed here. `player` is of the recording that is the source.
     """
     stdout_taken = "jsonl:-" in options.sink
-    share_one_heap()
+    # glibc gives each thread a heap of its own, in which other threads' free memory is of no use: -8 is M_ARENA_MAX.
+    _of_glibc("mallopt", -8, 1)
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands, contextlib.closing(source):
@@ -166,13 +232,13 @@ def run(
                 played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
             asked = runtime_options(options)
             if loops:
-                rest_s = DEMO_REST_SCANS / (options.rate_hz or DEMO_HZ)
-                asked = replace(asked, idle_reset_s=min(rest_s, asked.idle_reset_s))
+                # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.
+                asked = replace(asked, idle_reset_s=min(100 / (options.rate_hz or 100.0), asked.idle_reset_s))
             if is_demo:  # it shows the run time of every scan
                 asked = replace(asked, every_scan=True)
             per_newton = options.counts_per_newton
             runtime = open_runtime(model, source, baselines=baselines, counts_per_newton=per_newton, **asdict(asked))
-            give_back()
+            give_back_memory()
             sinks: list[Sink] = []
             if played is not None:
                 sinks += [played, *([] if played.map is None else [played.map])]
@@ -213,6 +279,17 @@ def run(
             played.finish()
 
 
+def give_back_memory() -> None:
+    """Give free memory back to the system: a network takes more while it is loaded than afterwards."""
+    _of_glibc("malloc_trim", ctypes.c_size_t(0))
+
+
+def _of_glibc(name: str, *arguments: Any) -> None:
+    """Call a function of glibc's malloc; other C libraries have none of these, and stay as they are."""
+    if (function := getattr(ctypes.CDLL(None), name, None)) is not None:
+        function(*arguments)
+
+
 def _open_view(
     options: argparse.Namespace, contract: Contract, commands: Commands
 ) -> "contextlib.AbstractContextManager[LiveView | None]":
@@ -250,7 +327,7 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
 
 def recorded_text(made_s: float, now_s: float) -> str:
     """Return when a recording was made, both in [s] since 1970: a pad wears, and its rest level moves."""
-    days = max(now_s - made_s, 0.0) / DAY_S
+    days = max(now_s - made_s, 0.0) / 86_400
     ago = (
         f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
     )

@@ -152,6 +152,18 @@ free pad is measured.
 Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong usage, 3 sensor, 130 Ctrl-C.
 """
 
+_BENCH: Final = """\
+Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
+program should run meanwhile.
+
+examples:
+  edge-sr bench --out today
+  edge-sr bench --threads 1 \\
+          --only stsr mtsr
+
+Ctrl-C ends it with exit code 130, after the rows measured so far are written.
+"""
+
 HELP: Final = {
     "": Help(
         "[options]\n       edge-sr COMMAND [options]",
@@ -205,6 +217,12 @@ HELP: Final = {
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
         of.DOCTOR,
         _DOCTOR,
+    ),
+    "bench": Help(
+        "[options]",
+        "Measures error against run time of the bundled models and of methods without a network.",
+        (of.BENCH,),
+        _BENCH,
     ),
 }
 

@@ -4,15 +4,12 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, Final, TextIO, cast
+from typing import Any, TextIO, cast
 
 from edge.errors import SinkError
 from firmware_bridge.errors import harmless
 
 STDIN, STDOUT, STDERR = 0, 1, 2
-_MODES: Final = {STDIN: os.O_RDONLY, STDOUT: os.O_RDONLY, STDERR: os.O_WRONLY}
-"""Modes of the files that replace closed streams. Writing to stdout still fails, so that results are not lost without
-a message; stderr discards its text."""
 
 
 def open_closed_streams() -> None:
@@ -20,7 +17,8 @@ def open_closed_streams() -> None:
 
     Python's messages for a closed stderr would else go to stdout, between records.
     """
-    for number, mode in _MODES.items():
+    # Writing to stdout still fails, so that results are not lost without a message; stderr discards its text.
+    for number, mode in ((STDIN, os.O_RDONLY), (STDOUT, os.O_RDONLY), (STDERR, os.O_WRONLY)):
         with contextlib.suppress(OSError):
             os.fstat(number)
             continue

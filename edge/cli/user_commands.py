@@ -13,7 +13,6 @@ from edge.pipeline.commands import RESET, ZERO, Command, Commands, read_stdin
 from edge.terminal.stop_signals import before_force, handled
 
 KEYS: Final = {ord("r"): RESET, ord("z"): ZERO, ord("Z"): Command("zero", force=True)}
-ENDING: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
 class Keys:
@@ -112,7 +111,7 @@ def _given_back_on_signals(keys: Keys) -> Iterator[None]:
         signal.signal(signal.SIGTSTP, stop)
         keys.take()
 
-    with handled(ENDING, end) as before, handled(["SIGTSTP"], stop):
+    with handled(("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT"), end) as before, handled(["SIGTSTP"], stop):
         yield
 
 

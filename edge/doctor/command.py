@@ -8,9 +8,9 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, TextIO
+from typing import TextIO
 
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.findings import Finding, page, summary, worst
@@ -30,37 +30,25 @@ from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing.baseline import deformation
 
-EXIT_WRONG: Final = 1
-EXIT_STOPPED: Final = 130
-
-
-REFRESH_S: Final = 0.1
-BAR: Final = 10
-
 
 class FeltLine:
     """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
 
-    def __init__(self, stream: TextIO, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream = drawn(stream)
-        self._clock_s = clock_s
         self._shown = 0
-        self._shown_s = self._asked_s = clock_s()
-
-    def asked(self) -> None:
-        """Begin the time of a request."""
-        self._asked_s = self._clock_s()
+        self._shown_s = self.asked_s = time.monotonic()
 
     def show(self, guide: GuidedPress) -> None:
         """Show the load on the pad, at most ten times a second."""
-        now_s = self._clock_s()
-        if now_s - self._shown_s < REFRESH_S or not rewritable(self._stream):
+        now_s = time.monotonic()
+        if now_s - self._shown_s < 0.1 or not rewritable(self._stream):
             return
         self._shown_s = now_s
-        full = min(int(BAR * guide.felt), BAR)
-        left_s = max(PATIENCE_S - (now_s - self._asked_s), 0)
+        full = min(int(10 * guide.felt), 10)
+        left_s = max(PATIENCE_S - (now_s - self.asked_s), 0)
         skip = ", Enter skips" if _stdin_is_terminal() else ""
-        self._write(f"felt [{'#' * full:{BAR}}] {left_s:.0f} s left{skip}")
+        self._write(f"felt [{'#' * full:10}] {left_s:.0f} s left{skip}")
 
     def clear(self) -> None:
         """Clear the line, for text that stays."""
@@ -95,20 +83,14 @@ class Visit:
     """
 
     def __init__(
-        self,
-        options: argparse.Namespace,
-        link: Link,
-        known: SensorFile,
-        err: TextIO,
-        stop: threading.Event,
-        clock_s: Callable[[], float],
+        self, options: argparse.Namespace, link: Link, known: SensorFile, err: TextIO, stop: threading.Event
     ) -> None:
         """Prepare the visit; requests to a person go to `err`."""
         self.mountings: dict[str, Mounting] = {}
         self.newtons: dict[str, float] = {}
         self.unfinished = False
         self._options, self._link, self._known = options, link, known
-        self._err, self._stop, self._clock_s = err, stop, clock_s
+        self._err, self._stop = err, stop
 
     def watch(self, watched: Watched) -> None:
         """Watch the link while the pads are free; raises LinkLostError."""
@@ -121,7 +103,7 @@ class Visit:
                     bar.note(f"{scans / passed_s:.0f} scans/s")
                 bar.reach(min(passed_s, length_s))
 
-            watch(self._link, watched, length_s, self._stop, tell=show, clock_s=self._clock_s)
+            watch(self._link, watched, length_s, self._stop, tell=show)
 
     def press(self, names: Sequence[str], examined: Examined) -> None:
         """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
@@ -151,24 +133,24 @@ class Visit:
         baseline, mounting = examined.baselines[name], self._known.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
             self._say(whose + guide.first)
-        received_s = self._clock_s()
-        line = FeltLine(self._err, self._clock_s)
+        received_s = time.monotonic()
+        line = FeltLine(self._err)
         enter_pressed()  # one of before is no answer to this request
 
         def ask(request: str | None) -> None:
             if request is not None:
                 line.clear()
                 self._say(whose + request)
-                line.asked()
+                line.asked_s = time.monotonic()
 
         while not (guide.done or self._stop.is_set() or self._link.ended):
-            if self._clock_s() - received_s > GIVEN_UP_S:
+            if time.monotonic() - received_s > GIVEN_UP_S:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
             for scan in self._link.read(POLL_S):
                 if scan.sensor == name:
-                    received_s = self._clock_s()
+                    received_s = time.monotonic()
                     ask(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
             if enter_pressed():
                 ask(guide.skip())
@@ -188,7 +170,7 @@ class Visit:
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
-def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Callable[[], float] = time.monotonic) -> int:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     """Run `edge-sr doctor`; returns the exit code. Findings go to `out`, requests to a person to `err`, if a terminal.
 
     A link that was lost, and a sensor file that could not be written in the end, are raised after the findings were
@@ -206,8 +188,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
     before = stored_baselines(options.baseline, known)
     with stop_on_signals() as stop:
         link, known, watched = prepare(options.source, known, before, options.rate_hz)
-        visit = Visit(options, link, known, err, stop, clock_s)
-        start_s = clock_s()
+        visit = Visit(options, link, known, err, stop)
+        start_s = time.monotonic()
         failed: BridgeError | None = None
         whole = False
         with link:
@@ -234,7 +216,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
                 kept = True
             except SensorFileError as error:
                 failed = error
-        stopped_s = clock_s() - start_s if stop.is_set() else None
+        stopped_s = time.monotonic() - start_s if stop.is_set() else None
         if options.json:
             document = {
                 "source": link.name,
@@ -259,5 +241,5 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO, *, clock_s: Calla
         if stop.is_set():
             if options.out is not None and not kept:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
-            return EXIT_STOPPED
-    return EXIT_WRONG if visit.unfinished or worst(examined.findings) == "wrong" else 0
+            return 130
+    return 1 if visit.unfinished or worst(examined.findings) == "wrong" else 0

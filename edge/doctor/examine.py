@@ -189,13 +189,12 @@ def watch(
     stop: threading.Event,
     *,
     tell: Callable[[int, float], object] = lambda scans, passed_s: None,
-    clock_s: Callable[[], float] = time.monotonic,
 ) -> None:
     """Watch an open link for `length_s` in [s], or until `stop`, or until nothing comes any more; raises LinkLostError.
 
     `tell` is called after each read with the number of scans and the time that has passed, in [s].
     """
-    start_s = now_s = received_s = clock_s()
+    start_s = now_s = received_s = time.monotonic()
     scans = 0
     try:
         while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
@@ -203,12 +202,12 @@ def watch(
                 watched.scans.setdefault(scan.sensor, []).append(scan)
                 received_s = now_s
                 scans += 1
-            now_s = clock_s()
+            now_s = time.monotonic()
             watched.duration_s = now_s - start_s
             tell(scans, watched.duration_s)
     finally:
         watched.counters, watched.facts, watched.ids = link.counters(), link_checks.line_facts(link), link.can_ids()
-        watched.until_ns = None if link.kind == "replay" else int(clock_s() * NS_PER_S)
+        watched.until_ns = None if link.kind == "replay" else time.monotonic_ns()
 
 
 def examine(

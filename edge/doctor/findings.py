@@ -3,35 +3,23 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from edge.terminal.text_wrap import wrapped
 
 Verdict = Literal["ok", "look", "wrong", "not known"]
 
-_MARKS: Final[dict[Verdict, str]] = {"ok": "ok", "look": "LOOK", "wrong": "WRONG", "not known": "?"}
-_MARK_WIDTH: Final = 6
-
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Finding on one thing that was examined.
-
-    Attributes:
-        name: of the thing.
-        verdict: "ok"; "look", for what works but may not for long; "wrong"; "not known", if it could not be examined.
-        measured: result of the measurement, with its unit.
-        norm: expected range; empty where that goes without saying.
-        remedy: advice in plain words; empty where there is nothing to do.
-        sensor: name of the sensor; None for the link.
-    """
+    """Finding on one thing that was examined; "look" is for what works but may not for long."""
 
     name: str
     verdict: Verdict
-    measured: str
-    norm: str = ""
-    remedy: str = ""
-    sensor: str | None = None
+    measured: str  # with its unit
+    norm: str = ""  # expected range; empty where that goes without saying
+    remedy: str = ""  # in plain words; empty where there is nothing to do
+    sensor: str | None = None  # its name; None for the link
 
     def document(self) -> dict[str, Any]:
         """Return the finding as a dictionary for JSON."""
@@ -65,13 +53,14 @@ def summary(findings: Iterable[Finding]) -> str:
 
 def page(findings: Sequence[Finding], columns: int) -> str:
     """Return all findings as text, those of the link first, in lines of `columns` at most unless a word is wider."""
+    marks = {"ok": "ok", "look": "LOOK", "wrong": "WRONG", "not known": "?"}
     lines: list[str] = []
-    indent = " " * (_MARK_WIDTH + 2)
+    indent = " " * 8
     for sensor in dict.fromkeys(finding.sensor for finding in findings):
         lines.append("link" if sensor is None else f"sensor {sensor}")
         for finding in (one for one in findings if one.sensor == sensor):
             norm = f" (norm: {finding.norm})" if finding.norm else ""
             text = f"{finding.name}: {finding.measured}{norm}"
-            lines += wrapped(text, columns, f"  {_MARKS[finding.verdict]:{_MARK_WIDTH}}", indent)
+            lines += wrapped(text, columns, f"  {marks[finding.verdict]:6}", indent)
             lines += wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ")
     return "\n".join(lines)

@@ -19,30 +19,17 @@ from firmware_bridge.scans.mounting import Mounting
 
 AS_MAPPED: Final = "as in the id map"  # name of the orientation in which nothing is to be corrected
 CORNERS: Final = ("top left", "top right", "bottom right", "bottom left")
-TO_THE_MIDDLE: Final = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
-"""Signs of x and y of a push from each corner to the middle."""
 FEWEST_CORNERS: Final = 3
-AGREEING: Final = 0.8
-"""Least share of the pushes that must point along one axis: 1 where every corner agrees, 0.5 or 0 where one of four
-or three contradicts, 0 for the other axis.
-"""
-_OFF_THE_MIDDLE: Final = 0.4  # distance from a midline, in pitches, below which a press is on no corner
 
 
 @dataclass(frozen=True)
 class Press:
-    """Press on one corner.
+    """Press on one corner."""
 
-    Attributes:
-        place: that was asked for, and the taxel that answered: each one of the geometry's corners.
-        z_counts: summed z.
-        push_counts: change of the summed x and y when pushed to the middle; None where no push was felt.
-    """
-
-    place: int
-    taxel: int
-    z_counts: float
-    push_counts: tuple[float, float] | None
+    place: int  # corner of the geometry that was asked for
+    taxel: int  # corner that answered
+    z_counts: float  # summed over the pad
+    push_counts: tuple[float, float] | None  # change of summed x and y when pushed to the middle; None if not felt
 
 
 @dataclass
@@ -91,7 +78,7 @@ def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
         float((weights * at).sum() / weights.sum()) - (size - 1) / 2
         for at, size in zip(np.indices(weights.shape), weights.shape, strict=True)
     )
-    if min(abs(down), abs(right)) < _OFF_THE_MIDDLE:
+    if min(abs(down), abs(right)) < 0.4:  # pitches from a midline
         return None
     rows, cols = weights.shape
     return (0 if down < 0 else (rows - 1) * cols) + (0 if right < 0 else cols - 1)
@@ -111,12 +98,14 @@ def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Ax
     if len(pushes) < FEWEST_CORNERS:
         return None
     felt = np.array([press.push_counts for press in pushes])
-    expected = np.array([TO_THE_MIDDLE[geometry.corners.index(press.place)] for press in pushes])
+    to_the_middle = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])  # signs of x and y of a push from each corner
+    expected = np.array([to_the_middle[geometry.corners.index(press.place)] for press in pushes])
     # Each corner has one vote, so that a strong push at one corner does not outvote the others.
     votes = np.sign(felt).T @ expected / len(pushes)  # rows: the wire's x and y; columns: the pad's
     for swap in (False, True):
         along = votes[[1, 0]] if swap else votes
-        if (np.abs(np.diag(along)) >= AGREEING).all():
+        # 1 where every corner agrees, 0.5 or 0 where one of four or three contradicts, 0 for the other axis.
+        if (np.abs(np.diag(along)) >= 0.8).all():
             return Axes(swap, (int(np.sign(along[0, 0])), int(np.sign(along[1, 1]))))
     return None
 
@@ -136,8 +125,6 @@ def _why_no_order(presses: Sequence[Press], geometry: SensorGeometry) -> str:
     return "opposite corners do not answer at opposite corners"
 
 
-USUAL_COUNTS_PER_NEWTON: Final = (900.0, 1700.0)
-"""Range of counts per newton, around the 1150 to 1370 of data sheets and of a fit."""
 _AGAIN: Final = "press again: run the doctor once more"
 _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
@@ -194,7 +181,7 @@ def _unclear_axes(pushes: int, z: int | None) -> Finding:
 
 
 def _force_finding(counts_per_newton: float | None, kept: bool) -> Finding:
-    low, high = USUAL_COUNTS_PER_NEWTON
+    low, high = 900.0, 1700.0  # around the 1150 to 1370 of data sheets and of a fit
     norm = f"{low:.0f} to {high:.0f}"
     if counts_per_newton is None:
         return Finding("force", "not known", "no steady weight measured", norm, "lay it on the middle, hands off")
@@ -206,18 +193,9 @@ def _force_finding(counts_per_newton: float | None, kept: bool) -> Finding:
     return Finding("force", "ok", measured, norm, use)
 
 
-HOLD_SCANS: Final = 20
 FREE_SCANS: Final = 20
-PUSH_SCANS: Final = 10
-PUSH_COUNTS: Final = 300.0
-"""Least change of the summed x and y, about .2 N; noise of two counts a taxel sums up to eight."""
 PATIENCE_S: Final = 60.0
-TRIES: Final = 3
 STEADY_SCANS: Final = 50
-STEADY_COUNTS: Final = 30.0
-STEADY_SHARE: Final = 0.02
-LEAST_WEIGHT_COUNTS: Final = 100.0
-GRAVITY_M_S2: Final = 9.80665
 
 
 class Reading(NamedTuple):
@@ -306,8 +284,8 @@ class GuidedPress:
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
     ask = f"Press the {name} corner with a finger, about as hard as a stiff doorbell, and hold it."
-    for _ in range(TRIES):
-        held = yield from _wait(ask, _touched, HOLD_SCANS)
+    for _ in range(3):
+        held = yield from _wait(ask, _touched, 20)
         if held is None:
             return None
         mean = np.mean([reading.zeroed for reading in held], axis=0)
@@ -321,10 +299,11 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     before = mean[:2].sum(axis=(1, 2))
 
     def pushed(reading: Reading) -> bool:
-        return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= PUSH_COUNTS)
+        # 300 counts are about .2 N; noise of two counts a taxel sums up to eight.
+        return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= 300.0)
 
     felt = yield from _wait(
-        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), PUSH_SCANS
+        "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), 10
     )
     push = None
     if felt is not None and pushed(felt[-1]):
@@ -342,15 +321,15 @@ def _weigh(weight_g: float) -> Dialogue[float | None]:
         steady.append(float(reading.zeroed[2].sum()))
         del steady[:-STEADY_SCANS]
         low, high = min(np.abs(steady)), max(np.abs(steady))
-        still = high - low < max(STEADY_COUNTS, STEADY_SHARE * high)
-        return len(steady) == STEADY_SCANS and low > LEAST_WEIGHT_COUNTS and still
+        still = high - low < max(30.0, 0.02 * high)
+        return len(steady) == STEADY_SCANS and low > 100.0 and still
 
     laid = yield from _wait(f"Lay {weight_g:g} g on the middle of the pad, hands off.", lies_still, 1)
     if laid is None:
         return None
     counts = abs(float(np.mean(steady)))
     yield from _wait("Good. Take it off.", _free, FREE_SCANS)
-    return counts / (weight_g / 1000 * GRAVITY_M_S2)
+    return counts / (weight_g / 1000 * 9.80665)
 
 
 def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[list[Reading] | None]:

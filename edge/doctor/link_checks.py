@@ -17,8 +17,6 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.can_id_maps import ID_MAPS, ModelMap
 from firmware_bridge.schedule import LATEST_SCAN_S
 
-_SHOWN = 8
-
 
 def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> Finding | None:
     """Check that the chosen id map fits the CAN ids that came; None where none are seen at all.
@@ -45,7 +43,7 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
         measured = f"the ids received are not {model.name}'s but those of {owners}"
         return Finding("id map", "wrong", measured, norm, tries)
     known = [can_id for can_id in ids if can_id in model.taxels]
-    shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:_SHOWN]) + ", ..." * (len(ids) > _SHOWN)
+    shown = ", ".join(f"0x{can_id:03x}" for can_id in sorted(ids)[:8]) + ", ..." * (len(ids) > 8)
     measured = f"{len(ids)} ids received, {len(known)} of them {model.name}'s: {shown}"
     remedy = "no map has all of these ids: half of the sensor may be broken, or other devices share the bus"
     return judged("id map", "wrong" if half_silent or not known else "ok", measured, norm, remedy)
@@ -60,15 +58,9 @@ def _whole_sensors(ids: AbstractSet[int], model: ModelMap) -> list[str]:
 LATENCY_LIMIT_MS: Final = 2
 HELD_BACK_LIMIT_MS: Final = 5.0
 """Longest delay of a quarter of the scans, half of a period; a timer at 16 ms makes it 10 to 12."""
-LINE_BYTES: Final = 22
-STAMPED_LINE_BYTES: Final = 26  # length of an slcan line of a taxel with a time stamp; LINE_BYTES is without one
 BITS_PER_BYTE: Final = 10  # bits of a byte on a serial line: eight, a start bit and a stop bit
-ANSWERS_BYTES: Final = 64  # fewer bytes are an adapter's answers to commands; noise of another line speed is more
-USUAL_RATE_HZ: Final = 100.0
 FULL_SHARE: Final = 0.9
-OVERFULL_SHARE: Final = 1.05
 _BAD_LIMITS: Final = (1e-4, 1e-2)
-_TROUBLE: Final = ("overrun", "overflow", "error", "lost")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +93,7 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
     if not received:
         return Finding("link", "wrong", measured, "", off)
     bad = counters.get("bad_lines", 0) + counters.get("non_ascii_lines", 0)
-    if not frames and received >= ANSWERS_BYTES:
+    if not frames and received >= 64:  # fewer are the adapter's answers to commands
         remedy = "not slcan, or another line speed than the adapter's: try --source slcan:PORT@BAUD (VScom 3000000)"
         return Finding("link", "wrong", measured, "", remedy)
     if not frames:
@@ -133,18 +125,18 @@ def check_baud(
     frames, received = counters.get("frames", 0), counters.get("received_bytes", 0)
     if facts.baud is None or not frames or not sensors or duration_s <= 0:
         return None
-    line_bytes = STAMPED_LINE_BYTES if received / frames > (LINE_BYTES + STAMPED_LINE_BYTES) / 2 else LINE_BYTES
+    line_bytes = 26 if received / frames > 24 else 22  # of a taxel's slcan line with a time stamp, and without one
     carries_hz = capacity_hz(facts.baud, line_bytes, sensors, taxel_count)
     used = received * BITS_PER_BYTE / duration_s / facts.baud
     pads = f"{sensors} sensors" if sensors > 1 else "a sensor"
     measured = f"{facts.baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
     norm = f"under {100 * FULL_SHARE:.0f} % used"
     remedy = "open a faster line: --source slcan:PORT@3000000, and set the adapter to the same (slcand -S 3000000)"
-    if used > OVERFULL_SHARE:
+    if used > 1.05:
         return Finding("baud rate", "ok", f"{measured}: this adapter goes by USB and ignores it", norm)
     if used > FULL_SHARE:
         return Finding("baud rate", "wrong", measured, norm, remedy)
-    slow = carries_hz < (USUAL_RATE_HZ if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or "")
+    slow = carries_hz < (100.0 if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or "")
     return judged("baud rate", "look" if slow else "ok", measured, norm, remedy)
 
 
@@ -176,16 +168,14 @@ def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Fin
 
 def _trouble(counters: Mapping[str, int]) -> Finding | None:
     """Check the other counters of an adapter, by words in their names."""
-    found = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in _TROUBLE)]
+    words = ("overrun", "overflow", "error", "lost")
+    found = [f"{name} {n}" for name, n in counters.items() if n > 0 and any(word in name for word in words)]
     if not found:
         return None
     remedy = "the adapter loses frames: check the termination of the bus, and end what else loads this machine"
     return Finding("link", "look", ", ".join(found), "none", remedy)
 
 
-USUAL_HZ: Final = (70.0, 120.0)
-"""Range of the rates measured on sensors of sixteen taxels, 74 to 113 scans a second, with a margin."""
-RATE_TOLERANCE: Final = 0.1
 _LOSS_LIMITS: Final = (0.001, 0.01)
 _OLD_LIMITS: Final = (0.1, 0.3)
 _LOSS_REMEDY: Final = (
@@ -200,7 +190,8 @@ def check_rate(samples: Samples, wanted_hz: float | None, line_full: bool) -> Fi
     new_hz = samples.renewed[:, samples.living & ~samples.stuck()].mean(axis=0) * rate_hz
     taxels = f", taxels renewed {new_hz.min():.1f} to {new_hz.max():.1f} Hz" if new_hz.size else ""
     measured = f"{rate_hz:.1f} scans a second{taxels}"
-    low, high = USUAL_HZ if wanted_hz is None else (wanted_hz * (1 - RATE_TOLERANCE), wanted_hz * (1 + RATE_TOLERANCE))
+    # Measured on sensors of sixteen taxels are 74 to 113 scans a second.
+    low, high = (70.0, 120.0) if wanted_hz is None else (0.9 * wanted_hz, 1.1 * wanted_hz)
     norm = f"{low:.0f} to {high:.0f} Hz"
     if line_full:
         return Finding("rate", "not known", measured, norm, "the line is full: see baud rate")

@@ -15,35 +15,22 @@ from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
-PERIODS_TOGETHER: Final = 100
-"""Number of periods that are averaged: an adapter that delivers scans in bunches makes single periods meaningless."""
 AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
 FEWEST_SCANS: Final = 50
-_TRIMMED: Final = 0.02
-_TRIMMED_RMS: Final = 0.9346  # RMS of a normal variable of deviation 1 without the 2 % that lie farthest out
-_ENDS: Final = 0.1
 
 
 class Samples:
-    """Scans of one sensor, without the first, which may have been cut in mid-cycle.
-
-    Attributes:
-        scans: number of scans.
-        counts: (n, 3, taxels) raw counts, ABSENT where a taxel was silent.
-        fresh: (n, taxels), True where the taxel sent a reading.
-        renewed: (n, taxels), True where that reading is new.
-        time_s: (n,) from the first, in [s].
-        living: (taxels,), True for taxels that sent in at least half of the scans.
-    """
+    """Scans of one sensor, without the first, which may have been cut in mid-cycle."""
 
     def __init__(self, scans: Sequence[Scan]) -> None:
         kept = scans[1:]
         self.scans = len(kept)
+        # (n, 3, taxels) raw counts, and (n, taxels): whether the taxel sent a reading, and whether that is new.
         self.counts: NDArray[np.int32] = np.array([scan.counts.reshape(3, -1) for scan in kept], dtype=np.int32)
         self.fresh = self.counts[:, 0] != ABSENT
         self.renewed: NDArray[np.bool_] = np.array([scan.renewed.ravel() for scan in kept], dtype=bool)
         self.time_s = np.array([scan.time_ns - kept[0].time_ns for scan in kept], dtype=np.float64) / NS_PER_S
-        self.living: NDArray[np.bool_] = self.fresh.mean(axis=0) >= 0.5
+        self.living: NDArray[np.bool_] = self.fresh.mean(axis=0) >= 0.5  # (taxels,)
 
     @property
     def enough(self) -> bool:
@@ -52,7 +39,7 @@ class Samples:
 
     def period_s(self) -> float:
         """Return the period from scan to scan, in [s]."""
-        together = min(PERIODS_TOGETHER, self.scans // 2)
+        together = min(100, self.scans // 2)  # an adapter that delivers scans in bunches makes one meaningless
         return float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
 
     def held_back_ms(self) -> float:
@@ -96,9 +83,9 @@ class Samples:
         steps = around_counts(np.diff(self.counts, axis=0))
         for taxel in np.flatnonzero(self.living):
             sizes = np.sort(np.abs(steps[both[:, taxel], :, taxel]), axis=0)
-            kept = sizes[: int((1 - _TRIMMED) * len(sizes))].astype(np.float64)
-            if len(kept):
-                noise[:, taxel] = np.sqrt((kept**2).mean(axis=0) / 2) / _TRIMMED_RMS
+            kept = sizes[: int(0.98 * len(sizes))].astype(np.float64)
+            if len(kept):  # of a normal variable of deviation 1 the RMS is then 0.9346
+                noise[:, taxel] = np.sqrt((kept**2).mean(axis=0) / 2) / 0.9346
         return noise
 
     def rest_counts(self) -> NDArray[np.float64]:
@@ -107,7 +94,7 @@ class Samples:
 
     def drift_counts(self) -> NDArray[np.float64]:
         """Return (3, taxels), the last tenth less the first; NaN where a taxel is not living."""
-        part = max(1, int(_ENDS * self.scans))
+        part = max(1, int(0.1 * self.scans))
         return around_counts(self._median(slice(-part, None)) - self._median(slice(part)))
 
     def _median(self, part: slice) -> NDArray[np.float64]:
@@ -129,8 +116,6 @@ NOISE_LIMITS_COUNTS: Final = ((4.0, 8.0), (4.0, 8.0), (6.0, 12.0))
 """Limits of "look" and "wrong" for x, y, z. On record are 1.1 to 2.8 and 2 to 4.7; four taps need under eight."""
 STRAY_COUNTS: Final = 12_000.0
 """Largest distance of a taxel's rest from the others' on one axis: z of one model spans 9700 from end to end."""
-LONE_DRIFT_COUNTS: Final = 94.0  # largest drift of a single taxel, in counts; as much in every taxel is a contact
-_OVERLOADED: Final = "overloaded, too near a magnet or steel, or broken: free it, and replace the sensor if it persists"
 
 
 def check_silent(samples: Samples, wrong_map: bool) -> Finding:
@@ -152,7 +137,8 @@ def check_stuck(samples: Samples) -> Finding:
     # A rest near an end that goes round the circle is noisy there; a reading that has left the range is not.
     ends = samples.living & (np.isin(rest, RANGE_ENDS) & (samples.noise_counts() == 0)).any(axis=0)
     if ends.any():
-        return Finding("stuck taxels", "wrong", f"{_named(ends)} at an end of its range", "none", _OVERLOADED)
+        remedy = "overloaded, too near a magnet or steel, or broken: free it, and replace the sensor if it persists"
+        return Finding("stuck taxels", "wrong", f"{_named(ends)} at an end of its range", "none", remedy)
     if not stuck.any():
         return Finding("stuck taxels", "ok", "none")
     if stuck[samples.living].all():
@@ -209,7 +195,8 @@ def check_drift(samples: Samples) -> Finding:
     remedy = "let it warm up for ten minutes, unloaded and still, then zero again"
     if float(np.nanmax(sizes[2])) > LOAD_LIMIT_COUNTS:
         remedy = "more than warming up causes: something pressed or released it meanwhile; free it and measure again"
-    verdict = "wrong" if abs(z_sum) >= OFF_COUNTS else graded(sizes[axis, taxel], CREEP_LIMIT_COUNTS, LONE_DRIFT_COUNTS)
+    # 94 counts are the most of a single taxel: as much in every taxel is a contact.
+    verdict = "wrong" if abs(z_sum) >= OFF_COUNTS else graded(sizes[axis, taxel], CREEP_LIMIT_COUNTS, 94.0)
     return judged("drift", verdict, measured, norm, remedy)
 
 

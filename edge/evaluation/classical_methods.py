@@ -13,7 +13,6 @@ from firmware_bridge.recording.npz_recording import read_npz
 CONTACT_LEVEL: Final = 0.5
 """Share of a pattern's maximum from which a pixel of these methods counts as touched: the edge of a blurred step."""
 
-_MOST_BYTES: Final = 1 << 28
 Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Function from newest taps (n, 3, rows, cols) in zeroed counts to patterns (n, H, W) in [mm]."""
 
@@ -21,13 +20,11 @@ Method = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 def fitted_methods(path: Path, scale: int) -> dict[str, Method]:
     """Return the methods by name, with the parameters fitted on training taps, at a scale in pixels per taxel pitch.
 
-    The npz holds bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels).
-
-    Raises:
-        EdgeError: the file cannot be read.
+    The npz holds bilinear_gain () and bicubic_gain () in mm per count, and linear_map (features, pixels). Raises
+    EdgeError if it cannot be read.
     """
     try:
-        arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), _MOST_BYTES)
+        arrays = read_npz(path, ("bilinear_gain", "linear_map", "bicubic_gain"), 1 << 28)
         gain, matrix, cubic_gain = float(arrays["bilinear_gain"]), arrays["linear_map"], float(arrays["bicubic_gain"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error

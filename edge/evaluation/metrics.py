@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from edge.perception.pattern_stages import touched
 
-_WINDOW_SIGMA_PX: Final = 1.5
 _WINDOW_RADIUS_PX: Final = 5
 
 
@@ -145,7 +144,7 @@ def _similarity(
 def _blur(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return Gaussian means over the windows that lie inside the map."""
     offsets_px = np.arange(-_WINDOW_RADIUS_PX, _WINDOW_RADIUS_PX + 1)
-    weights = np.exp(-0.5 * (offsets_px / _WINDOW_SIGMA_PX) ** 2)
+    weights = np.exp(-0.5 * (offsets_px / 1.5) ** 2)
     weights /= weights.sum()
     windows = np.lib.stride_tricks.sliding_window_view
     rows = windows(maps, weights.size, axis=-2) @ weights

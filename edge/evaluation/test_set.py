@@ -25,7 +25,6 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 
-_MOST_BYTES: Final = 1 << 31
 _AXES: Final[Mapping[str, tuple[str, str]]] = {
     "newest": ("int16", "n3rc"),
     "earlier": ("int16", "tk3rc"),
@@ -75,8 +74,7 @@ class FrozenSet:
     def windows(self, taps: int, given: int | None = None) -> NDArray[np.float32]:
         """Return windows (n, taps, 3, rows, cols) in zeroed counts, the newest `given` taps as read, the rest zero.
 
-        Raises:
-            FrozenSetError: the set has fewer taps.
+        Raises FrozenSetError if the set has fewer taps.
         """
         if not 1 <= taps <= 1 + self.earlier.shape[1]:
             raise FrozenSetError(
@@ -115,13 +113,9 @@ class FrozenSet:
 
 
 def load_frozen_set(path: Path) -> FrozenSet:
-    """Load a frozen test set.
-
-    Raises:
-        FrozenSetError: the file is missing, or an array is missing or of another type or shape; the message names it.
-    """
+    """Load a frozen test set; raises FrozenSetError, which names what is missing, or of another type or shape."""
     try:
-        arrays = read_npz(path, _AXES, _MOST_BYTES)
+        arrays = read_npz(path, _AXES, 1 << 31)
         _check_axes(arrays)
     except (OSError, ValueError) as error:
         raise FrozenSetError(
@@ -132,11 +126,7 @@ def load_frozen_set(path: Path) -> FrozenSet:
 
 
 def check_axes(axes_of: Mapping[str, tuple[str, str]], arrays: Mapping[str, NDArray[Any]]) -> Mapping[str, int]:
-    """Return the length of each axis of arrays whose type and axes are stated.
-
-    Raises:
-        ValueError: an array is missing, or of another type or shape.
-    """
+    """Return the length of each axis of arrays whose type and axes are stated; raises ValueError if one differs."""
     lengths = {"3": 3}
     for name, (kind, axes) in axes_of.items():
         if name not in arrays:
@@ -165,14 +155,10 @@ def judge(
     half_width_mm: NDArray[np.floating] | None = None,
     pitch_mm: float = USPA44.pitch_mm,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return every metric of every frame, (n,) each.
+    """Return every metric of every frame, (n,) each, of patterns (n, H, W) in [mm].
 
-    Args:
-        patterns: (n, H, W) in [mm].
-        frozen: the test set.
-        contact_level: share of a pattern's maximum from which a pixel counts as touched.
-        half_width_mm: (n, H, W), half widths of the 90 % intervals; "coverage_90" is left out without them.
-        pitch_mm: of the taxels, in [mm].
+    A pixel counts as touched from `contact_level`, a share of its pattern's maximum. Without the half widths of the
+    90 % intervals, (n, H, W), "coverage_90" is left out.
     """
     truth, full_scale = frozen.patterns(), frozen.full_scale_mm
     errors = {

@@ -1,8 +1,8 @@
-"""Options of a run, under one name each from the flags of `edge-sr` to the tap tracker."""
+"""Options of a run, written once: `edge-sr` and `open_runtime` take them from here, with their meaning and default."""
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 from edge.errors import UsageError
 from edge.validation import as_float, check_whole
@@ -12,21 +12,33 @@ OFF_COUNTS: Final = 750.0
 IDLE_RESET_S: Final = 5.0
 
 
+def _option(default: Any, form: str, text: str) -> Any:
+    return field(default=default, metadata={"form": form, "text": text})
+
+
+# fmt: off
 @dataclass(frozen=True, slots=True)
 class RuntimeOptions:
-    """Options of making results from scans; each is a flag of its name, and a keyword of `open_runtime`.
+    """Options of making results from scans, each with its form and text in the help of `edge-sr`.
 
     Raises:
         UsageError: the contact thresholds, the time or the taps are out of range.
     """
 
-    contact_on_counts: float = ON_COUNTS
-    contact_off_counts: float = OFF_COUNTS
-    idle_reset_s: float = IDLE_RESET_S
-    every_scan: bool = False
-    follow_drift: bool = True
-    learn: bool = True
-    taps: int | None = None
+    contact_on_counts: float = _option(
+        ON_COUNTS, "--contact-on-counts N", "a tap begins when the z readings, summed over the pad, reach N counts; "
+        "some 1150 counts are 1 N (default %(default)g)")
+    contact_off_counts: float = _option(
+        OFF_COUNTS, "--contact-off-counts N", "a tap ends when they fall below N (default %(default)g)")
+    idle_reset_s: float = _option(
+        IDLE_RESET_S, "--idle-reset-s T", "forget earlier taps after T seconds without contact (default %(default)g)")
+    taps: int | None = _option(
+        None, "--taps K", "combine at most K taps to a pattern (default: as many as the model takes; if it takes poses "
+        "of the pad and there are none 1, or as many as its name states, such as mtsr4)")
+    every_scan: bool = _option(False, "--every-scan", "compute a pattern even if the readings have not changed")
+    learn: bool = _option(True, "--no-learn", "do not learn from contacts how sensitive each taxel is")
+    follow_drift: bool = True  # let the rest level follow the readings of a free pad
+    # fmt: on
 
     def __post_init__(self) -> None:
         on_counts, off_counts = self.contact_on_counts, self.contact_off_counts

@@ -3,11 +3,11 @@
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from edge.inference.bundled import TAXELS, find_model, taps_of
 from edge.inference.model_interface import Model
-from edge.perception.contact_options import IDLE_RESET_S, OFF_COUNTS, ON_COUNTS, RuntimeOptions
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.runtime import Runtime
@@ -44,13 +44,7 @@ def open_runtime(
     baselines: Mapping[str, Baseline] | str | Path | None = None,
     counts_per_newton: float | Mapping[str, float] | None = None,
     pad: Pad | Mapping[str, Pad] | None = None,
-    contact_on_counts: float = ON_COUNTS,
-    contact_off_counts: float = OFF_COUNTS,
-    idle_reset_s: float = IDLE_RESET_S,
-    every_scan: bool = False,
-    follow_drift: bool = True,
-    learn: bool = True,
-    taps: int | None = None,
+    **options: Any,
 ) -> Runtime:
     """Return a runtime that makes results of a source's scans; its defaults are those of `edge-sr`.
 
@@ -63,14 +57,9 @@ def open_runtime(
             which no scan arrives is reported as an event.
         pad: properties of the pad of all sensors, or of each by name, for models that use them; by default as in the
             sensor file.
-        contact_on_counts: summed z at which a tap begins.
-        contact_off_counts: summed z at which it ends.
-        idle_reset_s: time without contact after which earlier taps are forgotten, in [s].
-        every_scan: infer also where nothing has changed since the last pattern.
-        follow_drift: let the rest level follow the readings of a free pad.
-        learn: learn the gains of the sensor from contacts; a `Stream` keeps them in the source's sensor file.
-        taps: most taps of a pattern; None for all that the model takes, but one where it takes poses and the sensor has
-            none: taps then follow the paper's schedule, each turned by 5 degrees from the one before.
+        options: those of `RuntimeOptions`, such as `every_scan=True`. With `learn` a `Stream` keeps the gains that it
+            learns in the source's sensor file; with `taps` and without poses taps follow the paper's schedule, each
+            turned by 5 degrees from the one before.
 
     Raises:
         ModelError: the model does not exist, cannot be used, or is for another sensor.
@@ -78,21 +67,19 @@ def open_runtime(
         UsageError: the source is not open; a baseline is of another grid; a number is out of range; `taps` is more than
             the model takes.
     """
+    chosen = RuntimeOptions(**options)
     known, nominal = source.sensor_file, source.sensor_file.geometry == USPA44
     return Runtime(
         load_model(model) if isinstance(model, (str, Path)) else model,
         source=source.kind,
         estimator=load_estimator(TAXELS, (USPA44.rows, USPA44.cols)) if nominal else None,
-        contacts=load_contact_model() if nominal and learn else None,
+        contacts=load_contact_model() if nominal and chosen.learn else None,
         geometry=known.geometry,
         baselines=of_single_csv(stored_baselines(baselines, known), source.name),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
         measured=known.measured_pads if pad is None else None,
-        options=RuntimeOptions(
-            *(contact_on_counts, contact_off_counts, idle_reset_s),
-            *(every_scan, follow_drift, learn, taps),
-        ),
+        options=chosen,
         unix_time_s=source.unix_time_s,
     )

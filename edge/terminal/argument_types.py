@@ -11,9 +11,6 @@ from edge import __version__
 from edge.terminal.text_wrap import FEWEST_COLUMNS
 from firmware_bridge.schedule import POSITIVE
 
-MOST_COLUMNS: Final = 80
-_GAP: Final = 2
-
 
 class HelpFormatter(argparse.HelpFormatter):
     """Formatter that lays out descriptions and epilogues by the form of each line.
@@ -24,7 +21,7 @@ class HelpFormatter(argparse.HelpFormatter):
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog)
-        self._width = max(min(self._width, MOST_COLUMNS), FEWEST_COLUMNS)
+        self._width = max(min(self._width, 80), FEWEST_COLUMNS)
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return "\n".join(
@@ -38,8 +35,8 @@ class HelpFormatter(argparse.HelpFormatter):
         if not tab:
             return [line] if line.startswith(" ") else textwrap.wrap(line, width) or [""]
         column = min(self._max_help_position, width // 2)
-        beside = len(term) + 2 * _GAP <= column
-        first = f"{' ' * _GAP}{term}"
+        beside = len(term) + 4 <= column
+        first = f"  {term}"
         lines = textwrap.wrap(
             meaning,
             width,
@@ -51,7 +48,6 @@ class HelpFormatter(argparse.HelpFormatter):
 
 
 EXIT_USAGE: Final = 2
-MOST_PORT: Final = 65535
 
 
 class Parser(argparse.ArgumentParser):
@@ -100,8 +96,8 @@ def whole(least: int) -> Callable[[str], int]:
 
 def port(text: str) -> int:
     """Parse a port of this machine; 0 stands for any free one."""
-    if not (text.isascii() and text.isdigit() and len(text) < 10) or int(text) > MOST_PORT:
+    if not (text.isascii() and text.isdigit() and len(text) < 10) or int(text) > 65535:
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not a port: expected 0 to {MOST_PORT}, or none; write FILE or command before it"
+            f"{text!r} is not a port: expected 0 to 65535, or none; write FILE or command before it"
         )
     return int(text)

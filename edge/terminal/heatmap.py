@@ -21,14 +21,9 @@ STOPS: Final = np.array(
     ],
     dtype=np.float64,
 )
-CUBE_LEVELS: Final = np.array([0, 95, 135, 175, 215, 255], dtype=np.float64)
 SHADES: Final = " .:-=+*#%@"
 HALF_BLOCK: Final = "\N{UPPER HALF BLOCK}"
-RESET: Final = "\x1b[0m"
 GAP: Final = 2
-WIDEST: Final = 40
-NARROWEST: Final = 20
-SHARP: Final = 8  # divisor of a map's width: with half as many lines, a map of 4 x 4 then has sharp borders
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +48,14 @@ def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: 
     return "truecolor" if environment.get("COLORTERM") in ("truecolor", "24bit") else "256"
 
 
-def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = WIDEST) -> str:
+def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = 40) -> str:
     """Draw panels side by side, or below each other if the terminal of so many columns is too narrow.
 
     No panel is wider than `widest` columns.
     """
     width = min(widest, (columns - GAP * (len(panels) - 1)) // len(panels))
-    width -= width % SHARP
-    if width < NARROWEST:
+    width -= width % 8  # with half as many lines, a map of 4 x 4 then has sharp borders
+    if width < 20:
         width = max(1, min(widest, columns))
         return "\n\n".join("\n".join(_lines(panel, width, palette)) for panel in panels)
     rows = zip(*(_lines(panel, width, palette) for panel in panels), strict=True)
@@ -119,7 +114,7 @@ def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Pal
         colour = f"\x1b[38;{top};48;{bottom}m"
         text.append(HALF_BLOCK if colour == last else colour + HALF_BLOCK)
         last = colour
-    return "".join(text) + RESET
+    return "".join(text) + "\x1b[0m"
 
 
 def colours(shares: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -133,5 +128,5 @@ def _colour_codes(shares: NDArray[np.float64], palette: Palette) -> list[str]:
     rgb = colours(shares)
     if palette == "truecolor":
         return ["2;{:.0f};{:.0f};{:.0f}".format(*colour) for colour in rgb]
-    cube = np.abs(rgb[..., None] - CUBE_LEVELS).argmin(axis=-1)
+    cube = np.abs(rgb[..., None] - np.array([0, 95, 135, 175, 215, 255])).argmin(axis=-1)
     return [f"5;{16 + 36 * red + 6 * green + blue}" for red, green, blue in cube.tolist()]

@@ -10,8 +10,6 @@ from edge.terminal.text_wrap import drawn
 from firmware_bridge.errors import harmless
 
 DELAY_S: Final = 2.0
-_COUNTED: Final = "{desc} {percentage:3.0f}%|{bar}| {rate_fmt} {remaining} left{postfix}"
-_TIMED: Final = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 SECONDS: Final = "s"  # unit of work that lasts for a set time, whose rate means nothing
 _Thing = TypeVar("_Thing")
 
@@ -20,14 +18,9 @@ class Progress:
     """Progress of a piece of work on one line, which is cleared at the end, whatever ends it."""
 
     def __init__(self, what: str, total: float, unit: str, *, done: float = 0, stream: TextIO | None = None) -> None:
-        """Begin; nothing is shown yet.
+        """Begin with `done` units of `total`, each a `unit` such as "pose", or SECONDS; nothing is shown yet.
 
-        Args:
-            what: name of the work, in a word or two.
-            total: units of the whole work.
-            unit: in the singular, such as "pose"; SECONDS for a wait.
-            done: units that were finished before, and took no time now.
-            stream: output, used only if it is a terminal; stderr by default.
+        The stream, stderr by default, is used only if it is a terminal.
         """
         self._bar: Any = None  # a tqdm, where there is a terminal
         stream = sys.stderr if stream is None else stream
@@ -35,6 +28,7 @@ class Progress:
         if first and stream is not None and not stream.closed and stream.isatty():
             from tqdm import tqdm  # here and not above, since few programs run on a terminal
 
+            rate = "" if unit == SECONDS else "{rate_fmt} "
             self._bar = tqdm(
                 desc=harmless(what, kept=""),
                 total=total,
@@ -45,7 +39,7 @@ class Progress:
                 leave=False,
                 dynamic_ncols=True,
                 miniters=0,
-                bar_format=_TIMED if unit == SECONDS else _COUNTED,
+                bar_format=f"{{desc}} {{percentage:3.0f}}%|{{bar}}| {rate}{{remaining}} left{{postfix}}",
                 delay=DELAY_S,
             )
 

@@ -39,10 +39,9 @@ from firmware_bridge.zeroing.baseline import save_baselines
 
 COMMANDS = written_samples.commands()
 RATE_HZ = 500
-ENOUGH = 60
+ENOUGH = 60  # results of a sensor that would go on for ever
 TAPS_SCANS = 460
 """Scans of the demo up to the end of its four taps."""
-"""Results of a sensor that would go on for ever."""
 
 PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
@@ -55,7 +54,7 @@ PARSED = {
     r"python tests/system/chaos\.py .*": "takes minutes; test_chaos runs it, shortened",
     r"python tests/system/chaos_wire\.py .*": "plays until ended; test_chaos runs it",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
-    r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_hot_path",
+    r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_bench_timing",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
 }
 LEFT_OUT = {

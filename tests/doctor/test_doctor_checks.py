@@ -12,7 +12,7 @@ from edge.doctor.findings import Finding, page
 from edge.doctor.link_checks import LineFacts, capacity_hz, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.scans.can_id_maps import ID_MAPS, LAYOUT_A_MAP, USPA44_MAP, XR1944_MAP, trigger_frame
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.slcan_scans import SlcanScans
 from firmware_bridge.zeroing.baseline import Baseline
@@ -225,6 +225,10 @@ class TestLine:
         assert faults(scans, facts=LineFacts("/dev/ttyACM0", 3_000_000)) == {"latency timer": "wrong"}
 
 
+def ids_of(model, sensor):
+    return [can_id for can_id, _ in model.wire_order(sensor)]
+
+
 def heard_of(model, ids, scans=60):
     """A stream of frames with these ids through the real stages: the ids that came, the scans and the counters."""
     stages = SlcanScans(model)
@@ -241,8 +245,7 @@ class TestIdMap:
     @pytest.mark.parametrize("asked", ID_MAPS)
     def test_the_map_to_try_is_that_of_the_ids_heard(self, asked, spoken):
         sensor = {"uSPa44": "4", "uSPa46": "4", "XR1944": "4", "A": "1", "B": "1a"}[spoken]
-        ids = [can_id for can_id, _ in ID_MAPS[spoken].wire_order(sensor)]
-        heard, closed, counters = heard_of(ID_MAPS[asked], ids)
+        heard, closed, counters = heard_of(ID_MAPS[asked], ids_of(ID_MAPS[spoken], sensor))
         examined = judge(watched(closed, counters=counters, ids=heard, model=ID_MAPS[asked]), 0)
         found = {one.name: one for one in examined.findings}
         if asked == spoken or (asked, spoken) == ("B", "A"):  # the ids of A's board 1 are those of B's 7b
@@ -258,28 +261,18 @@ class TestIdMap:
         else:
             assert found["scans"].verdict == "wrong"
 
-    def test_a_sensor_that_is_half_broken_is_not_talked_into_another_map(self):
-        ids = [can_id for can_id, _ in USPA44_MAP.wire_order("4")][:8]
-        heard, _, _ = heard_of(USPA44_MAP, ids)
-        finding = check_id_map(heard, USPA44_MAP, half_silent=True)
-        assert finding is not None and finding.verdict == "wrong" and "no map has all" in finding.remedy
-        assert "8 ids received, 8 of them uSPa44's: 0x004" in finding.measured
-
-    def test_one_of_two_sensors_may_be_of_another_map(self):
-        ids = [can_id for can_id, _ in (*USPA44_MAP.wire_order("4"), *XR1944_MAP.wire_order("6"))]
-        heard, _, _ = heard_of(USPA44_MAP, ids)
-        finding = check_id_map(heard, USPA44_MAP, half_silent=True)
-        assert finding is not None and finding.verdict == "wrong" and "XR1944 (sensor 6)" in finding.measured
-
-    def test_a_silent_taxel_is_no_wrong_map(self):
-        ids = [can_id for can_id, _ in XR1944_MAP.wire_order("4")][1:]
-        heard, _, _ = heard_of(XR1944_MAP, ids)
-        finding = check_id_map(heard, XR1944_MAP, half_silent=False)
-        assert finding is not None and finding.verdict == "ok"
-
-    def test_links_without_ids_say_nothing_of_maps(self):
-        assert check_id_map(frozenset(), USPA44_MAP, half_silent=True) is None
-        assert trigger_frame(1).can_id not in LAYOUT_A_MAP.taxels
+    @pytest.mark.parametrize(
+        ("ids", "model", "half_silent", "verdict", "words"),
+        [
+            (ids_of(USPA44_MAP, "4")[:8], USPA44_MAP, True, "wrong", "8 ids received, 8 of them uSPa44's: 0x004"),
+            ([*ids_of(USPA44_MAP, "4"), *ids_of(XR1944_MAP, "6")], USPA44_MAP, True, "wrong", "XR1944 (sensor 6)"),
+            (ids_of(XR1944_MAP, "4")[1:], XR1944_MAP, False, "ok", "15 ids received"),  # a silent taxel alone
+        ],
+    )
+    def test_a_sensor_with_a_fault_is_not_talked_into_another_map(self, ids, model, half_silent, verdict, words):
+        finding = check_id_map(frozenset(ids), model, half_silent)
+        assert finding is not None and finding.verdict == verdict and words in finding.measured
+        assert check_id_map(frozenset(), model, half_silent) is None, "a link without ids says nothing of maps"
 
 
 def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
@@ -297,28 +290,15 @@ def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
     assert "-> keep the motors away" in text and "?     load: nothing" in text
 
 
-PAGE = (ROOT / "docs" / "trouble.md").read_text()
-
-
-def trees() -> list[ast.AST]:
-    return [ast.parse(path.read_text()) for path in sorted((ROOT / "edge" / "doctor").glob("*.py"))]
-
-
-def findings() -> list[ast.Call]:
-    return [
+def test_each_finding_has_a_row():
+    nodes = [
         node
-        for tree in trees()
-        for node in ast.walk(tree)
+        for path in (ROOT / "edge" / "doctor").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Finding"
     ]
-
-
-def texts(node: ast.AST) -> list[str]:
-    return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-
-
-def test_each_finding_has_a_row():
-    names = {text for call in findings() for text in texts(call.args[0])}
+    names = {one.value for node in nodes for one in ast.walk(node.args[0]) if isinstance(one, ast.Constant)}
     assert {"link", "noise", "taxel order"} <= names
-    rows = {one.strip() for line in PAGE.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
+    page = (ROOT / "docs" / "trouble.md").read_text()
+    rows = {one.strip() for line in page.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
     assert names <= rows, names - rows

@@ -13,6 +13,7 @@ from firmware_bridge.scans.mounting import Mounting
 
 AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]
 UPRIGHT = list(range(16))
+CORNERS = USPA44.corners
 
 
 def answer_to(deformations, guide=None, period_s=0.01):
@@ -67,7 +68,7 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
 
 
 def press(place, taxel=None, z=4000.0, push=(500.0, 500.0)):
-    x, y = dict(zip(USPA44.corners, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True))[place]
+    x, y = dict(zip(CORNERS, ((1, 1), (-1, 1), (-1, -1), (1, -1)), strict=True))[place]
     return Press(place, place if taxel is None else taxel, z, None if push is None else (push[0] * x, push[1] * y))
 
 
@@ -79,35 +80,37 @@ class TestAnswers:
 
     def test_three_corners_settle_the_turn_and_the_axes(self):
         for left_out in range(4):
-            presses = [press(place) for place in USPA44.corners]
+            presses = [press(place) for place in CORNERS]
             del presses[left_out]
             assert find_order(presses) == "as in the id map"
             axes = find_axes(presses)
             assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
 
-    @pytest.mark.parametrize("wrong", range(4))
-    def test_one_contradicting_push_is_not_outvoted(self, wrong):
-        pushes = [(-500, 500) if n == wrong else (900, 900) for n in range(4)]
-        presses = [press(place, push=push) for place, push in zip(USPA44.corners, pushes, strict=True)]
-        assert find_axes(presses) is None
-        findings, mounting = judge_press(Answer(presses), False, False)
-        assert mounting is None
-        assert [(one.name, one.verdict) for one in findings] == [("taxel order", "ok"), ("axis signs", "wrong")]
-        assert "contradict" in findings[1].measured
-
-    def test_pushes_that_were_not_felt_are_told(self):
-        presses = [press(place, push=None if n > 1 else (500, 500)) for n, place in enumerate(USPA44.corners)]
-        findings, mounting = judge_press(Answer(presses), False, False)
-        assert findings[1].verdict == "not known" and "2 of 4 pushes" in findings[1].measured and mounting is None
-
-    def test_z_that_does_both_is_wrong(self):
-        presses = [press(place, z=-4000.0 if place == 15 else 4000.0) for place in USPA44.corners]
-        assert guided_press.z_sign(presses) is None
-        findings, mounting = judge_press(Answer(presses), False, False)
-        assert findings[1].verdict == "wrong" and "falls under others" in findings[1].measured and mounting is None
+    @pytest.mark.parametrize(
+        ("presses", "verdict", "measured"),
+        [
+            *(
+                ([press(place, push=(-500, 500) if n == wrong else (900, 900)) for n, place in enumerate(CORNERS)],
+                 "wrong", "the corners contradict each other")
+                for wrong in range(4)  # one push is not outvoted
+            ),
+            (
+                [press(place, push=None if n > 1 else (500, 500)) for n, place in enumerate(CORNERS)],
+                "not known", "2 of 4 pushes measured",
+            ),
+            (
+                [press(place, z=-4000.0 if place == 15 else 4000.0) for place in CORNERS],
+                "wrong", "z rises under some presses and falls under others",
+            ),
+        ],
+    )  # fmt: skip
+    def test_axes_that_are_not_clear_are_told_and_give_no_mounting(self, presses, verdict, measured):
+        (order, axes), mounting = judge_press(Answer(presses), False, False)
+        assert (order.name, order.verdict, mounting) == ("taxel order", "ok", None)
+        assert (axes.name, axes.verdict, axes.measured) == ("axis signs", verdict, measured)
 
     def test_what_a_sensor_file_keeps_is_no_longer_wrong(self):
-        turned = [press(place, USPA44.corners[(n + 1) % 4]) for n, place in enumerate(USPA44.corners)]
+        turned = [press(place, CORNERS[(n + 1) % 4]) for n, place in enumerate(CORNERS)]
         for kept, verdict, words in ((False, "wrong", "--out FILE"), (True, "look", "the sensor file states this")):
             findings, mounting = judge_press(Answer(turned), kept, False)
             assert mounting is not None and mounting.moves_taxels

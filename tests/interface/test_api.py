@@ -88,19 +88,11 @@ def test_records_of_the_command_line_are_those_of_the_api(files, options, settin
     assert [timeless(one) for one in made] == [timeless(one) for one in said]
 
 
-def test_a_source_is_used_open_and_once():
+def test_a_source_is_used_open():
     source = open_source("demo")
     for use in (lambda: open_runtime(FakeModel(), source), lambda: next(iter(stream(source)))):
         with pytest.raises(UsageError, match=r"^source demo is not open: use it in a with statement"):
             use()
-    source = Source(FakeLink([[make_scan(n)] for n in range(9)]))
-    with source:
-        results = iter(stream(source))
-        assert next(results).scan.number == 0
-    with pytest.raises(UsageError, match="fake is not open"):
-        list(stream(source))  # what still waits is old
-    with pytest.raises(UsageError, match="fake was opened before"), source:
-        pass
 
 
 def stream(source, model=None, **settings):
@@ -108,22 +100,20 @@ def stream(source, model=None, **settings):
 
 
 @pytest.mark.parametrize(
-    ("ask", "error", "words"),
+    ("ask", "words"),
     [
-        (lambda: open_source("nothing"), api.SourceError, "source is 'nothing', expected one of: slcan:"),
-        (lambda: open_source("demo", rate_hz=0), UsageError, "rate_hz is 0, expected a positive number"),
-        (lambda: open_source("demo", give_up_s=NAN), UsageError, "give_up_s is nan, expected 0 or more"),
-        (lambda: open_source(["demo"]), UsageError, r"source is \['demo'\], expected text"),
-        (lambda: api.examine("demo", rate_hz=-1), UsageError, "rate_hz is -1, expected a positive number"),
-        (lambda: api.examine("demo", duration_s=-1), UsageError, "duration_s is -1, expected a positive number"),
-        (lambda: api.examine("demo", baselines={"4": 1}), UsageError, "baseline of sensor 4 is a int, expected"),
-        (lambda: api.examine("demo", "demo"), UsageError, "^2 sources, expected one: examine them one after"),
-        (lambda: load_model("stsr", threads=-1), UsageError, "threads is -1, expected a whole number from 1"),
-        (lambda: load_model("nothing"), api.ModelError, r"no model 'nothing': .*bundled: .*stsr-int8\.onnx"),
+        (lambda: open_source("demo", rate_hz=0), "rate_hz is 0, expected a positive number"),
+        (lambda: open_source("demo", give_up_s=NAN), "give_up_s is nan, expected 0 or more"),
+        (lambda: open_source(["demo"]), r"source is \['demo'\], expected text"),
+        (lambda: api.examine("demo", rate_hz=-1), "rate_hz is -1, expected a positive number"),
+        (lambda: api.examine("demo", duration_s=-1), "duration_s is -1, expected a positive number"),
+        (lambda: api.examine("demo", baselines={"4": 1}), "baseline of sensor 4 is a int, expected"),
+        (lambda: api.examine("demo", "demo"), "^2 sources, expected one: examine them one after"),
+        (lambda: load_model("stsr", threads=-1), "threads is -1, expected a whole number from 1"),
     ],
 )
-def test_what_cannot_be_is_one_line(ask, error, words):
-    with pytest.raises(error, match=words) as raised:
+def test_what_cannot_be_is_one_line(ask, words):
+    with pytest.raises(UsageError, match=words) as raised:
         ask()
     assert "\n" not in str(raised.value)
 
@@ -153,25 +143,12 @@ def footprint():
     return threading.active_count(), len(list(Path("/proc/self/fd").iterdir())), len(children)
 
 
-@pytest.mark.parametrize("way", ["break", "exception", "return"])
-def test_leaving_the_loop_closes_everything(way):
-    def leave():
-        with open_source("demo") as source:
-            results = stream(source)
-            for _ in results:
-                assert footprint() > before
-                if way == "break":
-                    break
-                if way == "exception":
-                    raise ZeroDivisionError
-                return
-
+def test_leaving_the_loop_closes_everything():
     before = footprint()
-    if way == "exception":
-        with pytest.raises(ZeroDivisionError):
-            leave()
-    else:
-        leave()
+    with pytest.raises(ZeroDivisionError), open_source("demo") as source:
+        for _ in stream(source):
+            assert footprint() > before
+            raise ZeroDivisionError
     assert footprint() == before
 
 
@@ -267,18 +244,11 @@ def test_poses_that_another_thread_states_are_those_of_the_next_scans():
     assert stream.statistics.poses == len(PRESSES) - 1
 
 
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"x_mm": float("nan")}, "a pose: x_mm is nan, expected a number from"),
-        ({"time_ns": 10**18}, "a pose: time_ns is .* ahead of now"),
-    ],
-)
-def test_a_pose_that_cannot_be_is_refused_where_it_is_stated(wrong, match):
+def test_a_pose_that_cannot_be_is_refused_where_it_is_stated():
     with Source(FakeLink([[make_scan(0)]])) as source:
         stream = Stream(source, open_runtime(FakeModel(), source), clock_ns=lambda: 0)
-        with pytest.raises(UsageError, match=match):
-            stream.pose(**({"x_mm": 0, "y_mm": 0} | wrong))
+        with pytest.raises(UsageError, match=r"a pose: time_ns is .* ahead of now"):
+            stream.pose(x_mm=0, y_mm=0, time_ns=10**18)
 
 
 def test_of_a_recording_poses_are_stated_at_its_own_times(tmp_path):

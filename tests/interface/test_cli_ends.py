@@ -1,22 +1,18 @@
 """Ends of `edge-sr`: signals, streams that are closed or full, and the terminal that it leaves, of real processes."""
 
-import fcntl
 import json
 import os
 import pty
 import re
 import resource
-import select
 import signal
-import struct
 import subprocess
 import sys
-import termios
 import threading
 from functools import partial
 
 import pytest
-from cli_samples import EDGE_SR, TIMEOUT_S, base_options, files, records, run, start
+from cli_samples import TIMEOUT_S, base_options, files, records, run, start
 from edge_samples import ROOT, wait_for
 
 from edge.cli import main as cli
@@ -46,10 +42,10 @@ class TestEnds:
         process.wait(TIMEOUT_S)
         return rest, errors
 
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-    def test_signals_end_it_cleanly_with_the_summary(self, emulator, files, tmp_path, number):
+    def test_a_hang_up_ends_it_cleanly_with_the_summary(self, emulator, files, tmp_path):
+        """As Ctrl-C and SIGTERM do, which tests of keys and of poses send."""
         process, first = self.follow(emulator, files, "--sink", f"mcap:{tmp_path}/out.mcap")
-        process.send_signal(number)
+        process.send_signal(signal.SIGHUP)
         rest, errors = self.rest(process)
         assert process.returncode == 0
         got = records("".join(first) + rest)
@@ -58,15 +54,17 @@ class TestEnds:
         assert f"\nEMULATED slcan:{emulator.port}: {len(got)} scans" in errors and "Traceback" not in errors
         assert len(load_recording(tmp_path / "out.mcap").tracks[0].counts) == len(got)
 
-    @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGUSR1])
-    def test_a_signal_that_the_parent_wants_ignored_is_ignored(self, emulator, files, number):
+    def test_a_signal_that_the_parent_wants_ignored_is_ignored(self, emulator, files):
         """As under nohup, or in the background of a shell without jobs."""
-        before = signal.signal(number, signal.SIG_IGN)
+        numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGUSR1)
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
         try:
             process, _ = self.follow(emulator, files)
         finally:
-            signal.signal(number, before)
-        process.send_signal(number)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        for number in numbers:
+            process.send_signal(number)
         got = records("".join(process.stdout.readline() for _ in range(100)))
         assert len(got) == 100 and not [one for one in got if one["state"] == "event"]
         process.send_signal(signal.SIGTERM)
@@ -141,43 +139,6 @@ class TestEnds:
         assert process.returncode == 0
 
 
-class TestTerminal:
-    def on_terminal(self, folder, *arguments, columns):
-        """Return the text of stderr on a terminal of that width, and of stdout."""
-        leader, follower = pty.openpty()
-        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
-        with (folder / "stdout").open("w") as output:
-            process = start(
-                *arguments, stderr=follower, stdin=follower, stdout=output, env=environment | {"TERM": "xterm"}
-            )
-        os.close(follower)
-        shown = b""
-        while select.select([leader], [], [], TIMEOUT_S)[0]:
-            try:
-                shown += os.read(leader, 65536)
-            except OSError:  # the process has ended
-                break
-        os.close(leader)
-        assert process.wait(TIMEOUT_S) == 0
-        return shown.decode(), (folder / "stdout").read_text()
-
-    def test_the_live_line_is_there_without_asking(self, files, tmp_path):
-        replay = ["--source", f"replay:{files}/taps.npz"]
-        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=120)
-        live = re.findall(r"\r([^\r\n]*)\x1b\[K", shown)
-        assert live and live[-1].startswith("REPLAY | 4 contact not checked tap 4 ") and output == ""
-        assert max(map(len, live)) <= 119
-
-    def test_it_gives_way_to_records_on_stdout(self, files, tmp_path):
-        replay = ["--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
-        shown, output = self.on_terminal(tmp_path, *base_options(files), *replay, columns=80)
-        assert "REPLAY | " not in shown and len(records(output)) == 40
-
-
-REPLAY = ["replay", "{files}/taps.npz"]
-
-
 def in_shell(redirection, *arguments, unbuffered):
     """A run whose streams a shell has redirected; all that is left of them is read."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
@@ -195,7 +156,6 @@ def in_shell(redirection, *arguments, unbuffered):
         ("demo --duration-s 0.1", ">/dev/full", "No space left", False),
         ("models", ">/dev/full", "No space left", True),
         ("models", ">&-", "Bad file descriptor", False),
-        ("doctor --source demo --no-press --drift-s 1", ">&-", "Bad file descriptor", True),
         ("--help", ">/dev/full", "No space left", False),
     ],
 )
@@ -206,7 +166,7 @@ def test_a_stdout_that_takes_nothing_is_5_in_one_line(command, redirection, why,
     assert "Traceback" not in done.stderr and "Exception" not in done.stderr
 
 
-@pytest.mark.parametrize("redirection", ["2>&-", "2>/dev/full", "<&- 2>&-", "2</dev/null"])
+@pytest.mark.parametrize("redirection", ["2>/dev/full", "<&- 2>&-"])
 def test_without_a_stderr_there_are_records_on_stdout_and_nothing_else(files, redirection):
     options = [*base_options(files), "--source", f"replay:{files}/taps.npz", "--sink", "jsonl:-"]
     done = in_shell(redirection, *options, unbuffered=False)
@@ -228,9 +188,9 @@ def test_ctrl_c_while_modules_are_imported_ends_in_no_traceback(tmp_path):
     assert (process.returncode, errors) == (-signal.SIGINT, "")
 
 
-@pytest.mark.parametrize("text", ["\x1b[2J", "\x1b]0;title\x07", "\x9b2J", "\x1b[31m\r"])
-def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
+def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path):
     """It may stand in a cell, a header, a key, or in the name of a file, which need not be UTF-8 either."""
+    text = "\x1b[2J\x1b]0;title\x07\x9b2J\x1b[31m\r"
     columns = [f"txl{taxel}_{axis}" for taxel in range(1, 17) for axis in "xyz"]
     key = json.dumps(text)
     name = os.fsdecode(b"\xfc") + text
@@ -248,15 +208,12 @@ def test_no_control_character_of_a_file_reaches_the_terminal(tmp_path, text):
         done = run(*asked, "--sink", "jsonl:-")
         printed = done.stdout + done.stderr
         assert done.returncode == (0 if name in path.name else 2) and "Traceback" not in printed
-        assert text not in printed and printed.replace("\n", "").isprintable()
+        assert printed.replace("\n", "").isprintable()
 
 
-def test_odd_surroundings_end_in_one_line():
-    """A terminal one column wide, and fewer descriptors than a run needs."""
-    how = {"capture_output": True, "text": True, "cwd": ROOT}
-    helped = subprocess.run([*EDGE_SR, "--help"], env=os.environ | {"COLUMNS": "1"}, **how)
-    assert (helped.returncode, helped.stderr) == (0, "") and "--source" in helped.stdout
+def test_fewer_descriptors_than_a_run_needs_end_in_one_line():
     few = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (14, 14))
-    done = subprocess.run([*EDGE_SR, "--source", "demo", "--duration-s", "1"], preexec_fn=few, **how)
-    assert done.returncode == 5 and "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"
+    process = start("--source", "demo", "--duration-s", "1", preexec_fn=few)
+    errors = process.communicate(timeout=TIMEOUT_S)[1]
+    assert process.returncode == 5 and "Traceback" not in errors
+    assert errors.splitlines()[-1] == "edge-sr: Too many open files: allow more of them, ulimit -n 256"

@@ -10,8 +10,9 @@ from trust_samples import make_posed_trust
 
 from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, UsageError, demo_recording, load_model
 from edge.cli import main as cli
-from edge.cli import run_command as run
+from edge.cli import run_command
 from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
+from edge.cli.run_help import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
@@ -158,7 +159,17 @@ def test_the_table_has_a_line_a_tap_and_says_what_the_taps_are_worth(recording):
     assert score_table(scores[:1]).splitlines()[-1].startswith("Each pattern is of one tap")
 
 
-def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(monkeypatch, capfd):
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    """A tiny model that takes poses, pad and gains, as the one of the demo does."""
+    path = tmp_path_factory.mktemp("posed") / "posed.onnx"
+    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
+    takes = {"trust": make_posed_trust(100.0).to_json(), "pad_inputs": pad_inputs, "takes_gains": True}
+    write_posed_model(path, make_posed_contract(interval_factor=1.6, output_full_scale=100.0, **takes))
+    return str(path)
+
+
+def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(posed, monkeypatch, capfd):
     """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
     with np.load(demo_recording()) as demo:
         tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
@@ -174,9 +185,9 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
         return [waiting.pop(0) for one in tuple(waiting) if one.time_ns < now_ns]
 
     link.poses = stated
-    monkeypatch.setattr(cli, "_open_source", lambda options, give_up_s: Source(link))
-    monkeypatch.setattr(run, "open_sink", lambda text, **facts: sink)
-    assert cli.main(["--source", "demo:loop", "--sink", "status"]) == 0
+    monkeypatch.setattr(run_command, "open_sink", lambda text, **facts: sink)
+    options = parsed_options("", ["--source", "demo:loop", "--sink", "status", "--model", posed])
+    run_command.run(options, Source(link))
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
     assert out.count("map of a letter of 50 mm") == 1
@@ -223,15 +234,10 @@ def taps_of(results):
     return [*takewhile(lambda tap: tap.place[2] > SCENES_TURN_DEG, taps)]
 
 
-def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(tmp_path):
+def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(posed):
     """The whole program with a model that takes poses: each proposal of its records is where the next tap is made."""
-    path = tmp_path / "posed.onnx"
-    trust = make_posed_trust(100.0).to_json()
-    pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
-    takes = {"trust": trust, "pad_inputs": pad_inputs, "takes_gains": True}
-    write_posed_model(path, make_posed_contract(interval_factor=1.6, output_full_scale=100.0, **takes))
     # At its own rate: faster, a busy machine loses scans in the kernel, and with them the zeroing before the first tap.
-    done = cli_samples.run("demo", "--model", str(path), "--sink", "jsonl:-")
+    done = cli_samples.run("demo", "--model", posed, "--sink", "jsonl:-")
     assert done.returncode == 0, done.stderr
     assert "taps 'glyph:1' 4 times, where it is proposed" in done.stderr
     results = [one for one in cli_samples.records(done.stdout) if one["state"] != "event"]
@@ -275,5 +281,5 @@ def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(mo
     def ask(*names, **_):
         raise UsageError(*names)
 
-    monkeypatch.setattr(cli, "open_source", ask)
+    monkeypatch.setattr(run_command, "open_source", ask)
     assert cli.main(arguments) == 2 and capsys.readouterr().err == f"edge-sr: {source}\n"

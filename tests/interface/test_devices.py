@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from edge.cli import main as cli
-from edge.cli.devices_command import NOTHING, SERVER_HINT
+from edge.cli.listings import NOTHING, SERVER_HINT
 from edge.pipeline.silence_hint import silence_hint
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices

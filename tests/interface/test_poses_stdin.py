@@ -37,13 +37,11 @@ NOW_NS = 10**12
 
 
 class TestFields:
-    def test_all_fields_are_taken(self):
+    def test_all_fields_are_taken_and_place_alone_is_enough(self):
         expected = TimedPose(PadPose(1.5, 0.0, 5.0, 0.2, 1.0), 123, "4", True)
         assert pose_of_fields(json.loads(WHOLE), NOW_NS) == expected
-
-    def test_place_alone_is_enough(self):
-        expected = TimedPose(PadPose(1.0, -2.0), NOW_NS)
-        assert pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == expected
+        assert pose_of_fields({"cmd": "pose", "x_mm": 1, "y_mm": -2.0}, NOW_NS) == TimedPose(PadPose(1, -2), NOW_NS)
+        assert pose_of_fields({"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + FURTHEST_AHEAD_NS}, NOW_NS)  # a little ahead
 
     @pytest.mark.parametrize(
         ("fields", "words"),
@@ -69,9 +67,6 @@ class TestFields:
         with pytest.raises(PoseError, match=words.replace("[", r"\[")) as caught:
             pose_of_fields(fields, NOW_NS)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 250
-
-    def test_a_pose_may_lie_a_little_ahead(self):
-        assert pose_of_fields({"x_mm": 0, "y_mm": 0, "time_ns": NOW_NS + FURTHEST_AHEAD_NS}, NOW_NS)
 
 
 class TestLines:

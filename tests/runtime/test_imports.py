@@ -83,13 +83,13 @@ def test_a_run_loads_what_it_uses_and_leaves_no_trace(tmp_path):
 
 _GIVEN_BACK = """
 from pathlib import Path
-from edge.terminal.heap import give_back
+from edge.cli.run_command import give_back_memory
 def resident(): return int(Path("/proc/self/statm").read_text().split()[1])
 blocks = [bytes(5000) for _ in range(10_000)]
 kept = blocks[::100]
 del blocks
 full = resident()
-give_back()
+give_back_memory()
 print(full - resident())
 """
 

@@ -44,9 +44,9 @@ def fresh(tmp_path_factory, wheels):
 
 @pytest.fixture(scope="module")
 def demo(fresh, tmp_path_factory):
-    """The installed runtime's demo, which plays while other tests run, and the file of its records."""
+    """The installed runtime's demo with its first tap, which plays while other tests run, and its records' file."""
     records = tmp_path_factory.mktemp("demo") / "records.jsonl"
-    command = [str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}"]
+    command = [str(fresh / "edge-sr"), "--source", "demo", "--sink", f"jsonl:{records}", "--duration-s", "6"]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, env=without_checkout(), **pipes) as process:
         yield process, records
@@ -128,13 +128,6 @@ def test_what_is_left_out_is_one_line(fresh, tmp_path):
     assert (done.returncode, done.stdout, done.stderr.splitlines()) == (2, "", [line])
 
 
-@pytest.mark.parametrize("name", ["mtsr4.onnx", "mtsr4"])
-def test_a_model_is_named_without_its_precision(fresh, name):
-    command = [str(fresh / "edge-sr"), "--source", "demo", "--model", name, "--duration-s", "1", "--sink", "jsonl:-"]
-    records = [json.loads(line) for line in run(command).splitlines()]
-    assert {record["model"] for record in records if "model" in record} == {"mtsr4-int8"}
-
-
 def test_licence_and_version_are_in_the_wheel(fresh):
     (about,) = fresh.parent.glob("lib/python*/site-packages/tactile_edge_sr-*.dist-info")
     assert ANY_LICENCE in (about / "licenses/LICENSE").read_text()
@@ -197,7 +190,6 @@ def test_the_demo_runs_from_the_wheel(demo):
     assert "PSNR" in out
     lines = [json.loads(line) for line in records.read_text().splitlines()]
     assert {line["source"] for line in lines} == {"emulated"}
-    assert max(line["taps_used"] or 0 for line in lines) >= 4
     assert any(line["pattern"] for line in lines)
 
 

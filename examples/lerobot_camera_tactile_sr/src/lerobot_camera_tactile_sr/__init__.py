@@ -1,6 +1,5 @@
 """Camera `tactile_sr` of LeRobot: patterns, taxels and wrenches of a tactile sensor."""
 
-from lerobot_camera_tactile_sr.tactile_sr_camera import TactileSrCamera
-from lerobot_camera_tactile_sr.tactile_sr_config import TactileSrCameraConfig
+from lerobot_camera_tactile_sr.tactile_sr_camera import TactileSrCamera, TactileSrCameraConfig
 
 __all__ = ["TactileSrCamera", "TactileSrCameraConfig"]

@@ -16,13 +16,9 @@ def believed(result: Result) -> bool:
 
 
 def image_of(result: Result, contract: Contract, full_scale_mm: float, zoom: int = 1) -> NDArray[np.uint8]:
-    """Return an image (H, W, 3): pattern, deviation, and 255 where the image is to be believed.
+    """Return an image (H, W, 3): pattern and deviation, 0 without one, and 255 where the image is to be believed.
 
-    Args:
-        result: a result; without a pattern the first two are 0.
-        contract: of its model.
-        full_scale_mm: deformation and deviation that are 255, whatever the result.
-        zoom: side of a pixel of the pattern in the image.
+    Deformation and deviation of `full_scale_mm` are 255, whatever the result; `zoom` is the side of a pixel.
     """
     image = np.zeros((*contract.pattern_shape, 3), dtype=np.uint8)
     for channel, values in enumerate((result.pattern, result.deviation)):

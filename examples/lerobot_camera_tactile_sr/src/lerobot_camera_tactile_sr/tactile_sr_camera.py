@@ -2,28 +2,51 @@
 
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from lerobot.cameras.camera import Camera
+from lerobot.cameras.configs import CameraConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
-from edge.api import BridgeError, EdgeError, Result, Stream, devices, load_model, open_runtime, open_source
+from edge.api import (
+    DEFAULT_MODEL,
+    BridgeError,
+    EdgeError,
+    Result,
+    Stream,
+    devices,
+    load_model,
+    open_runtime,
+    open_source,
+)
 from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of
-from lerobot_camera_tactile_sr.tactile_sr_config import TactileSrCameraConfig
 
-FIRST_S = 30.0
-"""Longest wait for the first result: a loading model, a sensor that starts, and 100 scans to zero from."""
+
+@CameraConfig.register_subclass("tactile_sr")
+@dataclass(kw_only=True)
+class TactileSrCameraConfig(CameraConfig):
+    """Settings of one sensor, as `--robot.cameras` of LeRobot takes them; `fps` is not used: the sensor has its pace.
+
+    Width and height of an image are multiples of the pattern's, by default the same.
+    """
+
+    source: str | None = None  # as edge-sr --source; None for the adapter of the sensor file, or the one plugged in
+    sensor_file: str | None = None  # file of edge-sr doctor
+    name: str | None = None  # of the sensor where the source has several
+    model: str = DEFAULT_MODEL  # name of a bundled model, or a file
+    full_scale_mm: float = 0.3  # deformation and deviation at 255; it is fixed, so that images can be compared
+    pretend: bool = False  # accept emulated sensors and recordings, on which no robot may act
+
+    def __post_init__(self) -> None:
+        if not self.full_scale_mm > 0:
+            raise ValueError(f"full_scale_mm is {self.full_scale_mm}, expected a number above 0")
 
 
 class TactileSrCamera(Camera):
-    """Tactile sensor as a camera; a thread reads it, so that no call but the first waits for more than one scan.
-
-    Attributes:
-        width: of an image.
-        height: of an image.
-    """
+    """Tactile sensor as a camera; a thread reads it, so that no call but the first waits for more than one scan."""
 
     def __init__(self, config: TactileSrCameraConfig) -> None:
         """Load the model; nothing is opened.
@@ -83,21 +106,14 @@ class TactileSrCamera(Camera):
         if not warmup:
             return
         try:
-            self._wait(
-                lambda: self._newest is not None and self._newest.state not in ("zeroing", "incomplete"), FIRST_S
-            )
+            # A loading model, a sensor that starts, and 100 scans to zero from.
+            self._wait(lambda: self._newest is not None and self._newest.state not in ("zeroing", "incomplete"), 30.0)
         except (TimeoutError, ConnectionError):
             self.disconnect()
             raise
 
     def read(self) -> NDArray[np.uint8]:
-        """Return the image of the next scan; see `observation.image_of`.
-
-        Raises:
-            DeviceNotConnectedError: it is not connected.
-            ConnectionError: the sensor is lost for good.
-            TimeoutError: no scan came.
-        """
+        """Return the image of the next scan; see `observation.image_of`. Raises as `async_read` does."""
         with self._changed:
             self._fresh = False
         return self.async_read(1000.0)
@@ -116,11 +132,7 @@ class TactileSrCamera(Camera):
     def read_latest(self, max_age_ms: int = 500) -> NDArray[np.uint8]:
         """Return the image of the newest scan at once.
 
-        Raises:
-            DeviceNotConnectedError: it is not connected.
-            ConnectionError: the sensor is lost for good.
-            TimeoutError: the newest scan is older.
-            RuntimeError: there is none yet.
+        Raises as `async_read` does, with TimeoutError if that scan is older; RuntimeError if there is none yet.
         """
         return self._image(self._check_age(max_age_ms))
 
@@ -132,11 +144,7 @@ class TactileSrCamera(Camera):
         return state_of(self._check_age(max_age_ms), self._contract)
 
     def disconnect(self) -> None:
-        """Close the sensor.
-
-        Raises:
-            DeviceNotConnectedError: it is not connected.
-        """
+        """Close the sensor; raises DeviceNotConnectedError where it is not connected."""
         if self._thread is None:
             raise DeviceNotConnectedError(f"{self} is not connected")
         self._stop.set()

@@ -9,6 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edge.api import (
     DEFAULT_MODEL,
     BridgeError,
@@ -62,8 +64,6 @@ def frames_of(path: Path, fps: int, model: Any, full_scale_mm: float) -> Iterato
 
 
 def _frame(results: Sequence[Result], contract: Contract, full_scale_mm: float) -> dict[str, Any]:
-    import numpy as np
-
     state = [number for result in results for number in state_of(result, contract).values()]
     images = {image_key(one.scan.sensor): image_of(one, contract, full_scale_mm) for one in results}
     return {STATE: np.array(state, dtype=np.float32), **images}
@@ -124,16 +124,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--video", action="store_true", help="images as video, which is smaller and not exact")
     options = parser.parse_args(words)
     try:
-        count = convert(
-            options.recordings,
-            options.repo_id,
-            task=options.task,
-            fps=options.fps,
-            root=options.root,
-            model=options.model,
-            full_scale_mm=options.full_scale_mm,
-            video=options.video,
-        )
+        count = convert(**vars(options))
     except (BridgeError, EdgeError, ValueError, OSError) as error:
         print(f"tactile-sr-to-lerobot: {error}", file=sys.stderr)
         return 1

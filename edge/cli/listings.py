@@ -1,0 +1,114 @@
+"""`edge-sr models` and `edge-sr devices`: what is bundled, and what is plugged in."""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from typing import Final, TextIO
+
+import numpy as np
+
+from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
+from edge.terminal.progress_bar import Progress
+from edge.terminal.text_wrap import columns, wrapped
+from firmware_bridge.errors import DeviceError
+from firmware_bridge.links.discovery import Found, devices
+from firmware_bridge.schedule import Ticker
+
+RATE_HZ: Final = 100.0
+ROUNDS: Final = 3
+"""Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
+ROUND_TICKS: Final = 50
+NOTHING = (
+    "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
+    "it was plugged in, and that this user is in the group dialout"
+)
+SERVER_HINT = "The vendor's server, where one runs, is not searched for: --source xela-server:ws://HOST:5000"
+
+
+def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Print the bundled models with their error, and with --measure their run time on this machine.
+
+    Raises ModelError if there is none, or one cannot be used.
+    """
+    paths = bundled_models()
+    if not paths:
+        raise ModelError("no models are bundled with this installation")
+    models = [load_model(path) for path in paths]
+    measure, took_us = options.measure, run_times_us(models) if options.measure else []
+    widest = max(len(path.stem) for path in paths)
+    times = " p50 us p99 us" if measure else ""
+    shown = {"psnr_db": "7.1f", "rmse_percent": "6.2f", "boundary_mm": "7.2f"}
+    out.write(f"{'model':{widest}s} taps   MB arithmetic PSNR dB RMSE % edge mm{times}\n")
+    for index, (path, model) in enumerate(zip(paths, models, strict=True)):
+        contract = model.contract
+        error = contract.test_error.get(str(contract.taps), {})
+        figures = "".join(
+            f" {error[name]:{width}}" if name in error else f" {'-':>{width[0]}s}" for name, width in shown.items()
+        )
+        cells = f"{path.stem:{widest}s} {contract.taps:4d} {path.stat().st_size / 1e6:4.1f} {contract.arithmetic:10s}"
+        times = "".join(f" {us:6.0f}" for us in took_us[index]) if measure else ""
+        default = {DEFAULT_MODEL: " default", POSED_MODEL: " with poses"}.get(path.stem, "")
+        out.write(f"{cells}{figures}{times}{default}\n")
+    out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
+    if not measure:
+        return
+    out.write(f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
+    # The ratio is 1.2 to 1.4 on a quiet machine.
+    uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > 3 * p50]
+    if uneven:
+        named = ", ".join(uneven)
+        out.write(f"those of {named} are uneven, as on a busy machine: measure again when it is quiet\n")
+
+
+def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
+    """Return median and 99th percentile of each model's run time in [us], each run at its tick as on a robot.
+
+    Windows are random, with all taps: run time does not depend on their values.
+    """
+    rng = np.random.default_rng(1)
+    took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
+    with Progress("run times", took_us.size, "run") as bar:
+        for round_ in range(ROUNDS):
+            for index, model in enumerate(models):
+                contract = model.contract
+                shape = (16, contract.taps, 3, contract.rows, contract.cols)
+                windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
+                ticker = Ticker(RATE_HZ)
+                for tick in range(ROUND_TICKS):
+                    ticker.wait()
+                    start_ns = time.perf_counter_ns()
+                    model.run(contract.scale_window(windows[tick % len(windows)]))
+                    took_us[index, round_, tick] = (time.perf_counter_ns() - start_ns) / 1e3
+                bar.advance(ROUND_TICKS)  # not while it measures
+    both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
+    return [(float(p50), float(p99)) for p50, p99 in both.T]
+
+
+def show_devices(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
+    """Print the devices, opening none, what to type to read each, and what prevents its use; with --json for programs.
+
+    Raises DeviceError if no adapter is among them.
+    """
+    found, notes = devices()
+    if options.json:
+        out.write(json.dumps({"devices": [one._asdict() for one in found], "notes": notes}, indent=1) + "\n")
+    else:
+        out.write("".join(f"{line}\n" for line in page(found, notes, columns())))
+    if not any(one.adapter for one in found):
+        raise DeviceError(NOTHING)
+
+
+def page(found: Sequence[Found], notes: Sequence[str], width: int) -> list[str]:
+    """Return lines for a reader, adapters first; only text to be typed and longer words are wider than `width`."""
+    lines: list[str] = []
+    for one in sorted(found, key=lambda one: not one.adapter):
+        serial = f"serial {one.serial_number}" if one.serial_number else None
+        lines += wrapped("  ".join(word for word in (one.path, one.usb_id, serial) if word), width, indent="  ")
+        lines += wrapped(f"{'looks like ' if one.adapter else ''}{one.looks_like}", width, "  ", "  ")
+        lines.append(f"  --source {one.source}")
+        for problem in one.problems:
+            lines += wrapped(problem, width, "  ! ", "    ")
+    for note in (*notes, SERVER_HINT):
+        lines += wrapped(note, width)
+    return lines
