@@ -142,7 +142,7 @@ class DriftTracker:
         ordered = np.sort(counts[:, self._live if voters is None else voters], axis=1)
         count = ordered.shape[1]
         if not count:
-            return np.zeros((len(AXES), 1, 1), np.float32), np.zeros_like(counts)
+            return np.zeros_like(self._rate_per_s), np.zeros_like(counts)
         common = (np.float32(0.5) * (ordered[:, (count - 1) // 2] + ordered[:, count // 2]))[:, None, None]
         return common, np.where(self._live, counts - common, np.float32(0))
 
