@@ -35,12 +35,20 @@ _UNITS: Final = {
     )
     for word in words.split()
 }
-_USUAL_PERIODS_S: Final = (0.0005, 0.25)
-"""Periods between scans that tell the unit of times without one: none of them is usual in two units."""
-_GAP: Final = 10.0  # usual steps between times from which on a step is a gap, which says nothing about the rate
+_WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,9}(\.0*)?")
+MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
+LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
 
 
-class CsvColumns:
+def csv_header(taxel_count: int) -> tuple[str, ...]:
+    """Return the columns of so many taxels."""
+    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
+
+
+CSV_HEADER: Final = csv_header(USPA44.taxel_count)
+
+
+class _Columns:
     """Places of the columns that are read; counts and newtons taxel by taxel, x, y and z each."""
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -86,21 +94,19 @@ class CsvColumns:
             raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")
 
 
-def rate_of(name: str, times: ArrayLike) -> float | None:
-    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told.
-
-    The unit is that in the name, else the one in which the times are those of a sensor's usual rates.
-    """
+def _rate_of(name: str, times: ArrayLike) -> float | None:
+    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told."""
     values = np.asarray(times, dtype=np.float64)
     steps = np.diff(values)
     if not steps.size or not np.isfinite(values).all() or steps.min() < 0:
         return None
     usual = float(np.percentile(steps, 90))
-    step = float(steps[steps <= _GAP * usual].mean() if usual else steps.mean())
+    # A gap of ten usual steps says nothing about the rate.
+    step = float(steps[steps <= 10 * usual].mean() if usual else steps.mean())
     units = [_UNITS[word] for word in _words(name) if word in _UNITS]
     if not units and not (steps == 1).all():  # such a column may as well number the rows
-        low, high = _USUAL_PERIODS_S
-        units = [unit for unit in sorted(set(_UNITS.values())) if low <= step / unit < high]
+        # No period of a sensor in this range is usual in two units.
+        units = [unit for unit in sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
     return units[-1] / step if units and step else None
 
 
@@ -110,23 +116,6 @@ def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
 
 def _words(name: str) -> list[str]:
     return re.findall(r"[a-z]+", name.lower().replace("\u00b5", "u").replace("\u03bc", "u"))
-
-
-MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
-LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
-_META_NAME: Final = "meta_data.csv"
-_META_RATE: Final = "frequency_hz"
-_WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
-_SEPARATOR = re.compile(r'"?sep=(.)"?\s*')
-_SEPARATORS: Final = ",;\t"
-
-
-def csv_header(taxel_count: int) -> tuple[str, ...]:
-    """Return the columns of so many taxels."""
-    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
-
-
-CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 
 
 class _Row(NamedTuple):
@@ -174,7 +163,7 @@ class _Scans:
     def __init__(self, path: Path, header: _Row) -> None:
         self._path = path
         try:
-            self._columns = CsvColumns(header.cells)
+            self._columns = _Columns(header.cells)
         except ValueError as error:
             raise RecordingError(f"{path}, line {header.line}: {error}") from error
         self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
@@ -205,7 +194,7 @@ class _Scans:
     def recording(self, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others."""
         path, columns = self._path, self._columns
-        rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
+        rates_hz = [_rate_of(columns.times[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
         if rates_hz:
             by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
@@ -224,7 +213,7 @@ class _Scans:
         return Recording(
             path,
             (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
-            rate_hz or _meta_rate_hz(path.with_name(_META_NAME)),
+            rate_hz or _meta_rate_hz(path.with_name("meta_data.csv")),
             notes=tuple(notes),
             origin="emulated" if columns.emulated else None,
             poses=self._poses,
@@ -250,11 +239,11 @@ def _rows(path: Path) -> Iterator[_Row]:
                 raise _DamageError(number, f"a line longer than {LONGEST_CSV_LINE} bytes", "a row of counts")
             if "\ufffd" in line and separator is not None:  # a header may have a name in another encoding
                 raise _DamageError(number, "bytes that are no UTF-8 text", "a row of counts")
-            named = _SEPARATOR.fullmatch(line) if separator is None else None
+            named = re.fullmatch(r'"?sep=(.)"?\s*', line) if separator is None else None
             if named is not None:
                 separator = named[1]
                 continue
-            separator = separator or max(_SEPARATORS, key=line.count)
+            separator = separator or max(",;\t", key=line.count)
             try:
                 cells = next(csv.reader([line], delimiter=separator, strict=True))
             except csv.Error as error:
@@ -316,13 +305,13 @@ def _meta_rate_hz(path: Path) -> float | None:
         rows = list(itertools.islice(_rows(path), 2))
     except _DamageError as damage:
         raise RecordingError(f"{path}, {damage}") from damage
-    if not rows or _META_RATE not in rows[0].cells:
+    if not rows or "frequency_hz" not in rows[0].cells:
         return None
-    column = rows[0].cells.index(_META_RATE)
+    column = rows[0].cells.index("frequency_hz")
     cell = rows[1].cells[column] if len(rows) > 1 and len(rows[1].cells) > column else ""
     rate_hz = _number(cell)
     if not is_rate(rate_hz):
-        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", A_RATE)
+        _refuse(path, 2, f"frequency_hz '{cell[:20]}'", A_RATE)
     return rate_hz
 
 
