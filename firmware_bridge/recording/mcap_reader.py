@@ -57,7 +57,7 @@ MOST_SHOWN_TOPICS: Final = 10
 
 @dataclass
 class _Sensor:
-    """What is known of one sensor, and its scans in columns: objects would take ten times the memory."""
+    """Facts of one sensor, and its scans in columns: objects would take ten times the memory."""
 
     baseline: Baseline | None = None  # the one at its first scan
     latest: Baseline | None = None

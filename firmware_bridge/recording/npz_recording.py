@@ -54,13 +54,10 @@ _HEADERS: Final = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_hea
 def read_npz(
     path: Path, names: Iterable[str], most_bytes: int, damaged: Callable[[], object] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read the arrays of these names that are in the file; others are not read.
+    """Read the arrays of these names that are in the file, of `most_bytes` together; others are not read.
 
-    Args:
-        path: path of the file.
-        names: names of the arrays.
-        most_bytes: largest allowed size of them together.
-        damaged: called where the file has lost its end, to read the arrays that are whole; without it that is refused.
+    Where the file has lost its end, `damaged` is called, and the arrays that are whole are read; without it that is
+    refused.
 
     Raises:
         NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.

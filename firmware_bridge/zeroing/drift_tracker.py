@@ -71,12 +71,10 @@ class DriftTracker:
         self._last_ns = 0  # the first scan interrupts, which sets the other attributes
 
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
-        """Process one scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
+        """Process the next scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
 
-        Args:
-            scan: next scan of the sensor.
-            contact: True during a tap, and while the baseline is in doubt.
-            dead: taxels (rows, cols) that are ignored; a new array only where they have changed.
+        There is `contact` during a tap, and while the baseline is in doubt. The `dead` taxels (rows, cols) are ignored,
+        and are a new array only where they have changed.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns

@@ -46,9 +46,7 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
     may lie above the freest scans of the whole recording, as with an earlier baseline. Where the pad is still nowhere,
     but was let go of, these are the freest FEWEST_RECORDED scans.
-
-    Args:
-        counts: (n, 3, rows, cols) raw counts of all scans of a sensor; ABSENT where a taxel gave no reading.
+    Raw counts (n, 3, rows, cols) of all scans of a sensor; ABSENT where a taxel gave no reading.
 
     Raises:
         BaselineRefusedError: there is none, with the reason at the freest place.
