@@ -17,8 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 MOST_RECORD_BYTES: Final = 1 << 25
-"""Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
-MOST_WINDOW_BYTES: Final = 1 << 25  # largest window of zstd, in bytes
+"""Most bytes of a record, of a chunk unpacked, and of zstd's window: writers make chunks of one to a few megabytes."""
 _RECORD: Final = struct.Struct("<BQ")
 MESSAGE: Final = struct.Struct("<HIQQ")
 """Head of a message: channel, sequence, and times at which it was logged and published."""
@@ -83,7 +82,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     if size_bytes > MOST_RECORD_BYTES:
         raise ValueError(f"{size_bytes:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
     if chunk.compression == "zstd":
-        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_WINDOW_BYTES)
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES)
         data = unpacker.stream_reader(chunk.data).read(size_bytes + 1)
     elif chunk.compression == "lz4":
         import lz4.frame

@@ -48,7 +48,6 @@ _BROKEN: Final = (
     RuntimeError,  # encrypted, with an unsupported compression, or nested too deep
     *(SyntaxError, TokenError, MemoryError, Warning),  # errors that numpy's reader of the header passes on
 )
-_HEADERS: Final = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 def read_npz(
@@ -128,9 +127,10 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
         raise NpzError(f"{info.filename} is compressed in another way than numpy's: save it again with numpy")
     with archive.open(info) as entry:
         version = npy.read_magic(entry)
-        if version not in _HEADERS:
+        headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+        if version not in headers:
             raise NpzError(f"{info.filename} is of npy version {version}, expected (1, 0) or (2, 0)")
-        shape, _, dtype = _HEADERS[version](entry)
+        shape, _, dtype = headers[version](entry)
         if dtype.hasobject or dtype.kind not in "biufU":
             raise NpzError(f"{info.filename} holds {dtype}, expected plain arrays of numbers or text")
         stated_bytes, held_bytes = prod(shape) * dtype.itemsize, info.file_size - entry.tell()

@@ -36,12 +36,10 @@ Origin = Literal["start-up", "demand", "file", "recording", "unsure"]
 
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
-MOST_FILE_BYTES: Final = 1 << 20  # most bytes of a baseline file; a sensor takes about 2 kB
 LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
 
-Orders = Mapping[str, Sequence[int]]
-_AS_WIRED: Final[Orders] = MappingProxyType({})
+_AS_WIRED: Final[Mapping[str, Sequence[int]]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +178,9 @@ class BaselineEstimator:
         return baseline
 
 
-def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
+def save_baselines(
+    path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = _AS_WIRED
+) -> None:
     """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
     `orders` are those of the taxels of each sensor whose mounting differs from its id map.
@@ -215,7 +215,7 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orde
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Baseline]:
+def load_baselines(path: str | Path, orders: Mapping[str, Sequence[int]] = _AS_WIRED) -> dict[str, Baseline]:
     """Read baselines, by sensor; `orders` are the present ones of the taxels, as in `save_baselines`.
 
     Raises:
@@ -224,7 +224,7 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
     """
     path = Path(path)
     try:
-        document = json.loads(read_bounded(path, MOST_FILE_BYTES).decode())
+        document = json.loads(read_bounded(path, 1 << 20).decode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
