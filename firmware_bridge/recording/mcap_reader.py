@@ -3,17 +3,13 @@
 import json
 import os
 import re
-import struct
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Final, Literal, NoReturn
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
@@ -22,7 +18,7 @@ from firmware_bridge.in_place import read_bounded
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
-from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
+from firmware_bridge.recording.mcap_records import CutOffError, DamageError, EncodedMessage, records, short
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
     POSE,
@@ -104,8 +100,8 @@ def load_mcap(path: Path) -> Recording:
                 raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
             reading.begin(one)
             try:
-                for opcode, data in records(file):
-                    reading.take(opcode, data)
+                for record in records(file):
+                    reading.take(record)
             except CutOffError as end:
                 reading.notes.insert(0, f"{one} breaks off ({end}): its recording was killed, or the disk was full")
             except DamageError as damage:
@@ -158,27 +154,18 @@ class _Reading:
         """Go on with a file: its numbers of schemas and channels are its own."""
         self._path, self._schemas, self._topics = path, {}, {}
 
-    def take(self, opcode: int, data: memoryview) -> None:
+    def take(self, record: EncodedMessage | Schema | Channel | Metadata) -> None:
         """Process one record, from a chunk or between chunks."""
-        if opcode == Opcode.MESSAGE:
-            self._take_message(data)
-            return
-        stream = ReadDataStream(BytesIO(data))
-        try:
-            if opcode == Opcode.SCHEMA:
-                self._take_schema(Schema.read(stream))
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(stream)
-                kind = self._schemas.get(channel.schema_id) if channel.message_encoding == "cdr" else None
-                self._topics[channel.id] = channel.topic[:60], kind
-            elif opcode == Opcode.METADATA:
-                self._described = True
-                metadata = Metadata.read(stream)
-                self._take_metadata(metadata.name, metadata.metadata)
-        except RecordingError:
-            raise
-        except BROKEN as error:
-            raise DamageError(f"a record that cannot be read ({short(error)})") from error
+        if isinstance(record, EncodedMessage):
+            self._take_message(record)
+        elif isinstance(record, Schema):
+            self._take_schema(record)
+        elif isinstance(record, Channel):
+            kind = self._schemas.get(record.schema_id) if record.message_encoding == "cdr" else None
+            self._topics[record.id] = record.topic[:60], kind
+        else:
+            self._described = True
+            self._take_metadata(record.name, record.metadata)
 
     def recording(self) -> Recording:
         """Return what was read.
@@ -272,20 +259,16 @@ class _Reading:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
         one.facts = text
 
-    def _take_message(self, data: memoryview) -> None:
-        try:
-            channel, _, log_ns, _ = MESSAGE.unpack_from(data)
-        except struct.error as error:
-            raise DamageError("a message that is cut off") from error
-        topic, kind = self._topics.get(channel, ("", None))
-        body = data[MESSAGE.size :]
+    def _take_message(self, message: EncodedMessage) -> None:
+        topic, kind = self._topics.get(message.channel_id, ("", None))
+        body = message.data
         try:
             if kind is POSE:
                 self._take_pose(decode_pose(body))
             elif kind is SENSOR:
                 self._take_facts(body)
             elif kind is not None and kind.name == SCAN_NAME:
-                self._take_scan(decode_scan(body, self._geometry), log_ns)
+                self._take_scan(decode_scan(body, self._geometry), message.log_ns)
             elif kind is not None:
                 self._take_baseline(decode_baseline(body, self._geometry))
         except CdrError as error:
