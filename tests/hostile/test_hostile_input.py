@@ -98,11 +98,11 @@ class TestArchives:
         header = npy(np.zeros((1, 3, 4, 4), np.int32)).replace(b"(1, 3", b"(9999999999, 3").replace(b" " * 9, b"", 1)
         self.refused(tmp_path, stored({"counts": header} | members("counts")), "states 1919999999808 bytes and holds")
 
-    def test_a_table_of_contents_of_a_million_members(self, tmp_path, bounded_memory):
+    def test_a_table_of_contents_that_is_large(self, tmp_path, bounded_memory):
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w") as whole:
-            for number in range(13_000):
-                whole.writestr(f"{number:060d}", b"")
+            for number in range(20):
+                whole.writestr(f"{number:060000d}", b"")
         self.refused(tmp_path, file.getvalue(), r"a piece of 1,\d+,\d+ bytes, expected at most 1,048,576")
 
     @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
