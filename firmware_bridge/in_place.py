@@ -19,15 +19,12 @@ def write_in_place(
 ) -> None:
     """Write a file so that at any time its name leads to a complete file, new or former, or to no file.
 
-    Args:
-        path: path of the file; an existing one stays as NAME.bak.
-        write: writes a draft of the same name in another folder.
-        load: reads the draft back, as its readers will.
-        keep_before: False for files that are rewritten often, and need no .bak.
+    `write` writes a draft of the same name in another folder, and `load` reads it back, as its readers will. An
+    existing file stays as NAME.bak, unless not `keep_before`, for files that are rewritten often.
 
     Raises:
-        OSError: the file cannot be written, or is no plain file; the former one is still there. Errors of `write` and
-            `load` are passed on, and leave the former one there as well.
+        OSError: the file cannot be written, or is no plain file. Errors of `write` and `load` are passed on. The former
+            file is still there.
     """
     path = Path(path)
     check_writable(path)
@@ -57,18 +54,15 @@ def check_writable(path: Path) -> None:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-PIECE_BYTES: Final = 1 << 20
-
-
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """Read a whole file.
 
     Raises:
-        OSError: it cannot be read, or is larger; no more than a piece beyond the limit is read.
+        OSError: it cannot be read, or is larger; no more than a mebibyte beyond the limit is read.
     """
     content = bytearray()
     with path.open("rb") as file:
-        while piece := file.read(PIECE_BYTES):  # one large read would allocate memory for the whole limit
+        while piece := file.read(1 << 20):  # one large read would allocate memory for the whole limit
             content += piece
             if len(content) > most_bytes:
                 raise OSError(errno.EFBIG, f"larger than the {most_bytes:,} bytes that are read")

@@ -77,12 +77,9 @@ class PoseTrack:
         return len(self._times_ns)
 
     def add(self, time_ns: int, pose: PadPose, *, holds: bool = False) -> bool:
-        """Add a pose; False, and nothing is added, if one at the same time or later was added before.
+        """Add the pose at a monotonic time in [ns], where the pad rests until the next one if it `holds`.
 
-        Args:
-            time_ns: monotonic time of the pose, in [ns].
-            pose: of the pad.
-            holds: the pad rests there until the next pose, however long that takes.
+        False, and nothing is added, if one at the same time or later was added before.
         """
         if self._times_ns and time_ns <= self._times_ns[-1]:
             return False

@@ -4,7 +4,6 @@ The slowest sensor on record renews a taxel four times a second, so a quarter of
 silence; and an adapter hands on its data after 16 ms at the latest.
 """
 
-import math
 import time
 from collections.abc import Callable
 from typing import Final
@@ -26,34 +25,18 @@ def sleep_until(deadline_ns: int, clock: Clock = time.monotonic_ns, sleep: Sleep
 
 
 class Ticker:
-    """Source of ticks at start + n / rate: a late tick does not move the ones after it.
-
-    It counts the ticks that were `late`, and those `skipped`, because the next one was past as well.
-    """
+    """Source of ticks at start + n / rate: a late tick does not move the ones after it."""
 
     def __init__(self, rate_hz: float, clock: Clock = time.monotonic_ns, sleep: Sleep = time.sleep) -> None:
-        if not (math.isfinite(rate_hz) and rate_hz > 0):
-            raise ValueError(f"rate is {rate_hz} Hz, expected a positive number")
-        self.late = self.skipped = 0
         self._rate_hz, self._clock, self._sleep = rate_hz, clock, sleep
         self._start_ns = clock()
         self._tick = 0
 
     def wait(self) -> int:
-        """Sleep until the next tick and return its number, from 1.
-
-        If it is late by whole periods, it leaves those ticks out and returns the newest one that is past.
-        """
-        self._tick += 1
-        now_ns = self._clock()
-        if now_ns > self.deadline_ns(self._tick):
-            self.late += 1
-            newest = int((now_ns - self._start_ns) * self._rate_hz / NS_PER_S)
-            behind = max(0, newest - self._tick)
-            self.skipped += behind
-            self._tick += behind
-        else:
-            sleep_until(self.deadline_ns(self._tick), self._clock, self._sleep)
+        """Sleep until the next tick and return its number, from 1; at once if it is late, without those long past."""
+        newest = int((self._clock() - self._start_ns) * self._rate_hz / NS_PER_S)
+        self._tick = max(self._tick + 1, newest)
+        sleep_until(self.deadline_ns(self._tick), self._clock, self._sleep)
         return self._tick
 
     def deadline_ns(self, tick: int) -> int:

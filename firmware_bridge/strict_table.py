@@ -11,17 +11,13 @@ LEAST_POSITIVE: Final = 1e-300
 
 
 class Table:
-    """One table of a file, whose keys are taken one by one; `end` refuses any left over.
-
-    Args:
-        path: of the file.
-        name: of the table, with a dot at its end, for messages.
-        values: of the table.
-        error: raised where a value cannot be used.
-        remedy: what a user can do then.
-    """
+    """One table of a file, whose keys are taken one by one; `end` refuses any left over."""
 
     def __init__(self, path: Path, name: str, values: Mapping[str, Any], error: type[ValueError], remedy: str) -> None:
+        """Start with all values of a table, whose name, if it has one, ends in a dot.
+
+        Where one cannot be used, the error is raised, and a user is told the remedy.
+        """
         self._path, self._name, self._error, self._remedy = path, name, error, remedy
         self._values = dict(values)
         self._known: list[str] = []

@@ -7,14 +7,11 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 from numpy.lib import format as npy
@@ -31,7 +28,7 @@ from firmware_bridge.poses import PoseTrack, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
 from firmware_bridge.recording.mcap_reader import mcap_files
-from firmware_bridge.recording.mcap_records import MESSAGE, DamageError, records
+from firmware_bridge.recording.mcap_records import DamageError, EncodedMessage, records
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
@@ -165,17 +162,16 @@ class _Rows:
         try:
             with self._path.open("rb") as file:
                 file.seek(len(MCAP0_MAGIC))
-                for opcode, data in records(file):
-                    if opcode != Opcode.MESSAGE:
-                        self._take(opcode, ReadDataStream(BytesIO(data)))
+                for record in records(file):
+                    if not isinstance(record, EncodedMessage):
+                        self._take(record)
                         continue
-                    channel, _, log_ns, _ = MESSAGE.unpack_from(data)
-                    topic = self._topics.get(channel)
+                    topic = self._topics.get(record.channel_id)
                     if topic is None:
                         continue
                     if topic.kind.name == SCAN_NAME and self._row is not None:
                         yield self._row
-                    self._read(topic, log_ns, data[MESSAGE.size :])
+                    self._read(topic, record.log_ns, record.data)
         except DamageError:
             pass  # a note of `load_recording` states it
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -183,23 +179,19 @@ class _Rows:
         if self._row is not None:
             yield self._row
 
-    def _take(self, opcode: int, stream: ReadDataStream) -> None:
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
-            if schema.name in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
-                self._types[schema.id] = MessageType.of(schema.name, schema.data.decode())
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(stream)
-            sensor, _, name = channel.topic.rpartition("/")
-            kind = self._types.get(channel.schema_id)
+    def _take(self, record: Schema | Channel | Metadata) -> None:
+        if isinstance(record, Schema):
+            if record.name in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
+                self._types[record.id] = MessageType.of(record.name, record.data.decode())
+        elif isinstance(record, Channel):
+            sensor, _, name = record.topic.rpartition("/")
+            kind = self._types.get(record.schema_id)
             if kind is not None:
                 # Earlier releases wrote maps in their own units, and stated none.
-                factor = UNITS[name].factor if name in UNITS and channel.metadata.get("unit") else 1.0
-                self._topics[channel.id] = _Topic(sensor, name, kind, factor)
-        elif opcode == Opcode.METADATA:
-            metadata = Metadata.read(stream)
-            if metadata.name == "contract":
-                self._taps = int(metadata.metadata.get("taps", "1"))
+                factor = UNITS[name].factor if name in UNITS and record.metadata.get("unit") else 1.0
+                self._topics[record.id] = _Topic(sensor, name, kind, factor)
+        elif record.name == "contract":
+            self._taps = int(record.metadata.get("taps", "1"))
 
     def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
         if topic.kind.name == SCAN_NAME:

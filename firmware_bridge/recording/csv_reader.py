@@ -9,7 +9,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,72 +35,32 @@ _UNITS: Final = {
     )
     for word in words.split()
 }
-_USUAL_PERIODS_S: Final = (0.0005, 0.25)
-"""Periods between scans that tell the unit of times without one: none of them is usual in two units."""
-_GAP: Final = 10.0  # usual steps between times from which on a step is a gap, which says nothing about the rate
+_WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,9}(\.0*)?")
+MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
+LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
 
 
-class CsvColumns:
-    """Places of the columns that are read; counts and newtons taxel by taxel, x, y and z each."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        """Sort the columns by their names.
-
-        Raises:
-            ValueError: they are not those of one pad; the text is what was got, and what was expected.
-        """
-        counts: dict[tuple[int, str], int] = {}
-        newtons: dict[tuple[int, str], int] = {}
-        self.times: dict[int, str] = {}
-        others: dict[str, int] = {}
-        posed: list[str] = []
-        names = ["".join(char if char.isprintable() else "?" for char in name.strip()) for name in names]
-        if not any(names):
-            raise ValueError("an empty file, expected a header and rows of counts")
-        for column, name in enumerate(names):
-            matched = _TAXEL.fullmatch(name.lower())
-            if matched is not None:
-                found, key = newtons if matched["force"] else counts, (int(matched["taxel"]), matched["axis"])
-                if key in found:
-                    raise ValueError(f"two columns {name[:20]!r}, expected each of them once")
-                found[key] = column
-            elif _TIMES & set(_words(name)):
-                self.times[column] = name
-            elif name:
-                others[name] = column
-                posed += [name] * name.lower().startswith("pose")
-        self.pad = next((pad for pad in PADS if counts.keys() == _taxels(pad)), USPA44)
-        wanted = _taxels(self.pad)
-        if counts.keys() != wanted:
-            shown = ", ".join(names)
-            raise ValueError(
-                f"{len(names)} columns: {shown[:60]}{'...' if len(shown) > 60 else ''}, expected a first line with "
-                f"{len(wanted)}: txl1_x, txl1_y, txl1_z, txl2_x, ..., txl{self.pad.taxel_count}_z, of one sensor"
-            )
-        self.counts = [counts[key] for key in sorted(wanted)]
-        self.newtons = [newtons[key] for key in sorted(wanted)] if newtons.keys() == wanted else []
-        self.poses = [others[name] for name in CSV_POSES if name in others]
-        self.emulated = EMULATED in others
-        self.left_out = [name for name in others if name not in (*CSV_POSES, EMULATED)]
-        if sorted(posed) not in ([], list(CSV_POSES[:2]), sorted(CSV_POSES)):
-            raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")
+def csv_header(taxel_count: int) -> tuple[str, ...]:
+    """Return the columns of so many taxels."""
+    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
 
 
-def rate_of(name: str, times: ArrayLike) -> float | None:
-    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told.
+CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 
-    The unit is that in the name, else the one in which the times are those of a sensor's usual rates.
-    """
+
+def _rate_of(name: str, times: ArrayLike) -> float | None:
+    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told."""
     values = np.asarray(times, dtype=np.float64)
     steps = np.diff(values)
     if not steps.size or not np.isfinite(values).all() or steps.min() < 0:
         return None
     usual = float(np.percentile(steps, 90))
-    step = float(steps[steps <= _GAP * usual].mean() if usual else steps.mean())
+    # A gap of ten usual steps says nothing about the rate.
+    step = float(steps[steps <= 10 * usual].mean() if usual else steps.mean())
     units = [_UNITS[word] for word in _words(name) if word in _UNITS]
     if not units and not (steps == 1).all():  # such a column may as well number the rows
-        low, high = _USUAL_PERIODS_S
-        units = [unit for unit in sorted(set(_UNITS.values())) if low <= step / unit < high]
+        # No period of a sensor in this range is usual in two units.
+        units = [unit for unit in sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
     return units[-1] / step if units and step else None
 
 
@@ -110,23 +70,6 @@ def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
 
 def _words(name: str) -> list[str]:
     return re.findall(r"[a-z]+", name.lower().replace("\u00b5", "u").replace("\u03bc", "u"))
-
-
-MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
-LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
-_META_NAME: Final = "meta_data.csv"
-_META_RATE: Final = "frequency_hz"
-_WHOLE_NUMBER = re.compile(r"[0-9]{1,9}(\.0*)?")
-_SEPARATOR = re.compile(r'"?sep=(.)"?\s*')
-_SEPARATORS: Final = ",;\t"
-
-
-def csv_header(taxel_count: int) -> tuple[str, ...]:
-    """Return the columns of so many taxels."""
-    return tuple(f"txl{taxel}_{axis}" for taxel in range(1, taxel_count + 1) for axis in AXES)
-
-
-CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 
 
 class _Row(NamedTuple):
@@ -151,82 +94,120 @@ def load_csv(path: Path) -> Recording:
         RecordingError: it is no recording, or a value in a whole line is impossible.
         OSError: the file cannot be read.
     """
-    rows = _rows(path)
-    scans = damaged = None
+    scans = row = damaged = None
     try:
-        header = next(rows, _Row(1, [], whole=True))
-        scans = _Scans(path, header)
-        for row in rows:
-            scans.add(row)
+        for row in _rows(path):
+            if scans is None:
+                scans = _Scans(row.cells)
+            else:
+                scans.add(row)
     except _DamageError as damage:
         damaged = damage
+    except RecordingError:
+        raise
+    except ValueError as error:
+        raise RecordingError(f"{path}, line {row.line if row else 1}: {error}") from error
     if scans is None or not scans.count:
-        raise RecordingError(f"{path}, {damaged or 'after its first line: no row, expected a row of counts'}")
+        empty = (
+            "line 1: an empty file, expected a header" if scans is None else "after its first line: no row, expected"
+        )
+        raise RecordingError(f"{path}, {damaged or empty + ' a row of counts'}")
     notes = []
     if damaged is not None:
         notes.append(f"{path} is damaged, {damaged}: only the {scans.count} scans before that are read")
-    return scans.recording(notes)
+    return scans.recording(path, notes)
 
 
 class _Scans:
-    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file."""
+    """Scans of the rows so far, in columns: a list of rows would take ten times the memory of the file.
 
-    def __init__(self, path: Path, header: _Row) -> None:
-        self._path = path
-        try:
-            self._columns = CsvColumns(header.cells)
-        except ValueError as error:
-            raise RecordingError(f"{path}, line {header.line}: {error}") from error
-        self._width = max(place + 1 for place, name in enumerate(header.cells) if name)
+    A ValueError states what was got of a line, and what was expected.
+    """
+
+    def __init__(self, header: Sequence[str]) -> None:
+        """Sort the columns by their names."""
+        counts: dict[tuple[int, str], int] = {}
+        newtons: dict[tuple[int, str], int] = {}
+        others: dict[str, int] = {}
+        self._time_names: dict[int, str] = {}
+        names = ["".join(char if char.isprintable() else "?" for char in name.strip()) for name in header]
+        for column, name in enumerate(names):
+            matched = _TAXEL.fullmatch(name.lower())
+            if matched is not None:
+                found, key = newtons if matched["force"] else counts, (int(matched["taxel"]), matched["axis"])
+                if key in found:
+                    raise ValueError(f"two columns {name[:20]!r}, expected each of them once")
+                found[key] = column
+            elif _TIMES & set(_words(name)):
+                self._time_names[column] = name
+            elif name:
+                others[name] = column
+        self._pad = next((pad for pad in PADS if counts.keys() == _taxels(pad)), USPA44)
+        wanted = _taxels(self._pad)
+        if counts.keys() != wanted:
+            shown = ", ".join(names)
+            raise ValueError(
+                f"{len(names)} columns: {shown[:60]}{'...' if len(shown) > 60 else ''}, expected a first line with "
+                f"{len(wanted)}: txl1_x, txl1_y, txl1_z, txl2_x, ..., txl{self._pad.taxel_count}_z, of one sensor"
+            )
+        posed = [name for name in others if name.lower().startswith("pose")]
+        if sorted(posed) not in ([], list(CSV_POSES[:2]), sorted(CSV_POSES)):
+            raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")
+        # Taxel by taxel, x, y and z each.
+        self._count_columns = [counts[key] for key in sorted(wanted)]
+        self._newton_columns = [newtons[key] for key in sorted(wanted)] if newtons.keys() == wanted else []
+        self._pose_columns = [others[name] for name in CSV_POSES if name in others]
+        self._emulated = EMULATED in others
+        self._left_out = [name for name in others if name not in (*CSV_POSES, EMULATED)]
+        self._width = max(place + 1 for place, name in enumerate(header) if name)
         self._counts = array("i")
         self._newtons = array("f")
         self._poses: list[TimedPose] = []
-        self._times = {column: array("d") for column in self._columns.times}
+        self._times = {column: array("d") for column in self._time_names}
         self._before: list[str] = []
         self.count = 0
 
     def add(self, row: _Row) -> None:
-        """Take one row; a _DamageError where it is damaged, a RecordingError where a value is impossible."""
-        cells, columns = row.cells, self._columns
+        """Take one row; a _DamageError where it is damaged."""
+        cells = row.cells
         _check_whole(row, self._width, self._before)
-        self._counts.extend(_count(self._path, row.line, cells[column]) for column in columns.counts)
-        self._newtons.extend(_number(cells[column]) for column in columns.newtons)
-        if any(cells[column] for column in columns.poses):
+        self._counts.extend(_count(cells[column]) for column in self._count_columns)
+        self._newtons.extend(_number(cells[column]) for column in self._newton_columns)
+        if any(cells[column] for column in self._pose_columns):
             try:
-                pose = PadPose(*(_number(cells[column]) for column in columns.poses))
+                pose = PadPose(*(_number(cells[column]) for column in self._pose_columns))
             except ValueError as error:
-                raise RecordingError(f"{self._path}, line {row.line}: its pose: {error}") from error
+                raise ValueError(f"its pose: {error}") from error
             self._poses.append(TimedPose(pose, self.count, used_from_ns=self.count))
         for column, times in self._times.items():
             times.append(_time_s(cells[column]))
         self._before = cells
         self.count += 1
 
-    def recording(self, notes: list[str]) -> Recording:
+    def recording(self, path: Path, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others."""
-        path, columns = self._path, self._columns
-        rates_hz = [rate_of(columns.times[column], times) for column, times in self._times.items()]
+        rates_hz = [_rate_of(self._time_names[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
         if rates_hz:
             by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
-            notes.append(f"{path}: {_listed(columns.times.values())} left out as times, {by}")
-        if columns.left_out:
+            notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, {by}")
+        if self._left_out:
             notes.append(
-                f"{path}: {_listed(columns.left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
+                f"{path}: {_listed(self._left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
                 "it, such as txl1_x, time_s, pose_x_mm"
             )
         vendor = None
         if self._newtons:
-            newtons = _by_axis(np.frombuffer(self._newtons, np.float32), columns.pad)
+            newtons = _by_axis(np.frombuffer(self._newtons, np.float32), self._pad)
             sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
             vendor = tuple(VendorReading(one) if right else None for one, right in zip(newtons, sound, strict=True))
-        counts = _by_axis(np.frombuffer(self._counts, np.int32), columns.pad)
+        counts = _by_axis(np.frombuffer(self._counts, np.int32), self._pad)
         return Recording(
             path,
             (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
-            rate_hz or _meta_rate_hz(path.with_name(_META_NAME)),
+            rate_hz or _meta_rate_hz(path.with_name("meta_data.csv")),
             notes=tuple(notes),
-            origin="emulated" if columns.emulated else None,
+            origin="emulated" if self._emulated else None,
             poses=self._poses,
             poses_by_row=True,
         )
@@ -245,16 +226,17 @@ def _rows(path: Path) -> Iterator[_Row]:
                 return
             read += len(line)
             if read > MOST_CSV_BYTES:
-                _refuse(path, number, f"a file larger than {MOST_CSV_BYTES:,} bytes", "a smaller one: cut it in parts")
+                too_large = f"a file larger than {MOST_CSV_BYTES:,} bytes, expected a smaller one: cut it in parts"
+                raise RecordingError(f"{path}, line {number}: {too_large}")
             if len(line) > LONGEST_CSV_LINE:
                 raise _DamageError(number, f"a line longer than {LONGEST_CSV_LINE} bytes", "a row of counts")
             if "\ufffd" in line and separator is not None:  # a header may have a name in another encoding
                 raise _DamageError(number, "bytes that are no UTF-8 text", "a row of counts")
-            named = _SEPARATOR.fullmatch(line) if separator is None else None
+            named = re.fullmatch(r'"?sep=(.)"?\s*', line) if separator is None else None
             if named is not None:
                 separator = named[1]
                 continue
-            separator = separator or max(_SEPARATORS, key=line.count)
+            separator = separator or max(",;\t", key=line.count)
             try:
                 cells = next(csv.reader([line], delimiter=separator, strict=True))
             except csv.Error as error:
@@ -277,11 +259,11 @@ def _check_whole(row: _Row, width: int, before: list[str]) -> None:
         raise _DamageError(row.line, f"a last line that ends in '{cells[-1][:20]}'", "its end: it seems cut off")
 
 
-def _count(path: Path, line: int, cell: str) -> int:
+def _count(cell: str) -> int:
     # Not float(): it takes nan, 1e4 and 1_0 as well.
     whole = int(cell.partition(".")[0]) if _WHOLE_NUMBER.fullmatch(cell) else None
     if whole is None or whole > HIGHEST_COUNT:
-        _refuse(path, line, f"'{cell[:20]}'", f"a whole number 0..{HIGHEST_COUNT}")
+        raise ValueError(f"'{cell[:20]}', expected a whole number 0..{HIGHEST_COUNT}")
     return whole
 
 
@@ -316,13 +298,13 @@ def _meta_rate_hz(path: Path) -> float | None:
         rows = list(itertools.islice(_rows(path), 2))
     except _DamageError as damage:
         raise RecordingError(f"{path}, {damage}") from damage
-    if not rows or _META_RATE not in rows[0].cells:
+    if not rows or "frequency_hz" not in rows[0].cells:
         return None
-    column = rows[0].cells.index(_META_RATE)
+    column = rows[0].cells.index("frequency_hz")
     cell = rows[1].cells[column] if len(rows) > 1 and len(rows[1].cells) > column else ""
     rate_hz = _number(cell)
     if not is_rate(rate_hz):
-        _refuse(path, 2, f"{_META_RATE} '{cell[:20]}'", A_RATE)
+        raise RecordingError(f"{path}, line 2: frequency_hz '{cell[:20]}', expected {A_RATE}")
     return rate_hz
 
 
@@ -331,7 +313,3 @@ def _listed(names: Iterable[str]) -> str:
     shown = [repr(name[:30]) for name in names]
     text = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "")
     return f"column {text} is" if len(shown) == 1 else f"columns {text} are"
-
-
-def _refuse(path: Path, line: int, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, line {line}: {got}, expected {expected}")

@@ -3,17 +3,13 @@
 import json
 import os
 import re
-import struct
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
 from typing import Final, Literal, NoReturn
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
@@ -22,7 +18,7 @@ from firmware_bridge.in_place import read_bounded
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
-from firmware_bridge.recording.mcap_records import BROKEN, MESSAGE, CutOffError, DamageError, records, short
+from firmware_bridge.recording.mcap_records import CutOffError, DamageError, EncodedMessage, records, short
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
     POSE,
@@ -52,17 +48,17 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_KEPT_BYTES: Final = 1 << 31  # most bytes of the scans in memory: a day of one sensor at 100 Hz
-_SCAN_BYTES: Final = 240
-_VENDOR_BYTES: Final = 1200
-MOST_BAG_BYTES: Final = 1 << 20  # most bytes of a bag's metadata.yaml
 MOST_SHOWN_TOPICS: Final = 10
-LONGEST_SHOWN: Final = 60
 
 
 @dataclass
-class _Lane:
-    """Scans of one sensor in their order, in columns: objects would take ten times the memory."""
+class _Sensor:
+    """Facts of one sensor, and its scans in columns: objects would take ten times the memory."""
 
+    baseline: Baseline | None = None  # the one at its first scan
+    latest: Baseline | None = None
+    mounting: Mounting | None = None
+    facts: str | None = None
     counts: bytearray = field(default_factory=bytearray)
     numbers: "array[int]" = field(default_factory=lambda: array("q"))
     times_ns: "array[int]" = field(default_factory=lambda: array("q"))
@@ -104,8 +100,8 @@ def load_mcap(path: Path) -> Recording:
                 raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
             reading.begin(one)
             try:
-                for opcode, data in records(file):
-                    reading.take(opcode, data)
+                for record in records(file):
+                    reading.take(record)
             except CutOffError as end:
                 reading.notes.insert(0, f"{one} breaks off ({end}): its recording was killed, or the disk was full")
             except DamageError as damage:
@@ -130,7 +126,7 @@ def mcap_files(path: Path) -> tuple[list[Path], list[str]]:
         remedy = "name a file, or convert a bag of another storage with `ros2 bag convert` to mcap"
         raise RecordingError(f"{path}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
     about = path / "metadata.yaml"
-    text = read_bounded(about, MOST_BAG_BYTES).decode(errors="replace") if about.is_file() else ""
+    text = read_bounded(about, 1 << 20).decode(errors="replace") if about.is_file() else ""
     named = [path / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
     order = [one for one in dict.fromkeys(named) if one in there]
     return order or there, [one.name for one in named if one not in there]
@@ -144,46 +140,32 @@ class _Reading:
         self._whole = self._path = path
         self._schemas: dict[int, MessageType | None] = {}
         self._topics: dict[int, tuple[str, MessageType | None]] = {}
-        self._lanes: dict[str, _Lane] = {}
-        self._baselines: dict[str, Baseline] = {}
-        self._latest: dict[str, Baseline] = {}
-        self._mountings: dict[str, Mounting] = {}
+        self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
         self._geometry = USPA44  # for files that name no geometry
         self._named = False  # whether metadata or a message names it
         self._sized = False  # whether a message's definition holds its number of taxels
-        self._facts: dict[str, str] = {}
         self._described = False  # whether there are metadata of edge-sr
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._poses: list[TimedPose] = []
-        self._posed: set[str | None] = set()
         self._origin: Literal["device", "emulated"] | None = None
 
     def begin(self, path: Path) -> None:
         """Go on with a file: its numbers of schemas and channels are its own."""
         self._path, self._schemas, self._topics = path, {}, {}
 
-    def take(self, opcode: int, data: memoryview) -> None:
+    def take(self, record: EncodedMessage | Schema | Channel | Metadata) -> None:
         """Process one record, from a chunk or between chunks."""
-        if opcode == Opcode.MESSAGE:
-            self._take_message(data)
-            return
-        stream = ReadDataStream(BytesIO(data))
-        try:
-            if opcode == Opcode.SCHEMA:
-                self._take_schema(Schema.read(stream))
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(stream)
-                kind = self._schemas.get(channel.schema_id) if channel.message_encoding == "cdr" else None
-                self._topics[channel.id] = channel.topic[:LONGEST_SHOWN], kind
-            elif opcode == Opcode.METADATA:
-                self._described = True
-                metadata = Metadata.read(stream)
-                self._take_metadata(metadata.name, metadata.metadata)
-        except RecordingError:
-            raise
-        except BROKEN as error:
-            raise DamageError(f"a record that cannot be read ({short(error)})") from error
+        if isinstance(record, EncodedMessage):
+            self._take_message(record)
+        elif isinstance(record, Schema):
+            self._take_schema(record)
+        elif isinstance(record, Channel):
+            kind = self._schemas.get(record.schema_id) if record.message_encoding == "cdr" else None
+            self._topics[record.id] = record.topic[:60], kind
+        else:
+            self._described = True
+            self._take_metadata(record.name, record.metadata)
 
     def recording(self) -> Recording:
         """Return what was read.
@@ -191,9 +173,10 @@ class _Reading:
         Raises:
             RecordingError: no scans.
         """
-        if not self._lanes:
+        scanned = {name: one for name, one in self._sensors.items() if one.times_ns}
+        if not scanned:
             self._refuse(f"no scans that edge-sr recorded{self._instead()}")
-        bare = [] if self._described else sorted(self._lanes.keys() - self._facts.keys())
+        bare = [] if self._described else sorted(name for name, one in scanned.items() if one.facts is None)
         if bare:
             self.notes.append(
                 f"{self._path}: the mounting of sensor {', '.join(bare)} is not in the file, as after a tool that "
@@ -201,15 +184,24 @@ class _Reading:
             )
         return Recording(
             self._whole,
-            tuple(lane.track(sensor, self._geometry) for sensor, lane in self._lanes.items()),
+            tuple(one.track(name, self._geometry) for name, one in scanned.items()),
             None,
-            {name: one for name, one in self._baselines.items() if name in self._lanes},
-            {name: one for name, one in self._mountings.items() if name in self._lanes},
+            {name: one.baseline for name, one in scanned.items() if one.baseline is not None},
+            {name: one.mounting for name, one in scanned.items() if one.mounting is not None},
             self._offset_ns,
             tuple(self.notes),
             self._origin,
             self._poses,
         )
+
+    def _sensor(self, name: str) -> _Sensor:
+        if name not in self._sensors:
+            if not is_sensor_name(name):
+                self._refuse(f"sensor {name[:20]!r}, expected the name of one")
+            if len(self._sensors) == MOST_SENSORS:
+                self._refuse(f"more than {MOST_SENSORS} sensors")
+            self._sensors[name] = _Sensor()
+        return self._sensors[name]
 
     def _take_schema(self, schema: Schema) -> None:
         sized = re.search(rb"\[([0-9]{1,4})\] counts ", schema.data)
@@ -233,10 +225,10 @@ class _Reading:
                 mounting = read_mounting(fields.get("mounting", ""), self._geometry.taxel_count)
             except ValueError as error:
                 self._refuse(f"no mounting of sensor {sensor[:20]!r}: {short(error)}")
-            if not is_sensor_name(sensor) or len(self._mountings) > MOST_SENSORS:
-                self._refuse(f"a mounting of sensor {sensor[:20]!r}, expected those of its sensors")
-            if self._mountings.setdefault(sensor, mounting) != mounting:
-                self._refuse(f"two mountings of sensor {sensor!r}, expected one: cut it in parts")
+            one = self._sensor(sensor)
+            if one.mounting not in (None, mounting):
+                self._refuse(f"two mountings of sensor {sensor[:20]!r}, expected one: cut it in parts")
+            one.mounting = mounting
 
     def _take_geometry(self, fields: Mapping[str, str]) -> None:
         try:
@@ -255,7 +247,8 @@ class _Reading:
     def _take_facts(self, data: memoryview) -> None:
         fields = SENSOR.decode(data)
         sensor, text = fields["sensor"], fields["facts"]
-        if self._facts.get(sensor) == text:
+        one = self._sensor(sensor)
+        if one.facts == text:
             return
         try:
             for name, values in json.loads(text).items():
@@ -264,24 +257,18 @@ class _Reading:
             raise
         except (ValueError, AttributeError, RecursionError) as error:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
-        if len(self._facts) > MOST_SENSORS:
-            raise CdrError(f"facts of more than {MOST_SENSORS} sensors")
-        self._facts[sensor] = text
+        one.facts = text
 
-    def _take_message(self, data: memoryview) -> None:
-        try:
-            channel, _, log_ns, _ = MESSAGE.unpack_from(data)
-        except struct.error as error:
-            raise DamageError("a message that is cut off") from error
-        topic, kind = self._topics.get(channel, ("", None))
-        body = data[MESSAGE.size :]
+    def _take_message(self, message: EncodedMessage) -> None:
+        topic, kind = self._topics.get(message.channel_id, ("", None))
+        body = message.data
         try:
             if kind is POSE:
                 self._take_pose(decode_pose(body))
             elif kind is SENSOR:
                 self._take_facts(body)
             elif kind is not None and kind.name == SCAN_NAME:
-                self._take_scan(decode_scan(body, self._geometry), log_ns)
+                self._take_scan(decode_scan(body, self._geometry), message.log_ns)
             elif kind is not None:
                 self._take_baseline(decode_baseline(body, self._geometry))
         except CdrError as error:
@@ -290,48 +277,45 @@ class _Reading:
     def _take_scan(self, scan: RecordedScan, log_ns: int) -> None:
         if scan.frame == f"emulated/{scan.sensor}":
             self._origin = "emulated"
-        lane = self._lanes.get(scan.sensor) or self._lanes.setdefault(scan.sensor, _Lane())
-        if len(self._lanes) > MOST_SENSORS:
-            self._refuse(f"more than {MOST_SENSORS} sensors")
+        one = self._sensor(scan.sensor)
+        if not one.times_ns:
+            self._sensors[scan.sensor] = self._sensors.pop(scan.sensor)
         if self._offset_ns is None:
             self._offset_ns = log_ns - scan.time_ns
         unix_ns = scan.time_ns + self._offset_ns
         if not 0 <= unix_ns < LAST_STAMP_NS:  # such a scan could be played, but not recorded again
             got = f"a scan of sensor {scan.sensor!r} at {unix_ns:,} ns since 1970"
             self._refuse(f"{got}, expected 0..{LAST_STAMP_NS:,}")
-        if lane.times_ns and scan.time_ns < lane.times_ns[-1]:
+        if one.times_ns and scan.time_ns < one.times_ns[-1]:
             self._refuse(f"times of sensor {scan.sensor!r} that go back, expected none")
-        self._kept_bytes += _SCAN_BYTES if scan.vendor is None else _SCAN_BYTES + _VENDOR_BYTES
+        self._kept_bytes += 240 if scan.vendor is None else 1440
         if self._kept_bytes > MOST_KEPT_BYTES:
             self._refuse(f"more scans than {MOST_KEPT_BYTES:,} bytes hold: cut it in parts")
         if scan.vendor is not None:
-            lane.vendor[len(lane.times_ns)] = scan.vendor
-        lane.counts += scan.counts.tobytes()
-        lane.numbers.append(scan.number)
-        lane.times_ns.append(scan.time_ns)
-        lane.device_times_ns.append(scan.device_time_ns)
-        lane.renewed.append(scan.renewed)
+            one.vendor[len(one.times_ns)] = scan.vendor
+        one.counts += scan.counts.tobytes()
+        one.numbers.append(scan.number)
+        one.times_ns.append(scan.time_ns)
+        one.device_times_ns.append(scan.device_time_ns)
+        one.renewed.append(scan.renewed)
 
     def _take_pose(self, timed: TimedPose) -> None:
         self._poses.append(timed)
-        self._posed.add(timed.sensor)
+        if timed.sensor is not None:
+            self._sensor(timed.sensor)
         if len(self._poses) > MOST_POSES:
             self._refuse(f"more than {MOST_POSES:,} poses: cut it in parts")
-        if len(self._posed) > MOST_SENSORS + 1:
-            self._refuse(f"poses of more than {MOST_SENSORS} sensors")
 
     def _take_baseline(self, baseline: Baseline) -> None:
-        sensor, lane = baseline.sensor, self._lanes.get(baseline.sensor)
-        before, self._latest[sensor] = self._latest.get(sensor), baseline
-        if len(self._latest) > MOST_SENSORS:
-            self._refuse(f"baselines of more than {MOST_SENSORS} sensors")
+        one = self._sensor(baseline.sensor)
+        before, one.latest = one.latest, baseline
         # A part of a file may have it after a sensor's first scan, which was made with it: it is repeated.
-        first_ns = 0 if lane is None else lane.times_ns[0] + (self._offset_ns or 0)
-        if lane is None or (before is None and baseline.created_unix_s < first_ns / NS_PER_S):
-            self._baselines[sensor] = baseline
+        first_ns = one.times_ns[0] + (self._offset_ns or 0) if one.times_ns else 0
+        if not one.times_ns or (before is None and baseline.created_unix_s < first_ns / NS_PER_S):
+            one.baseline = baseline
         elif before is not None and before.id != baseline.id and len(self.notes) < MOST_SENSORS:
             self.notes.append(
-                f"{self._path}: sensor {sensor} was zeroed again while it was recorded ({before.id}, then "
+                f"{self._path}: sensor {baseline.sensor} was zeroed again while it was recorded ({before.id}, then "
                 f"{baseline.id}); played again it keeps to the baseline of its beginning"
             )
 

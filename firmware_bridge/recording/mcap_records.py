@@ -8,21 +8,20 @@ import struct
 import zlib
 from collections.abc import Iterator
 from io import BytesIO
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk
+from mcap.records import Channel, Chunk, Metadata, Schema
 
 MOST_RECORD_BYTES: Final = 1 << 25
-"""Most bytes of one record, and of a chunk when unpacked: writers make chunks of one to a few megabytes."""
-MOST_WINDOW_BYTES: Final = 1 << 25  # largest window of zstd, in bytes
+"""Most bytes of a record, of a chunk unpacked, and of zstd's window: writers make chunks of one to a few megabytes."""
 _RECORD: Final = struct.Struct("<BQ")
-MESSAGE: Final = struct.Struct("<HIQQ")
-"""Head of a message: channel, sequence, and times at which it was logged and published."""
-BROKEN: Final = (
+_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, and times at which it was logged and published
+_KINDS: Final = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
+_BROKEN: Final = (
     *(struct.error, McapError, zstandard.ZstdError, ValueError, OverflowError, MemoryError),
     *(EOFError, RuntimeError),  # of lz4
 )
@@ -36,8 +35,36 @@ class CutOffError(DamageError):
     """The file ends too early."""
 
 
-def records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
-    """Yield each record up to the end of the data, those in chunks one by one; lengths are checked by its size."""
+class EncodedMessage(NamedTuple):
+    """A message of a channel, logged at a time in [ns] since 1970."""
+
+    channel_id: int
+    log_ns: int
+    data: memoryview
+
+
+def records(file: BinaryIO) -> Iterator[EncodedMessage | Schema | Channel | Metadata]:
+    """Yield these records up to the end of the data, those in chunks one by one, from behind the mark of the format.
+
+    Raises:
+        DamageError: one cannot be read.
+    """
+    for opcode, data in _undivided(file):
+        if opcode == Opcode.MESSAGE:
+            if len(data) < _MESSAGE.size:
+                raise DamageError("a message that is cut off")
+            channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data)
+            yield EncodedMessage(channel_id, log_ns, data[_MESSAGE.size :])
+        elif opcode in _KINDS:
+            try:
+                record = _KINDS[Opcode(opcode)].read(ReadDataStream(BytesIO(data)))
+            except _BROKEN as error:
+                raise DamageError(f"a record that cannot be read ({short(error)})") from error
+            yield record
+
+
+def _undivided(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
+    """Yield opcodes and content of records, whose lengths are checked by the file's size."""
     size_bytes = os.fstat(file.fileno()).st_size
     while True:
         at = file.tell()
@@ -49,7 +76,7 @@ def records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
             raise CutOffError(f"within a record, at byte {at}")
         if opcode == Opcode.DATA_END:
             return
-        if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+        if opcode not in (Opcode.CHUNK, Opcode.MESSAGE, *_KINDS):
             file.seek(length, os.SEEK_CUR)
             continue
         if length > MOST_RECORD_BYTES:
@@ -60,7 +87,7 @@ def records(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
             continue
         try:
             unpacked = _unpacked(Chunk.read(ReadDataStream(BytesIO(data))))
-        except BROKEN as error:
+        except _BROKEN as error:
             raise DamageError(f"at byte {at}, a chunk that cannot be unpacked: {short(error)}") from error
         yield from _records_of(unpacked, at)
 
@@ -83,7 +110,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     if size_bytes > MOST_RECORD_BYTES:
         raise ValueError(f"{size_bytes:,} bytes, expected at most {MOST_RECORD_BYTES:,}")
     if chunk.compression == "zstd":
-        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_WINDOW_BYTES)
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES)
         data = unpacker.stream_reader(chunk.data).read(size_bytes + 1)
     elif chunk.compression == "lz4":
         import lz4.frame

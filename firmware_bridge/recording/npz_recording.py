@@ -10,22 +10,22 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryFile
 from tokenize import TokenError
-from typing import Any, BinaryIO, Final, Literal, NoReturn
+from typing import Any, BinaryIO, Final, NoReturn
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from firmware_bridge.errors import NpzError, RecordingError
+from firmware_bridge.errors import CdrError, NpzError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS
-from firmware_bridge.poses import POSE_FIELDS, PadPose, TimedPose
-from firmware_bridge.recording.scan_messages import read_mounting
+from firmware_bridge.poses import POSE_FIELDS, TimedPose
+from firmware_bridge.recording.scan_messages import checked_pose, read_mounting
 from firmware_bridge.recording.tracks import (
     A_RATE,
     HIGHEST_COUNT,
@@ -43,33 +43,20 @@ from firmware_bridge.zeroing.baseline import LAST_UNIX_S, Baseline
 
 LONGEST_READ_BYTES: Final = 1 << 20
 """Most bytes of one read: zipfile reads a table of contents in one piece, whose members could take gigabytes."""
-_SURROGATES: Final = (0xD800, 0xDFFF)
 _BROKEN: Final = (
     *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, ValueError, TypeError, LookupError, OverflowError),
     RuntimeError,  # encrypted, with an unsupported compression, or nested too deep
     *(SyntaxError, TokenError, MemoryError, Warning),  # errors that numpy's reader of the header passes on
 )
-_HEADERS: Final = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-_LOCAL: Final = struct.Struct("<4sHHHIIIIHH")
-"""Head of a member: mark, version, flags, compression, time, check sum, sizes, and lengths of name and extra field."""
-_CENTRAL: Final = struct.Struct("<4sHHHHIIIIHHHHHII")
-"""The same in the directory, with three more fields of nothing, attributes, and the place of the member."""
-_END: Final = struct.Struct("<4sHHHHIIH")
-_MOST_SALVAGED_BYTES: Final = 1 << 31
-_COMPRESSIONS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Compressions that numpy writes. zipfile unpacks others without a limit on the output of one piece."""
 
 
 def read_npz(
     path: Path, names: Iterable[str], most_bytes: int, damaged: Callable[[], object] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read the arrays of these names that are in the file; others are not read.
+    """Read the arrays of these names that are in the file, of `most_bytes` together; others are not read.
 
-    Args:
-        path: path of the file.
-        names: names of the arrays.
-        most_bytes: largest allowed size of them together.
-        damaged: called where the file has lost its end, to read the arrays that are whole; without it that is refused.
+    Where the file has lost its end, `damaged` is called, and the arrays that are whole are read; without it that is
+    refused.
 
     Raises:
         NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.
@@ -100,26 +87,29 @@ def read_npz(
 
 def _copy_whole(file: BinaryIO, copy: BinaryIO) -> None:
     """Copy an archive that lost its end, where its directory is, with a directory of its members that are whole."""
+    # Head of a member: mark, version, flags, compression, time, check sum, sizes, and lengths of name and extra field.
+    # The directory holds the same with three more fields of nothing, attributes, and the place of the member.
+    head_form = struct.Struct("<4sHHHIIIIHH")
     size_bytes, at, directory, count = file.seek(0, io.SEEK_END), 0, bytearray(), 0
     while True:
         file.seek(at)
-        head = file.read(_LOCAL.size)
-        if len(head) < _LOCAL.size or not head.startswith(b"PK\3\4"):
+        head = file.read(head_form.size)
+        if len(head) < head_form.size or not head.startswith(b"PK\3\4"):
             break
-        _, version, flags, method, time, crc, packed, whole, name_bytes, extra_bytes = _LOCAL.unpack(head)
+        _, version, flags, method, time, crc, packed, whole, name_bytes, extra_bytes = head_form.unpack(head)
         name, extra = file.read(name_bytes), file.read(extra_bytes)
         if extra.startswith(b"\1\0\x10\0"):  # sizes of eight bytes, as for a member of unknown length
             whole, packed = struct.unpack_from("<QQ", extra, 4)
         end = file.tell() + packed
-        if end > min(size_bytes, _MOST_SALVAGED_BYTES) or flags & 8:
+        if end > min(size_bytes, MOST_NPZ_BYTES) or flags & 8:
             break
         sizes = (crc, packed, whole, len(name), 0, 0, 0, 0, 0, at)
-        directory += _CENTRAL.pack(b"PK\1\2", version, version, flags, method, time, *sizes) + name
+        directory += struct.pack("<4sHHHHIIIIHHHHHII", b"PK\1\2", version, version, flags, method, time, *sizes) + name
         at, count = end, count + 1
     file.seek(0)
     while left := min(at - file.tell(), LONGEST_READ_BYTES):
         copy.write(file.read(left))
-    copy.write(directory + _END.pack(b"PK\5\6", 0, 0, count, count, len(directory), at, 0))
+    copy.write(directory + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, count, count, len(directory), at, 0))
 
 
 class _ShortReads(io.BufferedReader):
@@ -132,13 +122,15 @@ class _ShortReads(io.BufferedReader):
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    if info.compress_type not in _COMPRESSIONS:
+    # zipfile unpacks other compressions without a limit on the output of one piece.
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise NpzError(f"{info.filename} is compressed in another way than numpy's: save it again with numpy")
     with archive.open(info) as entry:
         version = npy.read_magic(entry)
-        if version not in _HEADERS:
+        headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+        if version not in headers:
             raise NpzError(f"{info.filename} is of npy version {version}, expected (1, 0) or (2, 0)")
-        shape, _, dtype = _HEADERS[version](entry)
+        shape, _, dtype = headers[version](entry)
         if dtype.hasobject or dtype.kind not in "biufU":
             raise NpzError(f"{info.filename} holds {dtype}, expected plain arrays of numbers or text")
         stated_bytes, held_bytes = prod(shape) * dtype.itemsize, info.file_size - entry.tell()
@@ -150,8 +142,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
             raise NpzError(f"{info.filename} holds more than its array: it is damaged")
     if dtype.kind == "U" and array.size and dtype.itemsize:
         points = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(dtype.byteorder))
-        low, high = _SURROGATES
-        if points.max() > 0x10FFFF or ((points >= low) & (points <= high)).any():
+        if points.max() > 0x10FFFF or ((points >= 0xD800) & (points <= 0xDFFF)).any():
             raise NpzError(f"{info.filename} holds text that is not Unicode")
     return array
 
@@ -159,11 +150,10 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
 MOST_NPZ_BYTES: Final = 1 << 31  # most bytes of the arrays that are read: a day of one sensor at 100 Hz
-_REQUIRED: Final = ("format", "version", "sensor", "scan", "time_ns", "counts")
-_ORIGINS: Final = ("origin", "source")
-"""Arrays that hold the origin of the scans; `source` in older files, which have no `origin`."""
-_POSES: Final = ("pose_time_ns", "pose", "pose_sensor", "pose_holds", "pose_used_from_ns")
-_BASELINE: Final = ("baseline", "baseline_counts", "baseline_age_s")
+_SCANS: Final = {"sensor": "U", "scan": "iu", "time_ns": "iu"}  # arrays with a row for each scan, and kinds of numpy
+_ORIGINS: Final = {"origin": "U", "source": "U"}  # of these `source` in older files, which have no `origin`
+_POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b", "pose_used_from_ns": "iu"}
+_BASELINE: Final = {"baseline": "U", "baseline_counts": "f", "baseline_age_s": "f"}
 _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "real numbers", "fiu": "numbers"}
 
 
@@ -176,168 +166,137 @@ def load_npz(path: Path) -> Recording:
     """
     notes: list[str] = []
     cut_off = f"{path} is damaged: its end is missing, and only its whole arrays are read; copy it again"
-    names = (*_REQUIRED, *_ORIGINS, *_POSES, "rate_hz", "mountings")
-    arrays = _read(path, names, lambda: notes.append(cut_off))
-    for name in _REQUIRED:
-        if name not in arrays:
-            lost = f"; {notes[0]}" if notes else ""
-            raise RecordingError(f"{path}, array '{name}': missing, expected what `edge-sr convert` writes{lost}")
-    form, version = arrays["format"], arrays["version"]
-    if str(form) != NPZ_FORMAT:
-        _refuse(path, "format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
-    if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
-        _refuse(path, "version", str(version)[:40], f"{NPZ_VERSION}")
-    counts = _checked_counts(path, arrays["counts"])
-    for name, kinds in (("sensor", "U"), ("scan", "iu"), ("time_ns", "iu")):
-        _check_array(path, name, arrays[name], kinds, counts.shape[:1])
-    sensors = arrays["sensor"]
-    tracks = tuple(
-        Track(sensor, counts[mine], _times(path, sensor, arrays["time_ns"][mine]))
-        for sensor in _sensors(path, sensors)
-        for mine in [sensors == sensor]
-    )
-    rate = arrays.get("rate_hz")
-    if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
-        _refuse(path, "rate_hz", str(rate)[:40], A_RATE)
-    return Recording(
-        path,
-        tracks,
-        None if rate is None else float(rate),
-        _baselines(path, tracks, sensors),
-        _mountings(path, arrays.get("mountings"), tracks),
-        notes=tuple(notes),
-        origin=_origin(path, arrays, len(counts)),
-        poses=[] if notes and "pose" not in arrays else _poses(path, arrays),
-    )
-
-
-def _read(path: Path, names: Sequence[str], damaged: Callable[[], object]) -> dict[str, NDArray[Any]]:
     try:
-        return read_npz(path, names, MOST_NPZ_BYTES, damaged)
+        return _recording(path, notes, lambda: notes.append(cut_off))
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
 
 
+def _recording(path: Path, notes: list[str], damaged: Callable[[], object]) -> Recording:
+    required = ("format", "version", *_SCANS, "counts")
+    arrays = read_npz(path, (*required, *_ORIGINS, *_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES, damaged)
+    for name in required:
+        if name not in arrays:
+            lost = f"; {notes[0]}" if notes else ""
+            raise NpzError(f"array '{name}': missing, expected what `edge-sr convert` writes{lost}")
+    form, version, counts = arrays["format"], arrays["version"], arrays["counts"]
+    if str(form) != NPZ_FORMAT:
+        _refuse("format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
+    if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
+        _refuse("version", str(version)[:40], f"{NPZ_VERSION}")
+    _check_counts(counts)
+    _check_arrays(arrays, _SCANS | _ORIGINS, counts.shape[:1])
+    tracks = tuple(_tracks(arrays))
+    rate, origin = arrays.get("rate_hz"), arrays.get("origin", arrays.get("source", np.empty(0)))
+    if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
+        _refuse("rate_hz", str(rate)[:40], A_RATE)
+    return Recording(
+        path,
+        tracks,
+        None if rate is None else float(rate),
+        _baselines(path, tracks, arrays["sensor"]),
+        _mountings(str(arrays.get("mountings", "{}")), tracks),
+        notes=tuple(notes),
+        origin=origin_of(np.unique(origin).tolist()),
+        poses=[] if notes and "pose" not in arrays else _poses(arrays),
+    )
+
+
+def _check_counts(counts: NDArray[Any]) -> None:
+    shape = counts.shape
+    grid = len(shape) == 4 and shape[1] == len(AXES) and 0 < shape[2] * shape[3] <= MOST_TAXELS
+    if counts.dtype.kind not in "iu" or not grid or counts.size == 0:
+        most = f"{MOST_TAXELS} taxels at most"
+        expected = f"whole numbers of shape (scans, {len(AXES)}, rows, cols), {most}, at least one scan"
+        _refuse("counts", f"{counts.dtype} of shape {shape}", expected)
+    if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
+        got = f"counts {counts.min()}..{counts.max()}"
+        _refuse("counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
+    absent = counts == ABSENT
+    if (absent.any(axis=1) != absent.all(axis=1)).any():
+        _refuse("counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
+
+
+def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
+    sensors = arrays["sensor"]
+    names = list(dict.fromkeys(sensors.tolist()))
+    if len(names) > MOST_SENSORS:
+        _refuse("sensor", f"{len(names)} sensors", f"at most {MOST_SENSORS}")
+    for name in names:
+        if not is_sensor_name(name):
+            _refuse("sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
+        times = arrays["time_ns"][sensors == name]
+        if times.min() < 0 or times.max() > LAST_TIME_NS:
+            _refuse("time_ns", f"times {times.min()}..{times.max()}", f"0..{LAST_TIME_NS}")
+        if (times[1:] < times[:-1]).any():  # not a difference, which wraps around
+            _refuse("time_ns", f"times of sensor {name!r} that go back", "times that never fall")
+        yield Track(name, arrays["counts"][sensors == name].astype(np.int32), times.astype(np.int64))
+
+
 def _baselines(path: Path, tracks: Sequence[Track], sensors: NDArray[np.str_]) -> dict[str, Baseline]:
     """Return the baselines of the first scan of each sensor, dated by the clock of the scans."""
-    arrays = _read(path, _BASELINE, lambda: None)
+    arrays = read_npz(path, _BASELINE, MOST_NPZ_BYTES, lambda: None)
     if len(arrays) < len(_BASELINE):
         return {}
-    scan_shape = tracks[0].counts.shape[1:]
-    for name, kinds, shape in zip(_BASELINE, "Uff", ((), scan_shape, ()), strict=True):
-        _check_array(path, name, arrays[name], kinds, (len(sensors), *shape))
-    ids, counts, ages_s = (arrays[name] for name in _BASELINE)
+    _check_arrays(arrays, _BASELINE, sensors.shape, baseline_counts=tracks[0].counts.shape[1:])
     baselines: dict[str, Baseline] = {}
     for track in tracks:
-        first = int(np.argmax(sensors == track.sensor))
-        own, text, age_s = counts[first].astype(np.float32), str(ids[first]), float(ages_s[first])
+        ids, counts, ages_s = (arrays[name][int(np.argmax(sensors == track.sensor))] for name in _BASELINE)
+        own, text, age_s = counts.astype(np.float32), str(ids), float(ages_s)
         if not text or track.time_ns is None:
             continue
         known = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
         if not known.all() or not is_sensor_name(text):
-            _refuse(path, "baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
+            _refuse("baseline_counts", "others", f"0..{HIGHEST_COUNT + 1}, or none")
         own.setflags(write=False)
         taken_s = int(track.time_ns[0]) / NS_PER_S - (age_s if 0 <= age_s <= LAST_UNIX_S else math.nan)
         baselines[track.sensor] = Baseline(track.sensor, own, taken_s, 1, "file", text)
     return baselines
 
 
-def _sensors(path: Path, sensors: NDArray[np.str_]) -> list[str]:
-    names = list(dict.fromkeys(sensors.tolist()))
-    if len(names) > MOST_SENSORS:
-        _refuse(path, "sensor", f"{len(names)} sensors", f"at most {MOST_SENSORS}")
-    for name in names:
-        if not is_sensor_name(name):
-            _refuse(path, "sensor", repr(name[:20]), f"names of 1 to {LONGEST_SENSOR_NAME} printable characters")
-    return names
-
-
-def _mountings(path: Path, text: NDArray[Any] | None, tracks: Sequence[Track]) -> dict[str, Mounting]:
-    if text is None:
-        return {}
+def _mountings(text: str, tracks: Sequence[Track]) -> dict[str, Mounting]:
     try:
-        texts = json.loads(str(text))
+        texts = json.loads(text)
         return {
             one.sensor: read_mounting(texts[one.sensor], one.counts[0, 0].size) for one in tracks if one.sensor in texts
         }
     except (ValueError, TypeError, RecursionError) as error:
-        _refuse(path, "mountings", " ".join(str(error).split())[:120], "JSON as `edge-sr convert` writes it")
+        _refuse("mountings", " ".join(str(error).split())[:120], "JSON as `edge-sr convert` writes it")
 
 
-def _times(path: Path, sensor: str, times: NDArray[np.integer]) -> NDArray[np.int64]:
-    if times.min() < 0 or times.max() > LAST_TIME_NS:
-        _refuse(path, "time_ns", f"times {times.min()}..{times.max()}", f"0..{LAST_TIME_NS}")
-    if (times[1:] < times[:-1]).any():  # not a difference, which wraps around
-        _refuse(path, "time_ns", f"times of sensor {sensor!r} that go back", "times that never fall")
-    return times.astype(np.int64)
-
-
-def _checked_counts(path: Path, counts: NDArray[Any]) -> NDArray[np.int32]:
-    shape = counts.shape
-    grid = len(shape) == 4 and shape[1] == len(AXES) and 0 < shape[2] * shape[3] <= MOST_TAXELS
-    if counts.dtype.kind not in "iu" or not grid or counts.size == 0:
-        most = f"{MOST_TAXELS} taxels at most"
-        expected = f"whole numbers of shape (scans, {len(AXES)}, rows, cols), {most}, at least one scan"
-        _refuse(path, "counts", f"{counts.dtype} of shape {counts.shape}", expected)
-    if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
-        got = f"counts {counts.min()}..{counts.max()}"
-        _refuse(path, "counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
-    absent = counts == ABSENT
-    if (absent.any(axis=1) != absent.all(axis=1)).any():
-        _refuse(path, "counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
-    return counts.astype(np.int32)
-
-
-def _origin(path: Path, arrays: Mapping[str, NDArray[Any]], scans: int) -> Literal["device", "emulated"] | None:
-    for name in _ORIGINS:
-        if name in arrays:
-            _check_array(path, name, arrays[name], "U", (scans,))
-            return origin_of(np.unique(arrays[name]).tolist())
-    return None
-
-
-def _poses(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
-    found = {name: arrays[name] for name in _POSES if name in arrays}
+def _poses(arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
+    """Return the poses; other programs may leave out all but their times and numbers."""
+    found = [name for name in _POSES if name in arrays]
     if not found:
         return []
-    for name in _POSES[:2]:
-        if name not in found:
-            raise RecordingError(f"{path}, array '{name}': missing, expected together with '{next(iter(found))}'")
-    count = found["pose_time_ns"].size
-    for name, kinds in zip(_POSES, ("iu", "fiu", "U", "b", "iu"), strict=True):
-        if name in found:
-            _check_array(path, name, found[name], kinds, (count, len(POSE_FIELDS)) if name == "pose" else (count,))
+    for name in ("pose_time_ns", "pose"):
+        if name not in arrays:
+            raise NpzError(f"array '{name}': missing, expected together with '{found[0]}'")
+    count = arrays["pose_time_ns"].size
     if count > MOST_POSES:
-        _refuse(path, "pose", f"{count:,} poses", f"at most {MOST_POSES:,}: cut it in parts")
-    sensors = found.get("pose_sensor", np.zeros(count, "U1")).tolist()
+        _refuse("pose", f"{count:,} poses", f"at most {MOST_POSES:,}: cut it in parts")
+    _check_arrays(arrays, _POSES, (count,), pose=(len(POSE_FIELDS),))
+    sensors = arrays.get("pose_sensor", np.zeros(count, "U1")).tolist()
     if len(set(sensors)) > MOST_SENSORS + 1:
-        _refuse(path, "pose_sensor", f"{len(set(sensors))} sensors", f"at most {MOST_SENSORS}")
-    for name in set(sensors) - {""}:
-        if not is_sensor_name(name):
-            _refuse(path, "pose_sensor", repr(name[:20]), "the name of a sensor, or none")
-    times_ns, used_ns = found["pose_time_ns"], found.get("pose_used_from_ns", np.full(count, -1))
-    for name, times, low in (("pose_time_ns", times_ns, 0), ("pose_used_from_ns", used_ns, -1)):
-        if count and not low <= times.min() <= times.max() <= LAST_TIME_NS:
-            _refuse(path, name, f"times {times.min()}..{times.max()}", f"{low}..{LAST_TIME_NS}")
-    holds = found.get("pose_holds", np.zeros(count, bool))
-    rows = zip(
-        *(array.tolist() for array in (found["pose"].astype(np.float64), times_ns, holds, used_ns)),
-        sensors,
-        strict=True,
-    )
+        _refuse("pose_sensor", f"{len(set(sensors))} sensors", f"at most {MOST_SENSORS}")
+    holds, used_from_ns = arrays.get("pose_holds", np.zeros(count, bool)), arrays.get("pose_used_from_ns")
+    used_from_ns = np.full(count, -1) if used_from_ns is None else used_from_ns
+    rows = (arrays["pose"].astype(np.float64), arrays["pose_time_ns"], holds, used_from_ns)
     try:
-        return [
-            TimedPose(PadPose(*values), time_ns, sensor or None, held, None if used_from_ns < 0 else used_from_ns)
-            for values, time_ns, held, used_from_ns, sensor in rows
-        ]
-    except ValueError as error:
-        raise RecordingError(f"{path}, array 'pose': {error}") from error
+        return list(map(checked_pose, *(each.tolist() for each in rows), sensors))
+    except CdrError as error:
+        raise NpzError(f"array 'pose': {error}") from error
 
 
-def _check_array(path: Path, name: str, array: NDArray[Any], kinds: str, shape: tuple[int, ...]) -> None:
-    if array.dtype.kind not in kinds or array.shape != shape:
-        _refuse(path, name, f"{array.dtype} of shape {array.shape}", f"{_KINDS[kinds]} of shape {shape}")
+def _check_arrays(
+    arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, str], rows: tuple[int, ...], **of_a_row: tuple[int, ...]
+) -> None:
+    """Refuse arrays that are there, and not of these kinds, so many rows, and the shape of a row, else one value."""
+    for name in kinds.keys() & arrays.keys():
+        array, shape = arrays[name], (*rows, *of_a_row.get(name, ()))
+        if array.dtype.kind not in kinds[name] or array.shape != shape:
+            _refuse(name, f"{array.dtype} of shape {array.shape}", f"{_KINDS[kinds[name]]} of shape {shape}")
 
 
-def _refuse(path: Path, name: str, got: str, expected: str) -> NoReturn:
-    raise RecordingError(f"{path}, array '{name}': {' '.join(got.split())}, expected {expected}")
+def _refuse(name: str, got: str, expected: str) -> NoReturn:
+    raise NpzError(f"array '{name}': {' '.join(got.split())}, expected {expected}")

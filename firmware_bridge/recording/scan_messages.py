@@ -1,7 +1,7 @@
 """Messages of scans, baselines, poses and sensors: all that is needed to play a recording again, bit for bit."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from dataclasses import fields as dataclass_fields
 from functools import lru_cache
@@ -227,17 +227,24 @@ def decode_pose(data: bytes | memoryview) -> TimedPose:
         CdrError: it is no pose, or a value is impossible.
     """
     fields = POSE.decode(data)
-    sensor, used_from_ns = fields["sensor"], fields["used_from_ns"]
+    numbers = [fields[name] for name in POSE_FIELDS]
+    return checked_pose(numbers, *(fields[name] for name in ("time_ns", "holds", "used_from_ns", "sensor")))
+
+
+def checked_pose(numbers: Sequence[float], time_ns: int, holds: int, used_from_ns: int, sensor: str) -> TimedPose:
+    """Return the pose of these POSE_FIELDS, and of the other fields of POSE, as recordings hold them.
+
+    Raises:
+        CdrError: a value is impossible.
+    """
     _check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
-    _check_times(fields, time_ns=0, used_from_ns=-1)
-    _check(fields["holds"] <= 1, "holds", fields["holds"], "0 or 1")
+    _check_times({"time_ns": time_ns, "used_from_ns": used_from_ns}, time_ns=0, used_from_ns=-1)
+    _check(holds <= 1, "holds", holds, "0 or 1")
     try:
-        pose = PadPose(*(fields[name] for name in POSE_FIELDS))
+        pose = PadPose(*numbers)
     except ValueError as error:
         raise CdrError(str(error)) from error
-    return TimedPose(
-        pose, fields["time_ns"], sensor or None, bool(fields["holds"]), None if used_from_ns < 0 else used_from_ns
-    )
+    return TimedPose(pose, time_ns, sensor or None, bool(holds), None if used_from_ns < 0 else used_from_ns)
 
 
 def mounting_text(mounting: Mounting) -> str:

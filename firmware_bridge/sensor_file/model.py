@@ -41,10 +41,7 @@ took 27 s."""
 _REMEDY: Final = "correct it, or write it again with edge-sr doctor --out"
 PARTS: Final = ("mounting", "force", "baseline", "gains")
 """Parts of an entry that can be marked as assumed, or as measured on an emulated sensor."""
-
-
 LARGEST_MM: Final = 1e5
-_OFF: Final = 1e-3  # most by which a quaternion's norm may differ from 1
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class PadFrame:
             raise ValueError(f"parent is {self.parent[:40]!r}, expected the name of a frame such as tool0")
         if len(self.place_mm) != 3 or not all(abs(one) <= LARGEST_MM for one in self.place_mm):
             raise ValueError(f"place_mm is {self.place_mm}, expected three numbers up to {LARGEST_MM:g}")
-        if len(self.quaternion) != 4 or not abs(math.hypot(*self.quaternion) - 1) <= _OFF:
+        if len(self.quaternion) != 4 or not abs(math.hypot(*self.quaternion) - 1) <= 1e-3:
             raise ValueError(f"quaternion is {self.quaternion}, expected x, y, z, w of norm 1")
 
 
@@ -198,29 +195,24 @@ def _sensor_tables(value: Any) -> dict[str, dict[str, Any]]:
 def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     grid, taxels = geometry.scan_shape[1:], list(range(geometry.taxel_count))
     places = f"{grid[0]} rows of {grid[1]}, each of 0..{taxels[-1]} once"
-    mounting = {
+    parts = {"pad": _pad, "learned": _pad, "baseline": _baseline, "frame": _frame}
+    readers = {
         "order": cells(grid, lambda all_: set(map(type, all_)) == {int} and sorted(all_) == taxels, places),
         "swap_xy": truth,
         "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
         "gains": partial(_gains, geometry),
+        "counts_per_newton": between(*PAD_RANGES["counts_per_newton"]),
+        **dict.fromkeys(("assumed", "emulated"), _marks),
+        **dict.fromkeys(parts, a_table),
     }
-    known = {key: table.take(key, read, required=False) for key, read in mounting.items()}
-    counts_per_newton = table.take("counts_per_newton", between(*PAD_RANGES["counts_per_newton"]), required=False)
-    marked = {"assumed": _parts, "emulated": _parts}
-    marks = {key: table.take(key, read, required=False) or frozenset() for key, read in marked.items()}
-    parts = {"pad": _pad, "learned": _pad, "baseline": _baseline, "frame": _frame}
-    tables = {key: table.take(key, a_table, required=False) for key in parts}
+    taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
-    return SensorEntry(
-        Mounting(**{key: one for key, one in known.items() if one is not None}, taxel_count=geometry.taxel_count),
-        counts_per_newton,
-        **marks,
-        **{
-            key: read(table.part(key, tables[key]), name, geometry)
-            for key, read in parts.items()
-            if tables[key] is not None
-        },
-    )
+    known = {key: value for key, value in taken.items() if value is not None}
+    mounting = {key: known.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in known}
+    for key, read in parts.items():
+        if key in known:
+            known[key] = read(table.part(key, known[key]), name, geometry)
+    return SensorEntry(Mounting(**mounting, taxel_count=geometry.taxel_count), **known)
 
 
 def _pad(table: Table, sensor: str, geometry: SensorGeometry) -> Pad:
@@ -270,7 +262,7 @@ def _baseline(table: Table, sensor: str, geometry: SensorGeometry) -> Baseline:
     return baseline
 
 
-def _parts(value: Any) -> frozenset[str]:
+def _marks(value: Any) -> frozenset[str]:
     if not isinstance(value, list) or not all(isinstance(one, str) and one in PARTS for one in value):
         raise ValueError(f"a list of {', '.join(PARTS)}")
     return frozenset(value)

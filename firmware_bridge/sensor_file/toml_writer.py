@@ -32,9 +32,7 @@ from firmware_bridge.sensor_file.model import (
 )
 from firmware_bridge.zeroing.baseline import Baseline
 
-LOCKED_S: Final = 5.0
-"""Longest wait for another program that changes the file, in [s]: reading and writing take some milliseconds."""
-_LOOK_S: Final = 0.01
+LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
 
 @contextmanager
@@ -61,7 +59,7 @@ def changing(path: str | Path) -> Iterator[None]:
             except BlockingIOError as error:
                 if time.monotonic() >= end_s:
                     raise SensorFileError(f"{path}: another program has kept it locked for {LOCKED_S:g} s") from error
-                time.sleep(_LOOK_S)
+                time.sleep(0.01)
             except OSError:
                 break
         yield
@@ -140,12 +138,11 @@ def _entry_lines(entry: SensorEntry, cols: int) -> list[str]:
         lines += ["gains = [", *planes, "]"]
     if entry.counts_per_newton is not None:
         lines.append(_line("counts_per_newton", float(entry.counts_per_newton), "of the summed z"))
-    for key, marked, why in (
-        ("assumed", entry.assumed, "as wired; not measured"),
-        ("emulated", entry.emulated, "measured on an emulated sensor: not for a device"),
-    ):
-        if marked:
-            lines.append(_line(key, [part for part in PARTS if part in marked], why))
+    if entry.assumed:
+        lines.append(_line("assumed", sorted(entry.assumed, key=PARTS.index), "as wired; not measured"))
+    if entry.emulated:
+        why = "measured on an emulated sensor: not for a device"
+        lines.append(_line("emulated", sorted(entry.emulated, key=PARTS.index), why))
     return lines
 
 
@@ -160,10 +157,9 @@ def _frame_lines(frame: PadFrame) -> list[str]:
 
 def _pad_lines(pad: Pad, cols: int) -> list[str]:
     lines: list[str] = []
-    known = pad.constants
     for name in PAD_RANGES:
-        if name in known:
-            lines.append(_line(name, float(known[name])))
+        if name in pad.constants:
+            lines.append(_line(name, float(pad.constants[name])))
         if name in pad.intervals:
             lines.append(_line(f"{name}_interval", list(map(float, pad.intervals[name]))))
     for key, values, about in (

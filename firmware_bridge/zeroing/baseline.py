@@ -36,12 +36,10 @@ Origin = Literal["start-up", "demand", "file", "recording", "unsure"]
 
 FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
-MOST_FILE_BYTES: Final = 1 << 20  # most bytes of a baseline file; a sensor takes about 2 kB
 LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
 
-Orders = Mapping[str, Sequence[int]]
-_AS_WIRED: Final[Orders] = MappingProxyType({})
+_AS_WIRED: Final[Mapping[str, Sequence[int]]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,15 +101,10 @@ class Baseline:
 def deformation(
     scan_counts: NDArray[np.integer], baseline: Baseline, mounting: Mounting | None = None
 ) -> NDArray[np.float32]:
-    """Return the difference of a scan to the baseline, the short way round the circle of counts.
+    """Return the difference of a scan's raw counts to the baseline, the short way round the circle of counts.
 
-    Args:
-        scan_counts: (3, rows, cols) raw counts.
-        baseline: baseline of the same sensor.
-        mounting: directions of its axes, and its gains; None where they are as wired.
-
-    Returns:
-        (3, rows, cols) signed counts in -32768..32768; NaN where a taxel is absent.
+    Shapes (3, rows, cols); signed counts in -32768..32768, NaN where a taxel is absent. Without a mounting the axes are
+    as wired.
     """
     half = COUNTS_ON_CIRCLE // 2
     # float32 holds halves exactly up to 2^23, so this does not round.
@@ -139,18 +132,10 @@ class BaselineEstimator:
         reference: Baseline | None = None,
         clock: Callable[[], float] = time.time,
     ) -> None:
-        """Start with no scan.
-
-        Args:
-            min_scans: number of complete scans with a new reading that a baseline takes, at least 3.
-            reference: an earlier baseline of this sensor.
-            clock: returns the time in [s] since 1970.
-        """
+        """Wait for at least 3 complete scans with a new reading; `clock` returns the time in [s] since 1970."""
         if min_scans < 3:
             raise ValueError(f"min_scans is {min_scans}, expected at least 3")
-        self._min_scans = min_scans
-        self._reference = reference
-        self._clock = clock
+        self._min_scans, self._reference, self._clock = min_scans, reference, clock
         self._taken: list[NDArray[np.int32]] = []
         self._silent: NDArray[np.bool_] | None = None
 
@@ -160,13 +145,10 @@ class BaselineEstimator:
         return len(self._taken)
 
     def push(self, scan: Scan, silent: NDArray[np.bool_] | None = None) -> Baseline | None:
-        """Add one more scan, and return the baseline once there are enough.
+        """Add the next scan, and return the baseline once there are enough.
 
-        Args:
-            scan: next scan of the sensor.
-            silent: taxels (rows, cols) that are left out: a scan is complete without them, the baseline NaN there. A
-                taxel left out once stays so until there is a baseline, since an intermittent one would delay it for
-                ever.
+        A scan is complete without the `silent` taxels (rows, cols), and the baseline NaN there. One left out once stays
+        so until there is a baseline, since an intermittent one would delay it for ever.
 
         Raises:
             BaselineRefusedError: the pad moved or was loaded. The estimator has begun again.
@@ -196,7 +178,9 @@ class BaselineEstimator:
         return baseline
 
 
-def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orders = _AS_WIRED) -> None:
+def save_baselines(
+    path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = _AS_WIRED
+) -> None:
     """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
     `orders` are those of the taxels of each sensor whose mounting differs from its id map.
@@ -231,7 +215,7 @@ def save_baselines(path: str | Path, baselines: Iterable[Baseline], orders: Orde
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Baseline]:
+def load_baselines(path: str | Path, orders: Mapping[str, Sequence[int]] = _AS_WIRED) -> dict[str, Baseline]:
     """Read baselines, by sensor; `orders` are the present ones of the taxels, as in `save_baselines`.
 
     Raises:
@@ -240,7 +224,7 @@ def load_baselines(path: str | Path, orders: Orders = _AS_WIRED) -> dict[str, Ba
     """
     path = Path(path)
     try:
-        document = json.loads(read_bounded(path, MOST_FILE_BYTES).decode())
+        document = json.loads(read_bounded(path, 1 << 20).decode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:

@@ -17,39 +17,19 @@ from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
-BLOCK_NS: Final = 500_000_000
-SAMPLE_NS: Final = 25_000_000
-"""Time between the scans of a block, in [ns]: twenty give a median within a third of the noise, at a fifth the cost."""
-FEWEST_SCANS: Final = 8  # least number of scans in a block, which lasts longer where scans are rare
 GAP_NS: Final = 5_000_000_000  # time without a scan after which the pad may have been replaced or moved, in [ns]
-REST_BLOCKS: Final = 4
-"""Still blocks before drift is followed or a rest level compared: by then a pad has recovered from a press."""
-COMMON_PER_S: Final = 20.0
-"""Highest rate of the common drift that is followed, in [counts/s]: above any drift on record."""
+COMMON_PER_S: Final = 20.0  # highest common drift that is followed, in [counts/s]: above any drift on record
 COMMON_COUNTS: Final = 50.0
 """Largest common change ahead of the followed drift that is no touch: a pad turned over in the earth's field moves by
 36 counts; at this limit the summed z is still half of a contact's."""
 OWN_SHARE: Final = 0.65
 """Largest own drift of a taxel as a share of the common drift: six tenths are seen, and a press has more than one."""
-OWN_PER_S: Final = 0.05  # highest rate of a taxel's own drift beyond that share, in [counts/s]
-TOUCH_COUNTS: Final = 10.0
-"""Largest change of a taxel ahead of the common drift that is no touch: .01 N, nine times a block's highest noise."""
-RATE_S: Final = 2.0
-"""Time over which the rate of the common drift is smoothed, in [s]: a taxel's share of it must not be one of noise."""
-NOISE_PER_S: Final = 0.2  # rate that noise causes, in [counts/s]: four of its standard deviations
-SLOW_PER_S: Final = 1.0
-"""Rate of the common drift, in [counts/s], up to which a taxel's own drift is not followed while one may be touched."""
 STILL_COUNTS: Final = 7.0
 """Largest difference of two blocks at rest: the highest noise measured is 4.7 counts, 1.6 for that difference."""
 STEP_COUNTS: Final = 15.0
 """Change of rest level over a contact above which it is reported: more than noise and the end of a recovery cause."""
-BACK_COUNTS: Final = 8.0
-"""Size of a step up to which it counts as none, and the rest is followed. Smaller than a touch."""
-VOTE_COUNTS: Final = 4.0  # largest own step of a taxel that contributes to the common drift: the size of noise
-FEWEST_VOTERS: Final = 4
 
 _ZEROED: Final = "since it was zeroed"
-_BACK: Final = "rest level is back where it was"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +71,10 @@ class DriftTracker:
         self._last_ns = 0  # the first scan interrupts, which sets the other attributes
 
     def push(self, scan: Scan, contact: bool, dead: NDArray[np.bool_]) -> bool:
-        """Process one scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
+        """Process the next scan; return True if `counts`, `summary` or `note` have changed, or there is an event.
 
-        Args:
-            scan: next scan of the sensor.
-            contact: True during a tap, and while the baseline is in doubt.
-            dead: taxels (rows, cols) that are ignored; a new array only where they have changed.
+        There is `contact` during a tap, and while the baseline is in doubt. The `dead` taxels (rows, cols) are ignored,
+        and are a new array only where they have changed.
         """
         time_ns = scan.time_ns
         since_ns, self._last_ns = time_ns - self._last_ns, time_ns
@@ -106,8 +84,9 @@ class DriftTracker:
             return False
         if scan.complete or bool((scan.fresh | dead).all()):
             self._block.append(scan.counts)
-            self._next_ns = time_ns + SAMPLE_NS
-        if time_ns - self._start_ns < BLOCK_NS or len(self._block) < FEWEST_SCANS:
+            # Twenty scans give a median within a third of the noise, at a fifth of the cost of all.
+            self._next_ns = time_ns + 25_000_000
+        if time_ns - self._start_ns < 500_000_000 or len(self._block) < 8:  # longer where scans are rare
             return False
         level, seconds = self._middle_half(), (time_ns - self._start_ns) / 1e9
         self._begin_block(time_ns)
@@ -131,7 +110,6 @@ class DriftTracker:
             self._cause = "after a taxel was out"
         self._contact, self._dead = contact, dead
         self._live = ~(dead | self._unzeroed)
-        self._all_live = bool(self._live.all())
         self._begin_block(scan.time_ns)
         self._stop()
         before, self.note = self.note, self._step_note()
@@ -158,22 +136,13 @@ class DriftTracker:
         self, counts: NDArray[np.float32], voters: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split counts into the part common to `voters`, or all live taxels, (3, 1, 1), and each taxel's own."""
-        if voters is not None:
-            common = self._middle(counts[:, voters])
-            return common, np.where(self._live, counts - common, np.float32(0))
-        if not self._all_live:
-            # A dead taxel gets the median of the others, which keeps that median.
-            counts = np.where(self._live, counts, self._middle(counts[:, self._live]) if self._live.any() else 0)
-        common = self._middle(counts.reshape(len(AXES), -1))
-        return common, counts - common
-
-    @staticmethod
-    def _middle(counts: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the median over taxels, (3, 1, 1); np.median takes ten times as long for so few."""
-        ordered = np.sort(counts, axis=1)
+        # np.median takes ten times as long for so few.
+        ordered = np.sort(counts[:, self._live if voters is None else voters], axis=1)
         count = ordered.shape[1]
-        middle = np.float32(0.5) * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
-        return middle[:, None, None]
+        if not count:
+            return np.zeros_like(self._rate_per_s), np.zeros_like(counts)
+        common = (np.float32(0.5) * (ordered[:, (count - 1) // 2] + ordered[:, count // 2]))[:, None, None]
+        return common, np.where(self._live, counts - common, np.float32(0))
 
     def _wait(self, level: NDArray[np.float32], seconds: float) -> bool:
         """Wait until the pad has been still for a while, then determine its rest level."""
@@ -184,9 +153,8 @@ class DriftTracker:
         allowed = STILL_COUNTS + OWN_SHARE * np.abs(common)
         still = np.abs(common).max() <= STILL_COUNTS + COMMON_PER_S * seconds and (np.abs(own) <= allowed).all()
         self._quiet_blocks = self._quiet_blocks + 1 if still else 0
-        if self._quiet_blocks < REST_BLOCKS:
-            return False
-        return self._settle(level)
+        # After four still blocks a pad has recovered from a press.
+        return self._quiet_blocks >= 4 and self._settle(level)
 
     def _settle(self, level: NDArray[np.float32]) -> bool:
         self._resting = True
@@ -199,13 +167,14 @@ class DriftTracker:
             step, stepped = np.zeros_like(step), False
         elif not stepped:
             step = own
-        self._step = step if np.abs(step).max() > BACK_COUNTS else None
-        # Taxels that may be touched do not contribute to the common drift of the others.
-        untouched: NDArray[np.bool_] = np.logical_and.reduce(np.abs(own) <= VOTE_COUNTS) & self._live
-        self._voters = untouched if self._step is not None and untouched.sum() >= FEWEST_VOTERS else None
+        # A smaller step, below a touch, counts as none, and is followed.
+        self._step = step if np.abs(step).max() > 8 else None
+        # Taxels that may be touched, with a step above noise, do not contribute to the common drift of the others.
+        untouched: NDArray[np.bool_] = np.logical_and.reduce(np.abs(own) <= 4) & self._live
+        self._voters = untouched if self._step is not None and untouched.sum() >= 4 else None
         before, self.note = self.note, self._step_note()
         if not stepped:
-            self._event = None if before is None else _BACK
+            self._event = None if before is None else "rest level is back where it was"
         elif before is None or known is None or np.abs(step - known).max() > STEP_COUNTS:
             self._event = self.note
         self._sum_up()
@@ -215,18 +184,21 @@ class DriftTracker:
         step = self._step
         ahead = level - self._followed if step is None else level - self._followed - step
         common, own = self._parts(ahead, self._voters)
-        touched = (np.abs(own) > TOUCH_COUNTS + OWN_SHARE * np.abs(common)).any()
+        # Ten counts are .01 N, nine times a block's highest noise.
+        touched = (np.abs(own) > 10 + OWN_SHARE * np.abs(common)).any()
         if touched or np.abs(common).max() > COMMON_COUNTS:
             self._cause = "after a touch too light for a tap"
             self._stop()
             return False
         most = np.float32(COMMON_PER_S * seconds)
         moved = np.clip(common, -most, most)
-        own_per_s = OWN_PER_S if step is None else 0.0
         # This block shows that the one before it was free.
         self.counts = self._followed
-        self._rate_per_s += np.float32(min(seconds / RATE_S, 1.0)) * (moved / np.float32(seconds) - self._rate_per_s)
-        slow_per_s = np.float32(NOISE_PER_S if step is None else SLOW_PER_S)
+        # Smoothed over 2 s, so that a taxel's share of it is not one of noise.
+        self._rate_per_s += np.float32(min(seconds / 2, 1.0)) * (moved / np.float32(seconds) - self._rate_per_s)
+        # In [counts/s]: four standard deviations of noise cause .2 of the common rate; while a taxel may be touched,
+        # none follows a slow one on its own, nor creeps.
+        slow_per_s, own_per_s = (np.float32(0.2), 0.05) if step is None else (np.float32(1), 0.0)
         share_per_s = np.maximum(np.abs(self._rate_per_s) - slow_per_s, 0)
         most_own = np.float32(seconds) * (np.float32(OWN_SHARE) * share_per_s + np.float32(own_per_s))
         own_moved = np.clip(own, -most_own, most_own)

@@ -12,17 +12,6 @@ from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, refuse_load
 
 FEWEST_RECORDED: Final = 30
 """Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
-FREEST_SHARE: Final = 0.01
-"""Share of the scans with the lowest z, FEWEST_RECORDED or more, whose median a free pad is compared with."""
-MOST_TRIES: Final = 2000
-"""Places of a long recording at which a stretch may begin, so that the search ends within a second or two."""
-
-RECOVERY_COUNTS: Final = 60.0
-"""Largest spread of a taxel during the freest scans: real pads recover by some tens of counts in the second after a
-grip."""
-TOUCH_COUNTS: Final = 1500.0
-"""Rise of the summed z that is a contact, some 1.3 N; a free pad warms by less within a recording."""
-FEWEST_TOUCHED: Final = 5
 STEP: Final = 8  # scans by which a stretch is made longer at a time
 
 
@@ -57,9 +46,7 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
     may lie above the freest scans of the whole recording, as with an earlier baseline. Where the pad is still nowhere,
     but was let go of, these are the freest FEWEST_RECORDED scans.
-
-    Args:
-        counts: (n, 3, rows, cols) raw counts of all scans of a sensor; ABSENT where a taxel gave no reading.
+    Raw counts (n, 3, rows, cols) of all scans of a sensor; ABSENT where a taxel gave no reading.
 
     Raises:
         BaselineRefusedError: there is none, with the reason at the freest place.
@@ -71,12 +58,12 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     if len(rows) < FEWEST_RECORDED:
         raise BaselineRefusedError(f"{len(rows)} whole new scans, expected at least {FEWEST_RECORDED} of a free pad")
     z = unwrapped(taken)[:, 2].sum(axis=(1, 2), dtype=np.int64)
-    freest = np.argsort(z, kind="stable")[: max(FEWEST_RECORDED, round(FREEST_SHARE * len(rows)))]
+    freest = np.argsort(z, kind="stable")[: max(FEWEST_RECORDED, round(0.01 * len(rows)))]
     reference = Baseline.from_counts("freest", taken[freest], 1.0)
     if len(rows) >= FEWEST_SCANS and _fault(taken[:FEWEST_SCANS], reference) is None:
         return Stretch(rows[:FEWEST_SCANS], taken[:FEWEST_SCANS], _touched(z, z[:FEWEST_SCANS]))
     level = np.convolve(z, np.ones(FEWEST_RECORDED), "valid")
-    begins = np.arange(0, len(level), max(1, len(level) // MOST_TRIES))
+    begins = np.arange(0, len(level), max(1, len(level) // 2000))  # so that the search ends within a second or two
     least: BaselineRefusedError | None = None
     freest_first = begins[np.argsort(level[begins], kind="stable")].tolist()
     for begin in freest_first:
@@ -87,14 +74,18 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
         least = least or fault
     lowest = slice(freest_first[0], freest_first[0] + FEWEST_RECORDED)
     spread = float(np.ptp(np.percentile(unwrapped(taken[lowest]), (5, 95), axis=0), axis=0).max())
-    if spread <= RECOVERY_COUNTS and _touched(z, z[lowest]):
+    # Real pads recover by some tens of counts in the second after a grip.
+    if spread <= 60 and _touched(z, z[lowest]):
         return Stretch(rows[lowest], taken[lowest], touched=True, within_counts=spread / 2)
     raise BaselineRefusedError(f"nowhere free and still for {FEWEST_RECORDED} scans; where it is freest, {least}")
 
 
 def _touched(z: NDArray[np.int64], free: NDArray[np.int64]) -> bool:
-    """Return True if some scans are as far above those of a stretch as a contact; a single one may be damaged."""
-    return bool((z > np.median(free) + TOUCH_COUNTS).sum() >= FEWEST_TOUCHED)
+    """Return True if some scans are as far above those of a stretch as a contact; a few may be damaged.
+
+    A contact of 1.3 N raises the summed z by 1500 counts; a free pad warms by less within a recording.
+    """
+    return bool((z > np.median(free) + 1500).sum() >= 5)
 
 
 def _widest(taken: NDArray[np.int32], begin: int, reference: Baseline) -> tuple[int, int]:

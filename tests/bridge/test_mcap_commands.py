@@ -53,11 +53,11 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
     write_model(folder / "tiny.onnx", SURE)
     counts = np.stack([make_scan(number, noise=3).counts for number in range(160)])
-    for first in (120, 140):
-        counts[first : first + 10, 2, 1, 1] += 3000
+    for first in (110, 135):
+        counts[first : first + 20, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
     for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
-        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 200)]) == 0
+        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 100)]) == 0
         if any(own for own, _ in patterns(folder / "press.mcap").values()):
             return folder
         (folder / "press.mcap").unlink()

@@ -99,11 +99,6 @@ def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
     assert played(again)[0] == played(first)[0] == expected_order()
 
 
-@pytest.mark.parametrize("kind", ["mcap", "npz"])
-def test_a_recording_without_poses_has_none(tmp_path, kind):
-    assert load_recording(record(tmp_path / f"plain.{kind}", [])).poses == []
-
-
 def test_poses_of_another_program_are_interpolated_in_time(tmp_path):
     times_ns = np.arange(0, 400_000_000, 33_000_000)
     values = np.zeros((len(times_ns), 5))

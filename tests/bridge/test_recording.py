@@ -1,12 +1,18 @@
+import random
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bridge_samples import REAL_RECORDINGS
+from hostile_samples import one_line
 
+from firmware_bridge.can.slcan import encode_frame
+from firmware_bridge.emulation.xela_controller import scan_frames
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.slcan_scans import SlcanScans
 
 HEADER = ",".join(CSV_HEADER) + "\n"
 
@@ -250,25 +256,35 @@ def test_npz(tmp_path):
         ({"version": np.array(1.0)}, "array 'version'"),
         ({"counts": None}, "array 'counts': missing"),
         ({"counts": np.zeros((4, 3, 4, 4))}, "array 'counts': float64"),
-        ({"counts": np.zeros((4, 4, 4, 3), dtype=np.int32)}, "array 'counts'"),
-        ({"counts": np.zeros((0, 3, 4, 4), dtype=np.int32)}, "at least one scan"),
+        *(
+            ({"counts": np.zeros(shape, np.int32)}, r"\(scans, 3, rows, cols\), 64 taxels at most, at least one scan")
+            for shape in ((4, 4, 4, 3), (0, 3, 4, 4), (4, 3, 16), (4, 3, 0, 4), (4, 3, 5, 13))
+        ),
         ({"counts": np.full((4, 3, 4, 4), 65536, np.int32)}, r"array 'counts': counts 65536\.\.65536"),
         ({"counts": np.full((4, 3, 4, 4), -2, np.int32)}, r"array 'counts': counts -2\.\."),
         ({"counts": np.full((4, 3, 4, 4), [[[-1]], [[0]], [[0]]], np.int32)}, "absent on some axes"),
         ({"sensor": np.array([4, 6, 4, 6])}, "array 'sensor': int64"),
         ({"sensor": np.array(["4"])}, "array 'sensor'"),
+        ({"sensor": np.array(["4", "6", "6", "4\n5"])}, "printable"),
+        (
+            {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), int)}
+            | dict.fromkeys(("scan", "time_ns"), np.arange(65)),
+            "65 sensors, expected at most 64",
+        ),
         ({"sensor": np.array(["4", 6, None, {}], dtype=object)}, "plain arrays"),
         ({"scan": np.zeros(3, dtype=np.int64)}, "array 'scan'"),
         ({"time_ns": np.zeros(4)}, "array 'time_ns'"),
         ({"time_ns": np.array([5, 0, 4, 0])}, "array 'time_ns': times of sensor '4' that go back"),
-        ({"rate_hz": np.array(0.0)}, "array 'rate_hz'"),
-        ({"rate_hz": np.array(float("nan"))}, "array 'rate_hz'"),
+        ({"time_ns": np.array([5, 0, 1 << 61, 0])}, r"times 5\.\.2305843009213693952, expected 0"),
+        ({"time_ns": np.array([5, 0, 1 << 63, 0], np.uint64)}, "expected 0"),
+        *(({"rate_hz": np.array(rate_hz)}, "a positive number") for rate_hz in (0.0, float("nan"), 1e-300)),
         ({"rate_hz": np.array([50.0])}, "array 'rate_hz'"),
     ],
 )
 def test_npz_that_is_none(tmp_path, changes, words):
-    with pytest.raises(RecordingError, match=words):
+    with pytest.raises(RecordingError, match=words) as refused:
         load_recording(write_npz(tmp_path, **changes))
+    assert one_line(refused)
 
 
 def test_npz_is_read_as_far_as_its_arrays_are_whole(tmp_path):
@@ -301,3 +317,41 @@ def test_files_that_cannot_be_read(tmp_path):
         path = tmp_path / name if content is None else write_csv(tmp_path, content, name)
         with pytest.raises(RecordingError, match=words):
             load_recording(path)
+
+
+# Real recordings, both fingers at once, as slcan text: torn and repeated rows are told, and every row is one scan.
+
+
+TRIALS = sorted(path.parent for path in REAL_RECORDINGS.glob("*/xela_sensor1.csv"))
+
+
+@pytest.mark.skipif(not TRIALS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
+def test_every_row_is_one_scan_and_torn_ones_are_told(trial):
+    fingers = [load_recording(trial / f"xela_sensor{finger}.csv") for finger in (1, 2)]
+    scans, noise, got = SlcanScans(), random.Random(1), {"4": [], "6": []}
+    for number, rows in enumerate(zip(*(finger.tracks[0].counts for finger in fingers), strict=True)):
+        frames = zip(
+            *(scan_frames(row, int(sensor), noise) for row, sensor in zip(rows, got, strict=True)), strict=True
+        )
+        text = b"".join(encode_frame(frame) for pair in frames for frame in pair)
+        for scan in scans.feed(text, number * 16_000_000):
+            got[scan.sensor].append(scan)
+    torn = repeated = 0
+    for own, finger in zip(got.values(), fingers, strict=True):
+        rows = np.loadtxt(finger.path, delimiter=",", skiprows=1).reshape(-1, 16, 3)
+        assert [scan.number for scan in own] == list(range(len(rows)))
+        assert (np.stack([scan.counts for scan in own]).reshape(-1, 3, 16) == rows.transpose(0, 2, 1)).all()
+        changed = np.vstack([np.ones((1, 16), dtype=bool), (rows[1:] != rows[:-1]).any(axis=2)])
+        assert [scan.renewed.ravel().tolist() for scan in own] == changed.tolist()
+        renewed = changed.sum(axis=1)
+        assert [scan.torn for scan in own] == ((renewed > 0) & (renewed < 16)).tolist()
+        assert [scan.repeated for scan in own] == (renewed == 0).tolist()
+        torn, repeated = torn + sum(scan.torn for scan in own), repeated + sum(scan.repeated for scan in own)
+    # The recordings hold both; a comparison without any would prove nothing.
+    assert torn > 200 and repeated > 40
+    counted = {name: count for name, count in scans.counters().items() if count}
+    frames = counted["frames"]
+    assert counted == {
+        "frames": frames, "readings": frames, "scans": frames // 16, "torn_source": torn, "repeated": repeated
+    }  # fmt: skip

@@ -98,16 +98,11 @@ class TestArchives:
         header = npy(np.zeros((1, 3, 4, 4), np.int32)).replace(b"(1, 3", b"(9999999999, 3").replace(b" " * 9, b"", 1)
         self.refused(tmp_path, stored({"counts": header} | members("counts")), "states 1919999999808 bytes and holds")
 
-    def test_lengths_whose_product_wraps_around(self, tmp_path):
-        shape = f"({1 << 32}, {1 << 32})"
-        content = npy(np.zeros((1, 1)))[:80].replace(b"(1, 1)", shape.encode())
-        self.refused(tmp_path, stored({"counts": content} | members("counts")), "counts.npy|not a whole")
-
-    def test_a_table_of_contents_of_a_million_members(self, tmp_path, bounded_memory):
+    def test_a_table_of_contents_that_is_large(self, tmp_path, bounded_memory):
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w") as whole:
-            for number in range(13_000):
-                whole.writestr(f"{number:060d}", b"")
+            for number in range(20):
+                whole.writestr(f"{number:060000d}", b"")
         self.refused(tmp_path, file.getvalue(), r"a piece of 1,\d+,\d+ bytes, expected at most 1,048,576")
 
     @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -117,37 +112,18 @@ class TestArchives:
             whole.writestr("counts.npy", npy(np.zeros(3)))
         self.refused(tmp_path, file.getvalue(), "compressed in another way")
 
-    @pytest.mark.parametrize("text", [b"\0\0\x11\0", b"\0\xd8\0\0"])
-    def test_text_that_is_no_unicode(self, tmp_path, text):
-        sensors = npy(np.array(["4", "4"])).replace(b"4\0\0\0", text)
-        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "not Unicode")
-
-    def test_a_header_of_pieces_of_python(self, tmp_path):
-        sensors = npy(np.array(["4", "4"])).replace(b"'shape': (2,)", b"'shape': (((((")
-        self.refused(tmp_path, stored({"sensor": sensors} | members("sensor")), "not a whole")
-
     @pytest.mark.parametrize(
-        ("changes", "complaint"),
+        ("name", "old", "new", "complaint"),
         [
-            ({"time_ns": np.array([1 << 61, 5])}, "times 5..2305843009213693952, expected 0"),
-            ({"time_ns": np.array([1 << 63, 5], np.uint64)}, "expected 0"),
-            ({"sensor": np.array(["4", "4\n5"])}, "printable"),
-            ({"sensor": np.array(["4", "x" * 65])}, "printable"),
-            ({"rate_hz": np.array(1e-300)}, "a positive number"),
-            ({"counts": np.zeros((2, 2, 4, 4), np.int32)}, r"\(scans, 3, rows, cols\)"),
-            ({"counts": np.zeros((2, 3, 16), np.int32)}, r"\(scans, 3, rows, cols\)"),
-            ({"counts": np.zeros((2, 3, 0, 4), np.int32)}, r"\(scans, 3, rows, cols\)"),
-            ({"counts": np.zeros((2, 3, 5, 13), np.int32)}, "64 taxels at most"),
+            ("counts", b"(2, 3, 4, 4)", f"({1 << 32}, {1 << 32})".encode(), "counts.npy|not a whole"),  # wraps round
+            ("sensor", b"4\0\0\0", b"\0\0\x11\0", "not Unicode"),
+            ("sensor", b"4\0\0\0", b"\0\xd8\0\0", "not Unicode"),
+            ("sensor", b"'shape': (2,)", b"'shape': (((((", "not a whole"),
         ],
     )
-    def test_values_that_nothing_can_be_done_with(self, tmp_path, changes, complaint):
-        self.refused(tmp_path, archive(**recording_arrays() | changes), complaint)
-
-    def test_more_sensors_than_a_wire_can_hold(self, tmp_path):
-        count = 65
-        many = {"scan": np.arange(count), "time_ns": np.arange(count), "counts": np.zeros((count, 3, 4, 4), np.int32)}
-        many["sensor"] = np.arange(count).astype(str)
-        self.refused(tmp_path, archive(**recording_arrays() | many), "65 sensors, expected at most 64")
+    def test_a_member_that_numpy_does_not_write(self, tmp_path, name, old, new, complaint):
+        spoilt = npy(recording_arrays()[name]).replace(old, new)
+        self.refused(tmp_path, stored({name: spoilt} | members(name)), complaint)
 
     def test_what_is_asked_for_alone_is_read(self, tmp_path):
         path = tmp_path / "two.npz"

@@ -97,7 +97,9 @@ EQUIVALENT: dict[str, dict[str, str]] = {
     },
     "baseline": {
         "deformation: signed.min() >= -half -> signed.min() > -half": "the slower way gives the same",
+        "deformation: signed += half -> signed -= half": "a turn apart, of which the remainder is taken",
         "push: 0 -> 1": "what a silent taxel reads is the same in all scans, and its rest is NaN",
+        "refuse_load: 0 -> 1": "one count of a taxel that is unknown in either is below the limit",
         "save_baselines: 1 -> 2": "the blanks before a line of the file",
     },
     "contract": {
