@@ -317,10 +317,10 @@ def worst(cases: list[Case]) -> list[Case]:
     return kept
 
 
-def run(folder: Path) -> list[Case]:
+def run(folder: Path, parts: Mapping[str, Callable[[], Iterator[Case]]] = PARTS) -> list[Case]:
     """Write the report `stability`, and return the rows that are broken."""
     report = Report("stability", folder, __file__, [find_model(path.stem) for path in bundled_models()])
-    cases = {part: list(work()) for part, work in tracked(PARTS.items(), "stability", "part")}
+    cases = {part: list(work()) for part, work in tracked(parts.items(), "stability", "part")}
     every = [case for same in cases.values() for case in same]
     broken = [case for case in every if not case.holds]
     report.say(

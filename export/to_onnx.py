@@ -104,6 +104,7 @@ class IntervalData:
 
     validation: PressSet
     training: PressSet | None = None
+    steps: int = 2000  # of the fit
 
     def conformed(self, net: CompactNet, run: Run) -> dict[str, list[float]]:
         """Shift a corrected network's deviations until they hold for `run`, and return its levels; see `conform`."""
@@ -136,7 +137,7 @@ def export(
         if intervals.training is None:
             net.add_intervals().contact_level.fill_(contract.contact_level)
         else:
-            fit_correction(net, intervals.training, contract.contact_level)
+            fit_correction(net, intervals.training, contract.contact_level, steps=intervals.steps)
         levels = intervals.conformed(net, lambda *given: run_network(net, *given))
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
@@ -150,8 +151,8 @@ def export(
         integer, convs = convolutions(model)
         float_error = _error(in_float, contract, frozen)
         contract = replace(contract, arithmetic="int8")
-        cost = _cost(float_error, _error(model, contract, frozen))
-        facts = [f"{integer} of {convs} convolutions in int8", *cost]
+        lost = cost(float_error, _error(model, contract, frozen))
+        facts = [f"{integer} of {convs} convolutions in int8", *lost]
 
     session = _session(model, contract)
     facts = [*judge_in_contract(session, frozen, validation), *facts]
@@ -186,7 +187,7 @@ def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, st
     return model.SerializeToString(deterministic=True)
 
 
-def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
+def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
     """Return the loss by int8 as text, with each exceeded limit; nothing without errors on the test set."""
     if not in_float:
         return []
@@ -244,7 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(f"export: {error}")
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
-    costly = {line.partition(":")[0]: [cost for cost in (_COSTLY, _UNSURE) if cost in line] for line in lines}
+    costly = {line.partition(":")[0]: [one for one in (_COSTLY, _UNSURE) if one in line] for line in lines}
     lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")

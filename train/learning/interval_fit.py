@@ -34,7 +34,6 @@ _PER_FAMILY: Final = 1000  # training presses of each family: rare families weig
 _SAMPLES: Final = 24  # pixels of each region of a window
 _PRESSES_AT_ONCE: Final = 512
 _ROUNDS: Final = 2  # sensors that read each training press
-_STEPS: Final = 2000
 _BATCH: Final = 512
 _RATE: Final = 5e-3
 _DECAY: Final = 0.1
@@ -97,7 +96,7 @@ def readings_of_presses(presses: PressSet, taps: int, times: int = _READINGS, *,
     return found
 
 
-def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0) -> None:
+def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0, steps: int = 2000) -> None:
     """Add a correction to a trained network in evaluation mode, fitted on presses, some of them with all its taps."""
     torch.manual_seed(seed)
     correction = net.add_intervals()
@@ -109,8 +108,8 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
     there = ~ratios.isnan()
     ratios = ratios.nan_to_num()
     optimiser = torch.optim.AdamW(correction.parameters(), _RATE, weight_decay=_DECAY)
-    course = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=_STEPS)
-    for _ in range(_STEPS):
+    course = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
+    for _ in range(steps):
         picked = torch.randint(len(summary), (min(_BATCH, len(summary)),))
         beyond = ratios[picked] - correction.log_factors(summary[picked], later[picked])[:, :, None]
         loss = (torch.maximum(LEVEL * beyond, (LEVEL - 1) * beyond) * there[picked]).sum() / there[picked].sum()
