@@ -1,16 +1,12 @@
 """Every experiment runs, in miniature, and leaves a page and its tables."""
 
 import csv
-import re
-from dataclasses import replace
 
 import pytest
-from edge_samples import ROOT
 
 from train.experiments.__main__ import EXPERIMENTS, function_of, main
 from train.experiments.paper.protocol import HELD_OUT
 from train.experiments.paper.tables import training_sets
-from train.experiments.support import workbench
 from train.experiments.support.workbench import Workbench
 
 COLUMNS = {
@@ -22,19 +18,6 @@ COLUMNS = {
     "fig5": {"surface"},
     "fig7": {"method", "error %", "ms a pattern"},
 }
-
-
-@pytest.fixture(autouse=True)
-def little_of_the_papers_size(monkeypatch):
-    """Skip the cost of its networks, which takes seconds to measure and is asserted nowhere; judge half of a set."""
-    monkeypatch.setattr(workbench, "_TIMED_RUNS", 1)
-    names, whole = ("newest", "tap", "indentation_mm", "force_n"), Workbench.frozen
-
-    def frozen(self, *given, **options):
-        judged = whole(self, *given, **options)
-        return replace(judged, **{name: getattr(judged, name)[1::2] for name in names})
-
-    monkeypatch.setattr(Workbench, "frozen", frozen)
 
 
 @pytest.fixture(scope="module")
@@ -101,20 +84,9 @@ def test_networks_and_data_are_made_once(folder):
     made_ns = {path: path.stat().st_mtime_ns for path in folder.glob("[dc]*/*")}
     run(folder, "taps", again=True)
     assert made_ns == {path: path.stat().st_mtime_ns for path in folder.glob("[dc]*/*")}
+    assert all(path.name.startswith("quick-") for path in (folder / "checkpoints").glob("*.pt")), "apart from real ones"
 
 
 def test_every_experiment_is_a_file_that_can_be_run():
     for name in EXPERIMENTS:
         assert callable(function_of(name)), name
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_its_own_steps_are_followed_by_a_bar(name):
-    """A bar of a single page would never move; that of its training is another."""
-    source = {"fig5": "train/networks/tpsf_net.py"}.get(name, f"{function_of(name).__module__.replace('.', '/')}.py")
-    assert re.search(r"\bfor .* in .*tracked\(", (ROOT / source).read_text())
-
-
-def test_a_quick_bench_keeps_apart_from_a_real_one(folder):
-    assert all(path.name.startswith("quick-") for path in (folder / "checkpoints").glob("*.pt"))
-    assert Workbench().quick is False

@@ -61,13 +61,6 @@ def test_one_constant_of_a_pad_is_off():
     assert pads.OffPad("poisson", 10).can_be
 
 
-def test_losses_are_press_by_press():
-    up, down = pads.OffPad("pitch_mm", 5), pads.OffPad("pitch_mm", -5)
-    psnr = {pads.NONE_OFF: np.array([30.0, 20.0]), up: np.array([29.0, 19.0])}
-    (row,) = pads.loss_rows({"model": psnr}, [pads.NONE_OFF, up, down])
-    assert row["model, up"] == "1.00 (1.00..1.00)" and row["model, down"] is None
-
-
 @pytest.mark.night
 def test_the_families_in_miniature(bench, tmp_path):
     page = families.run(bench, tmp_path).read_text()

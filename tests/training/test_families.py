@@ -5,7 +5,6 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, SurfaceError
-from train.families import catalogue
 from train.families.catalogue import FIGURES, SHARES, draw_shape
 from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, SOLIDS, Lie, drawn, flat
 from train.physics.contact import BARE
@@ -17,12 +16,6 @@ from train.surfaces.poses import turns
 @pytest.fixture(scope="module")
 def pad():
     return GrippedPad(NOMINAL)
-
-
-@pytest.fixture
-def level(monkeypatch):
-    """Lay shapes level, so that their highest part is fixed."""
-    monkeypatch.setattr(catalogue, "_LEVEL", 1.0)
 
 
 def draw(pad, family, seed=0, taps=1):
@@ -118,12 +111,11 @@ def test_a_tilt_turns_with_the_shape_from_tap_to_tap(pad):
     pytest.fail("every face lies level")
 
 
-def test_two_shapes_lie_on_either_side_at_one_height(pad, level, monkeypatch):
-    monkeypatch.setattr(catalogue, "_PAIRED", ("block",))
+def test_two_shapes_lie_on_either_side_at_one_height(pad):
     heights = np.stack([draw(pad, "two", seed).heights_mm[0] for seed in range(12)])
     middle = heights.shape[-1] // 2
     left, right = heights[..., :middle].max(axis=(1, 2)), heights[..., middle:].max(axis=(1, 2))
-    assert (np.abs(left) < 1e-4).all() and (np.abs(right) < 1e-4).all()
+    assert (np.abs(left - right) < 0.3).mean() > 0.8, "but for a tilt, and for cones and domes whose top lies outside"
     assert (heights < NOWHERE_MM / 2).any(axis=(1, 2)).any(), "there is a gap beside some"
 
 

@@ -8,7 +8,7 @@ from press_samples import make_press_set
 from train.data.press_batches import PosedBatches, stated_poses
 from train.errors import DatasetError
 from train.networks.compact import CompactNet, HeteroscedasticError
-from train.networks.fusion import FusionNet
+from train.networks.fusion import Carrier, FusionNet
 from train.networks.registry import grown
 
 KNOWN = 5
@@ -82,18 +82,16 @@ def test_the_order_of_earlier_taps_is_free_and_absent_ones_change_nothing(net, i
 
 def test_a_shift_by_half_a_pitch_moves_what_an_earlier_tap_shows_by_a_cell(net):
     """Carried features land where the pose says: the same tap shifted by two cells changes the pattern two cells on."""
-    from train.networks.fusion import _Carrier
-
     there = torch.ones(1, 1, 1, 1, 1)
     state = torch.zeros(1, 1, 8, 8)
     state[0, 0, 3, 4] = 1
     pose = torch.tensor([[[2.35, -2.35, 0.0, 0.0, 0.0]]])
-    moved = _Carrier(pose, there, (4, 4), REACHES).to_taps(state)
+    moved = Carrier(pose, there, (4, 4), REACHES).to_taps(state)
     assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (4, 3), (
         "one cell up and to the right of the newest tap"
     )
     turned = torch.tensor([[[0.0, 0.0, 90.0, 0.0, 0.0]]])
-    moved = _Carrier(turned, there, (4, 4), REACHES).to_taps(state)
+    moved = Carrier(turned, there, (4, 4), REACHES).to_taps(state)
     # x of the turned pad points down the newest one's rows: half a cell right, half a cell up is half up, half left.
     assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (3, 3)
 

@@ -68,12 +68,6 @@ def test_the_whole_array_is_magpylibs_sum_over_all_magnets():
     assert np.allclose(MagnetArray(USPA44, MAGNET).flux_mt(movement), expected_mt, atol=1e-5)
 
 
-def test_single_precision_is_enough():
-    movement = np.random.default_rng(4).normal(size=(50, 16, 5)) * [0.1, 0.1, 0.15, 0.1, 0.1]
-    array = MagnetArray(USPA44, MAGNET)
-    assert np.abs(array.change_mt(movement.astype(np.float32)) - array.change_mt(movement)).max() < 2e-5
-
-
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="mm into its chip"):
         MagnetArray(USPA44, Magnet(chip_height_mm=2.3))

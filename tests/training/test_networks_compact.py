@@ -31,23 +31,19 @@ def test_shapes_follow_taps_and_scale(taps, scale):
     assert (small.taps, small.scale) == (taps, scale)
 
 
-@pytest.mark.parametrize(
-    ("taps", "scale", "channels", "said"),
-    [(1, 5, 16, "even"), (1, 0, 16, "even"), (0, 4, 16, "at least 1"), (1, 4, 4, "multiple of the 4 symmetries")],
-)
-def test_taps_scales_and_channels_out_of_range_are_refused(taps, scale, channels, said):
+@pytest.mark.parametrize(("taps", "channels", "said"), [(0, 16, "at least 1"), (1, 6, "multiple of the 4 symmetries")])
+def test_taps_and_channels_out_of_range_are_refused(taps, channels, said):
     with pytest.raises(ValueError, match=said):
-        CompactNet(taps, scale, channels)
+        CompactNet(taps, 4, channels)
 
 
 def test_absent_taps_are_the_same_as_fewer_taps(net):
-    for taps in (1, 2, 3):
-        given = window()
-        given[:, 3 * taps :] = 0
-        fewer = CompactNet(taps, 10, channels=16, blocks=2, group=net.group).eval()
-        fewer.take_over(net)
-        for output, expected in zip(net(given), fewer(given[:, : 3 * taps]), strict=True):
-            assert torch.allclose(output, expected, atol=1e-6 * float(output.detach().abs().max()) + 1e-6)
+    given = window()
+    given[:, 6:] = 0
+    fewer = CompactNet(2, 10, channels=16, blocks=2, group=net.group).eval()
+    fewer.take_over(net)
+    for output, expected in zip(net(given), fewer(given[:, :6]), strict=True):
+        assert torch.allclose(output, expected, atol=1e-6 * float(output.detach().abs().max()) + 1e-6)
 
 
 @pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])

@@ -3,7 +3,7 @@ import pytest
 
 from train.physics.resample import resample, resample_touching
 
-SCALES = [4, 4.5, 6, 7, 8, 10, 12.5, 15, 19, 20]
+SCALES = [4, 4.5, 7, 12.5, 19]
 
 
 def maps(count=3, side=80):
@@ -33,12 +33,7 @@ def test_a_plane_stays_where_it_is(scale):
     assert np.abs(small - plane(len(small))[0]).max() < 3 / 80
 
 
-def test_whole_ratios_are_block_means():
-    fine = maps()
-    assert np.allclose(resample(fine, 20, 10), fine.reshape(3, 40, 2, 40, 2).mean(axis=(2, 4)), atol=1e-6)
-
-
-def test_rows_and_columns_are_not_confused():
+def test_whole_ratios_are_block_means_and_rows_and_columns_not_confused():
     fine = np.random.default_rng(1).random((2, 80, 40)).astype(np.float32)
     assert np.allclose(resample(fine, 20, 5), fine.reshape(2, 20, 4, 10, 4).mean(axis=(2, 4)), atol=1e-6)
 

@@ -51,15 +51,9 @@ def test_shapes_have_the_areas_of_their_circumscribed_circles():
     assert top_mm2(surface_mesh("hollow triangle")) == pytest.approx(regular(3, 7) * (1 - inner))
 
 
-def test_letters_are_strokes_of_three_millimetres():
-    assert top_mm2(surface_mesh("T")) == pytest.approx(11 * 3 + 12 * 3)
-    corner = (pi / 4 - 1) * 1.5**2  # round outside, overlapping inside
-    assert top_mm2(surface_mesh("L")) == pytest.approx((12 + 8 + 2 * 1.5) * 3 + corner, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     "name",
-    ["Q", "", "s", "glyph", "glyph:", "glyph:-1", "glyph:1.5", "polygon:x", "polygon:²", "mesh", "mesh:", "cone:3"],
+    ["Q", "", "s", "glyph", "glyph:", "glyph:-1", "glyph:1.5", "polygon:²", "mesh", "mesh:", "cone:3"],
 )
 def test_an_unknown_name_lists_the_kinds(name):
     with pytest.raises(SurfaceError, match=r"small triangle.*glyph:SEED.*mesh:PATH"):
@@ -73,7 +67,7 @@ def test_a_users_file_is_a_surface_like_any_other(tmp_path):
     assert mesh.bounds.ravel() == pytest.approx([-3, -2, -2, 3, 2, 0])
 
 
-SEEDS = range(250)
+SEEDS = range(100)
 REACH_MM = {"glyph": GLYPH_REACH_MM, "polygon": POLYGON_REACH_MM}
 
 # Area, and centre x and y, of the first seeds.

@@ -39,8 +39,6 @@ _VALIDATIONS: Final = 5  # number of validations over a run
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
-_KEEP_EVERY_S: Final = 60.0
-_LOG_EVERY: Final = 50
 
 
 DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError)
@@ -155,6 +153,7 @@ def train(
     identity: str = "",
     log_folder: Path | None = None,
     validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
+    keep_every_s: float = 60.0,
 ) -> Trained:
     """Train a network in place; an interrupted run resumes when this is called again.
 
@@ -167,6 +166,7 @@ def train(
         identity: of network and data; an interrupted run resumes only with the same identity.
         log_folder: for TensorBoard, or None.
         validate: returns figures to log and to keep, of the network in evaluation mode.
+        keep_every_s: time after which the state is kept again.
 
     Raises:
         ValueError: a batch cannot be shared evenly by the processes.
@@ -213,7 +213,7 @@ def train(
                 course.append({"step": step, **figures})
                 net.train()
             now_s = time.monotonic()
-            if rank == 0 and now_s - kept_s > _KEEP_EVERY_S:
+            if rank == 0 and now_s - kept_s > keep_every_s:
                 figures = {"step": step, "elapsed_s": now_s - started_s, "course": course}
                 _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
                 kept_s = time.monotonic()
@@ -252,7 +252,7 @@ class _Log:
 
     def step(self, step: int, loss: float, rate: float) -> None:
         self._bar.advance()
-        if step % _LOG_EVERY == 0:
+        if step % 50 == 0:
             self._bar.note(f"loss {loss:.4f}")
             self.figures(step, {"loss": loss, "learning rate": rate})
 
