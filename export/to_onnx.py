@@ -48,7 +48,6 @@ from train.physics.pad_draws import input_scale
 from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 from train.trust import load_trust
 
-OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1  # largest accepted loss by int8 on the frozen test set, in [dB]
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interval's coverage by int8
@@ -76,7 +75,7 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> C
         tap_order=TAP_ORDER,
         angle_step_deg=ANGLE_STEP_DEG,
         counts_per_unit=COUNTS_PER_UNIT,
-        output_unit=OUTPUT_UNIT,
+        output_unit="mm",
         output_full_scale=frozen.full_scale_mm,
         contact_level=contact_level,
         sensor=pad.name,

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +28,6 @@ from train.data.real_grips import recorded_sets, recording_paths
 from train.errors import DatasetError, TrainError
 from train.learning.contact_mixture import CONSTANTS, learned, normalise
 from train.physics.pad_draws import RANGES
-
-_APART: Final = 0.1
-"""Least difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
 
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -55,7 +51,8 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     kept: list[int] = []
     for number, contact in enumerate(contacts):
         away = contacts[kept] - contact
-        if not kept or np.sqrt((away**2).mean(axis=1)).min() > _APART:
+        # A tenth of the RMS of z is five times the effect of noise and drift.
+        if not kept or np.sqrt((away**2).mean(axis=1)).min() > 0.1:
             kept.append(number)
     return counts[kept]
 

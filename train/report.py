@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,8 +17,6 @@ from train.data.presses import SEED
 
 Cell = str | int | float | None
 Row = dict[str, Cell]
-
-_RESAMPLES: Final = 2000
 
 
 class Report:
@@ -86,7 +83,7 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     order, start = np.unique(taps, return_inverse=True)
     sums = np.bincount(start, weights=values, minlength=len(order))
     counts = np.bincount(start, minlength=len(order))
-    drawn = np.random.default_rng(seed).integers(len(order), size=(_RESAMPLES, len(order)))
+    drawn = np.random.default_rng(seed).integers(len(order), size=(2000, len(order)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)

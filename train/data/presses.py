@@ -27,8 +27,6 @@ SEED: Final = 20240228
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
-_NO_POSES: Final = 2  # version without poses, which is still loaded: its taps were turned at one place
-_MOST_BYTES: Final = 1 << 33
 _MOST_FACTS_BYTES: Final = 1 << 22  # largest configuration read, in bytes; real ones take a few kB
 _AXES: Final = {
     "family": ("U", "n"),
@@ -166,8 +164,9 @@ def load_presses(path: Path) -> PressSet:
                 f"at most {VERSION}: make it with 'python -m train.data.make_presses'"
             )
         facts: Any = json.loads(str(about["facts"]))
-        names = [name for name in _AXES if name != "poses" or int(about["version"]) > _NO_POSES]
-        arrays = dict(read_npz(path, names, _MOST_BYTES))
+        # Version 2 has no poses: its taps were turned at one place.
+        names = [name for name in _AXES if name != "poses" or int(about["version"]) > 2]
+        arrays = dict(read_npz(path, names, 1 << 33))
         if "poses" not in arrays:
             turns_deg = arrays["angle_deg"][:, :1] - arrays["angle_deg"]
             arrays["poses"] = np.stack([*np.zeros((2, *turns_deg.shape), np.float32), turns_deg], axis=2)

@@ -22,17 +22,8 @@ QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
 TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
-_LEAST_DEVIATION: Final = 1e-4
-"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of the indentation of such a tap."""
-_FIRST_UNCERTAINTY: Final = log(expm1(0.02))
-"""Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
 _MOST_LOGIT: Final = 8.0
 """Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
-_LEAST_SHARE: Final = 1e-3
-"""Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
-_TRACTION_KPA: Final = 30.0  # traction of an output of 1 and a tap of amplitude 1, in [kPa]
-_TRACTION_SHARE: Final = 0.2  # weight of the traction's relative error in the loss
-_LEAST_KPA: Final = 0.05  # least RMS traction of a truth, in [kPa]; smaller ones count as this
 
 
 class CompactNet(PatternNet):
@@ -175,11 +166,12 @@ class CompactNet(PatternNet):
         """Return the outputs of the trunk's last state, for amplitudes `newest` (n, 1, 1) and earlier taps `later`."""
         features = torch.cat([state, entered.felt], dim=1)
         pattern = self.leave(features)[:, 0]
-        traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
-        # Not an exponential, which would be unbounded on a window unlike all others.
-        logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + _FIRST_UNCERTAINTY
+        traction = self.traction(features) * (newest * 30.0)[:, None]  # in [kPa], of an output of 1
+        # Not an exponential, which would be unbounded on a window unlike all others. It begins at about 0.02 mm.
+        logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + log(expm1(0.02))
         uncertainty = F.softplus(logits) if self.training else _softplus(logits)
-        deviation = (uncertainty + _LEAST_DEVIATION) * self.deviation_scale
+        # At least .05 % of the indentation of such a tap.
+        deviation = (uncertainty + 1e-4) * self.deviation_scale
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
     def take_over(self, start: PatternNet) -> None:
@@ -254,8 +246,8 @@ class HeteroscedasticError(Objective):
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
-            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
-            loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
+            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(0.05)
+            loss = loss + 0.2 * ((traction - batch.traction).abs() / size).mean()
         return loss
 
 
@@ -270,6 +262,6 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> T
     """
     size = truth_size(truth)
     error = (pattern.detach() - truth).abs() / size
-    spread = deviation / sqrt(2) / size + _LEAST_SHARE
+    spread = deviation / sqrt(2) / size + 1e-3  # so that no pixel with a tiny error dominates
     uncertainty_error = spread.detach() * (spread.log() + error / spread)
     return relative_rms_error(pattern, truth) + uncertainty_error.mean()

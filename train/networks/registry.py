@@ -19,7 +19,6 @@ from train.networks.published import MAX_TAPS, SeedNet, TactileSRCNN, TactileSRG
 
 _TAPS: Final = {"stsr": 1} | {f"mtsr{taps}": taps for taps in range(2, MAX_TAPS + 1)}
 _WIDE: Final = {"channels": 64, "blocks": 6}
-_SMALL: Final = {"channels": 32, "blocks": 4}  # a quarter of the work, for a smaller time budget
 
 NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     "srcnn": (TactileSRCNN, {}),
@@ -27,7 +26,7 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
     **{name: (SeedNet, {"taps": taps}) for name, taps in _TAPS.items()},
     **{f"compact-{name}": (CompactNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items()},
     **{f"fusion-{name}": (FusionNet, {"taps": taps} | _WIDE) for name, taps in _TAPS.items() if taps > 1},
-    "small-stsr": (CompactNet, {"taps": 1} | _SMALL),
+    "small-stsr": (CompactNet, {"taps": 1, "channels": 32, "blocks": 4}),  # a quarter of the work
 }
 """Class of each network, and the arguments that options may replace, by name."""
 

@@ -21,13 +21,8 @@ from firmware_bridge.pad_geometry import USPA44
 from train.physics.tpsf import spread
 
 COUNTS_PER_UNIT: Final = 100.0  # counts per unit of the network's input and loss
-_WIDTHS: Final = (256, 1024, 256)
 _SMALLEST: Final = 1e-6  # least length: softplus of a very negative number is 0, and the lengths are divisors
-_GAMMA_START: Final = 0.8
 _RATE: Final = 1e-3
-_GAMMA_HASTE: Final = 20.0
-"""Learning rate of gamma over the network's: a thousand weights of alpha and beta would make up for its staying."""
-_BATCH: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +47,11 @@ class PsfNet(nn.Module):
         super().__init__()
         self.layers = nn.Sequential()
         width = 3 * USPA44.taxel_count
-        for wider in _WIDTHS:
+        for wider in (256, 1024, 256):
             self.layers.extend([nn.Linear(width, wider), nn.ReLU()])
             width = wider
         self.layers.append(nn.Linear(width, 2))
-        self.gamma = nn.Parameter(torch.tensor(float(np.log(np.expm1(_GAMMA_START)))))
+        self.gamma = nn.Parameter(torch.tensor(float(np.log(np.expm1(0.8)))))
         self.register_buffer("k_scale", torch.tensor(1.0))
 
     def forward(self, counts: Tensor) -> PsfParameters:
@@ -143,13 +138,14 @@ def fit_psf_net(
             if isinstance(layer, nn.Linear):
                 layer.reset_parameters()
     order = torch.Generator().manual_seed(seed)
-    groups = [{"params": net.layers.parameters()}, {"params": [net.gamma], "lr": _GAMMA_HASTE * _RATE}]
+    # Gamma learns faster, for a thousand weights of alpha and beta would make up for its staying.
+    groups = [{"params": net.layers.parameters()}, {"params": [net.gamma], "lr": 20.0 * _RATE}]
     optimizer = torch.optim.Adam(groups, _RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs)
     losses: list[float] = []
     for _ in tracked(range(epochs), "PSF network", "epoch"):
         total = 0.0
-        for index in torch.randperm(len(scans), generator=order).split(_BATCH):
+        for index in torch.randperm(len(scans), generator=order).split(64):
             loss = net.loss(scans[index], images[index])
             optimizer.zero_grad()
             loss.backward()

@@ -26,10 +26,6 @@ from train.surfaces.meshes import MESH, load_mesh, mesh_file
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0
 _PLATE_THICKNESS_MM: Final = 1.0
-_STROKE_MM: Final = 3.0
-_WALL_MM: Final = 2.5
-_LARGE_RADIUS_MM: Final = 7.0
-_SMALL_RADIUS_MM: Final = 3.5
 _W, _H = 4.0, 6.0  # half the width and height of a letter, between stroke centres
 GLYPH_REACH_MM: Final = 8.0  # largest distance of a glyph's points from the plate's centre along x and y
 POLYGON_REACH_MM: Final = 9.5
@@ -110,15 +106,15 @@ def figure(name: str) -> BaseGeometry:
 
 
 def _letter(name: str) -> BaseGeometry:
-    strokes = [LineString(points).buffer(_STROKE_MM / 2, cap_style="square") for points in _STROKES[name]]
+    strokes = [LineString(points).buffer(3.0 / 2, cap_style="square") for points in _STROKES[name]]
     return unary_union(strokes).simplify(0.01)  # where strokes meet, points 1e-15 mm apart would open the mesh
 
 
 def _shape(form: str, shape: str) -> BaseGeometry:
     if form == "small":
-        return _regular(_CORNERS[shape], _SMALL_RADIUS_MM)
-    large = _regular(_CORNERS[shape], _LARGE_RADIUS_MM)
-    return large if form == "large" else large.difference(large.buffer(-_WALL_MM, join_style="mitre"))
+        return _regular(_CORNERS[shape], 3.5)
+    large = _regular(_CORNERS[shape], 7.0)
+    return large if form == "large" else large.difference(large.buffer(-2.5, join_style="mitre"))
 
 
 def _regular(corners: int, radius_mm: float) -> Polygon:
