@@ -65,8 +65,7 @@ def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[
 def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
     """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
 
-    Raises:
-        ValueError: the model gives no deviation.
+    ValueError if the model gives no deviation.
     """
     rows, contract = [], model.contract
     for window, truth in zip(windows_of(frozen, contract, given), frozen.patterns(), strict=True):

@@ -36,10 +36,7 @@ _TRACED: Final = 2  # windows with which a graph is traced: with one window, the
 def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
     """Return the network as a checked ONNX graph of any number of windows a run, without a contract.
 
-    The exporter folds batch normalisation into the convolutions before it.
-
-    Raises:
-        ExportError: torch returns no graph.
+    The exporter folds batch normalisation into the convolutions before it. ExportError if torch returns none.
     """
     example = torch.zeros(_TRACED, 3 * net.taps, pad.rows, pad.cols)
     free = {0: torch.export.Dim(ANY_BATCH)}

@@ -43,8 +43,7 @@ PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
 def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
     """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
-    Raises:
-        ExportError: there are too few sequences for meaningful ranges.
+    ExportError if there are too few sequences.
     """
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
@@ -71,10 +70,7 @@ class _Inputs(CalibrationDataReader):
 def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
     """Return a float graph with quantise and dequantise nodes around all nodes that may be quantised.
 
-    Ranges are measured on the batch `seen`, light contacts included.
-
-    Raises:
-        ExportError: no node of the graph may be quantised.
+    Ranges are measured on the batch `seen`, light contacts included. ExportError if no node may be quantised.
     """
     nodes = integer_nodes(model)
     if not nodes:

@@ -119,8 +119,7 @@ def differences(
 ) -> list[Difference]:
     """Return the differences between outputs, each (n, ...), relative to values in the output's own unit.
 
-    Raises:
-        ParityError: number or shapes of the outputs differ, or a value is not finite.
+    ParityError if shapes differ, or a value is not finite.
     """
     shapes = [[maps.shape for maps in given] for given in (expected, got)]
     if shapes[0] != shapes[1]:
@@ -179,8 +178,7 @@ def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:
 def check_parity(net: PatternNet, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
     """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
 
-    Raises:
-        ParityError: it is larger than TOLERANCE or EXTREME_TOLERANCE, or a value is not finite.
+    ParityError if it is too large, or a value is not finite.
     """
     run = GraphRun(model)
     largest = 0.0

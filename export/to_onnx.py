@@ -57,8 +57,7 @@ _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
     """Return the contract of a network's graph for the pad of the test set, with its error still empty.
 
-    Raises:
-        CheckpointError: the report of the weights lacks a key; the error names it.
+    CheckpointError if the report of the weights lacks a key.
     """
     pad = pad_of(*frozen.newest.shape[-2:])
     example = torch.zeros(1, 3 * net.taps, pad.rows, pad.cols)

@@ -58,8 +58,7 @@ def given_taps(taps: int) -> tuple[float, ...]:
 def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
     """Train the bundled networks on; `shorten` divides their steps, for tests.
 
-    Raises:
-        DatasetError: no sequence has as many taps as a network takes.
+    DatasetError if no sequence has as many taps.
     """
     most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
     if most < needed:  # before hours of training of those that come first

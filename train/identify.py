@@ -33,8 +33,7 @@ from train.physics.pad_draws import RANGES
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
     """Return the distinct contacts (n, 3, rows, cols) of each sensor.
 
-    Raises:
-        DatasetError: the folder has no recordings, or one cannot be read.
+    DatasetError if there are none, or one cannot be read.
     """
     if not recording_paths(folder):
         raise DatasetError(f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv")

@@ -1,4 +1,3 @@
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +20,10 @@ from train.experiments.paper.force import (
     course_errors,
     loop_percent,
     pressed,
-    run_recovery,
     training_presses,
 )
 from train.experiments.paper.protocol import mixed
-from train.experiments.support.workbench import Method
+from train.experiments.workbench import Method
 from train.physics.sensor_noise import NAMES, Nuisances
 
 
@@ -44,19 +42,6 @@ def scans(sequences):
     return force.scans_between(sequences, (0.2, 0.4), 3, [1])
 
 
-@pytest.mark.night
-def test_the_report_has_every_range_and_method(bench, tmp_path):
-    page = force.run_force(bench, tmp_path)
-    with page.with_suffix(".csv").open() as file:
-        rows = list(csv.DictReader(file))
-    columns = {"PSNR dB", "SSIM", "SSIM at own scale", "relative error %", "parameters", "MMAC", "run time ms"}
-    assert set(rows[0]) >= columns
-    assert {row["model"] for row in rows} == {"stsr", "mtsr2", "mtsr4", "linear map", "bilinear"}
-    assert len(rows) == 5 * len({row["force N"] for row in rows})
-    assert rows[0]["force N"] == "0.1..0.2"
-    assert all(int(row["taps"]) <= int(row["scans"]) for row in rows)
-
-
 def test_forces_lie_within_their_range(sequences, scans):
     # Contacts are flat: force is proportional to the pattern, and the whole press' force and pattern are given.
     whole = sequences.patterns_at(scans.tap, np.ones(len(scans.tap))).sum(axis=(1, 2))
@@ -68,16 +53,6 @@ def test_forces_lie_within_their_range(sequences, scans):
     z = scans.windows[:, :, 2].sum(axis=(-2, -1))
     assert (z[:, 1:].min(axis=1) > 4000).all(), "earlier taps have come to their ends: 5 N at 1400 counts a newton"
     assert (z[:, 0] < 3000).all()
-
-
-def test_a_press_that_ends_before_is_left_out(sequences):
-    highest_n = sequences.force_n[:, 0, -1]
-    middle_n = float(np.median(highest_n))
-    found = force.scans_between(sequences, (middle_n, middle_n * 1.001), 2, [1])
-    able = np.flatnonzero(highest_n >= middle_n * 1.001)
-    assert set(able) <= set(found.tap)
-    assert 0 < len(np.unique(found.tap)) < len(sequences)
-    assert force.scans_between(sequences, (50.0, 60.0), 2, [1]) is None
 
 
 def test_a_relative_error_is_that_of_the_scale_and_the_truth_has_none(scans):
@@ -114,25 +89,6 @@ def z_of(scans):
     return scans.windows[:, 0, 2].sum(axis=(1, 2))
 
 
-@pytest.mark.night
-def test_the_report_of_a_course_has_every_gauge_under_both_conditions(bench, tmp_path):
-    page = run_recovery(bench, tmp_path)
-    with page.with_suffix(".csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["nuisances"], row["model"]) for row in rows] == [
-        (condition, model)
-        for condition in ("just zeroed", "drifted")
-        for model in ("summed z", "stsr", "mtsr4", "true pattern")
-    ]
-    assert set(rows[0]) >= {"error %", "loop %", "at no load %", "parameters", "MMAC", "run time ms"}
-    for row in rows:
-        if row["model"] == "true pattern":  # is in proportion to the force, and ends with it
-            assert row["with its own factor %"].startswith("0.00")
-            assert row["loop %"].startswith("0.00")
-            assert row["false contact, % of scans"].startswith("0.00")
-    assert page.with_name("force-recovery-surfaces.csv").exists()
-
-
 def test_a_course_presses_holds_releases_and_rests():
     assert np.bincount(COURSE.phase).tolist() == [40, 100, 20, 40]
     press, hold, release, rest = (COURSE.share[COURSE.phase == phase] for phase in range(4))
@@ -157,20 +113,6 @@ def test_without_nuisances_a_press_and_its_release_read_alike(four):
     assert (scans.windows[:, 1:] == scans.windows[:1, 1:]).all()
     lagging = pressed(four, 0, COURSE, replace(NONE, hysteresis=0.11))
     assert loop_percent(scans.force_n, z_of(lagging) / 1400, COURSE) > 0.5
-
-
-def test_one_sensor_reads_the_course_and_the_earlier_taps(four):
-    clean = pressed(four, 0, COURSE, NONE).windows[100]
-    read = pressed(four, 0, COURSE, GAINS).windows[100]
-    clear = np.abs(clean).min(axis=0) > 200
-    gain = np.where(clear, read / np.where(clear, clean, 1), 1)
-    assert clear.sum() > 10
-    np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
-    assert np.ptp(gain[0][clear]) > 0.05
-    other = pressed(four, 1, COURSE, GAINS).windows[100]
-    other_clean = pressed(four, 1, COURSE, NONE).windows[100]
-    both = clear & (np.abs(other_clean).min(axis=0) > 200)
-    assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)
 
 
 def test_a_loop_is_the_largest_difference_at_equal_force():

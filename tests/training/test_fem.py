@@ -4,7 +4,6 @@ import torch
 
 pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install '.[fem]'")
 
-from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import FemPad, Mesh, MooneyRivlin, NoEquilibriumError, press_or_recall
@@ -18,17 +17,6 @@ def disc(along_mm, radius_mm):
 
 def bowl(along_mm, radius_mm):
     return (along_mm[:, None] ** 2 + along_mm[None, :] ** 2) / (2 * radius_mm)
-
-
-@pytest.mark.parametrize("scale", [7, 10])
-def test_nodes_lie_on_the_patterns_pixels_and_reach_the_rim(scale):
-    pad = FemPad(scale, 1)
-    pixels = (np.arange(4 * scale) - (4 * scale - 1) / 2) * USPA44.pixel_pitch_mm(scale)
-    inner = slice((pad.size - 4 * scale) // 2, (pad.size + 4 * scale) // 2)
-    assert np.allclose(pad.nodes_mm[inner], pixels)
-    assert pad.nodes_mm[[0, -1]].tolist() == [-10.0, 10.0]
-    assert np.diff(pad.nodes_mm).min() > 0.5 * pad.cell_mm
-    assert np.diff(pad.nodes_mm).max() < 1.5 * pad.cell_mm
 
 
 def test_the_rubber_is_the_layer_at_small_strain():
@@ -91,14 +79,6 @@ def test_nothing_pulls_nothing_sinks_in_and_contact_grows():
     assert (np.diff(presses.touching.sum(axis=(1, 2))) > 0).all()
     # A node that the surface would cover if the pad did not give way is not touched for that alone.
     assert presses.touching[-1].sum() < (depth_mm < 0.3).sum()
-
-
-def test_patterns_are_the_nodes_or_lie_straight_between_them():
-    pad = FemPad(5, 1)
-    slope = 0.3 + 0.01 * pad.nodes_mm[:, None] - 0.02 * pad.nodes_mm[None, :]
-    fine_mm = (np.arange(40) - 19.5) * 0.47
-    expected = 0.3 + 0.01 * fine_mm[:, None] - 0.02 * fine_mm[None, :]
-    assert np.allclose(pad.pattern(slope[None])[0], expected, atol=1e-6)
 
 
 def test_a_leap_too_far_is_named():

@@ -1,5 +1,4 @@
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from train.data.world import World, solve_pad
 from train.demo import demo_recording
 from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
-from train.physics.sensor_noise import NAMES, Nuisances
+from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import PLACES_MM
 
 
@@ -52,28 +51,6 @@ def test_the_truth_is_the_press(frozen):
     assert patterns.max(axis=(1, 2)) == pytest.approx(frozen.indentation_mm, rel=2e-3)
     inside = frozen.touching()
     assert patterns[inside].mean() > 4 * patterns[~inside].mean()
-
-
-def test_one_seed_freezes_the_same_and_another_reads_by_other_sensors(sequences, frozen):
-    assert freeze(sequences, Nuisances(), SEED).sha256() == frozen.sha256()
-    other = freeze(sequences, Nuisances(), SEED + 1)
-    assert other.sha256() != frozen.sha256() and np.array_equal(other.unit_patterns, frozen.unit_patterns)
-    assert not np.array_equal(other.newest, frozen.newest)
-
-
-def test_frames_of_a_tap_are_read_by_one_sensor(sequences):
-    """Gains stay from frame to frame: without other nuisances each taxel's readings are in one proportion."""
-    quiet = Nuisances().without(*NAMES)
-    clean, gained = (freeze(sequences, n, SEED) for n in (quiet, replace(quiet, gain_spread=0.075)))
-    strong = np.abs(clean.newest[:FRAMES]).min(axis=0) > 100
-    ratio = gained.newest[:FRAMES, strong] / clean.newest[:FRAMES, strong]
-    assert np.abs(ratio - ratio.mean(axis=0)).max() < 0.02 and ratio.mean(axis=0).std() > 0.03
-
-
-def test_another_scale_is_the_same_tap(sequences, frozen):
-    coarse = freeze(sequences, Nuisances(), SEED, scale=4)
-    assert coarse.unit_patterns.shape[1:] == (16, 16) and np.array_equal(coarse.newest, frozen.newest)
-    assert coarse.patterns().mean() == pytest.approx(frozen.patterns().mean(), rel=0.01)
 
 
 def test_classical_methods_beat_nothing_and_are_in_order(frozen, presses, tmp_path):

@@ -79,18 +79,6 @@ def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_
         calibrate(truth, pattern, 0 * deviation)
 
 
-def test_weights_of_a_correction_load_into_a_network_built_with_one():
-    net = make_net()
-    before = net(windows())
-    net.add_intervals()
-    assert all(torch.allclose(*pair, rtol=1e-6) for pair in zip(before, net(windows()), strict=True)), "a new one"
-    corrected(net)
-    again = CompactNet(2, 10, channels=16, blocks=1, known=KNOWN, intervals=True).eval()
-    again.load_state_dict(net.state_dict())
-    assert torch.equal(net(windows())[1], again(windows())[1])
-    assert "intervals.centre" not in make_net().state_dict()
-
-
 def test_the_correction_changes_deviations_alone_and_only_in_use():
     net = make_net()
     before = net(windows())

@@ -202,16 +202,3 @@ def test_the_next_is_drawn_while_one_is_used():
     assert drawn[1].wait(20) and not drawn[2].is_set()
     batches.close()
     assert not drawn[2].is_set()
-
-
-def test_what_fails_fails_at_its_number_and_leaves_no_thread():
-    def batch(number):
-        if number == 2:
-            raise OSError("no such batch")
-        return number
-
-    batches = drawn_ahead(batch, 0, 4)
-    assert [next(batches), next(batches)] == [0, 1]
-    with pytest.raises(OSError, match="no such batch"):
-        next(batches)
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("batches")]

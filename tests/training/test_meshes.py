@@ -82,12 +82,6 @@ def test_a_file_of_several_bodies_is_one_surface(tmp_path):
     assert load_mesh(saved(tmp_path, "touching.stl", binary_stl(along_an_edge))).volume == pytest.approx(2 * 10 * 8 * 3)
 
 
-def test_a_triangle_without_width_opens_nothing(tmp_path):
-    corners = box().triangles
-    needle = corners[0][[0, 0, 1]][None]
-    assert len(load_mesh(saved(tmp_path, "needle.stl", binary_stl(np.concatenate([corners, needle])))).faces) == 12
-
-
 def test_names_in_an_old_encoding_and_materials_beside_the_file_are_no_fault(tmp_path, caplog):
     for name, content in (
         ("part.stl", ascii_stl(box(), "Prüfkörper")),

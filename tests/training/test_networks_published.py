@@ -5,9 +5,9 @@ import torch
 from torch import nn
 
 from train.data.press_batches import Batch
-from train.experiments.support.workbench import macs
+from train.experiments.workbench import macs
 from train.networks.blocks import relative_error
-from train.networks.published import SeedNet, SrganObjective
+from train.networks.published import SrganObjective
 from train.networks.registry import build, grown
 from train.networks.symmetric import write_out
 
@@ -26,18 +26,6 @@ def window(taps, count=2, seed=0):
     return torch.randn(count, 3 * taps, 4, 4, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.fixture(scope="module")
-def stsr():
-    torch.manual_seed(0)
-    return SeedNet(1, 2)
-
-
-def mtsr_of(stsr, taps):
-    net = SeedNet(taps, stsr.scale)
-    net.take_over(stsr)
-    return net
-
-
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_parameters_and_macs_are_the_published_ones(name):
     millions, giga_macs = PUBLISHED[name]
@@ -47,30 +35,7 @@ def test_parameters_and_macs_are_the_published_ones(name):
     assert macs(net) / 1e9 == pytest.approx(giga_macs, abs=0.007)
 
 
-@pytest.mark.parametrize(("name", "scale"), [("stsr", 4), ("mtsr3", 2), ("srcnn", 3), ("srgan", 2), ("mtsr7", 1)])
-def test_patterns_have_the_pattern_size_at_any_scale(name, scale):
-    net = build(name, scale).eval()
-    assert net.scale == scale
-    with torch.inference_mode():
-        pattern = net(window(net.taps))
-    assert pattern.shape == (2, 4 * scale, 4 * scale)
-    assert pattern.min() >= 0
-
-
-def test_all_of_an_mtsr_trains_and_nothing_of_its_stsr(stsr):
-    before = {name: value.clone() for name, value in stsr.state_dict().items()}
-    mtsr = mtsr_of(stsr, 2).train()
-    start = {name: value.clone() for name, value in mtsr.named_parameters()}
-    optimizer = torch.optim.Adam(mtsr.parameters(), lr=1e-2)
-    for seed in range(2):
-        optimizer.zero_grad()
-        (mtsr(window(2, 4, seed)) - 0.2).square().mean().backward()
-        optimizer.step()
-    assert {name for name, value in mtsr.named_parameters() if torch.equal(value, start[name])} == set()
-    assert all(torch.equal(value, before[name]) for name, value in stsr.state_dict().items())
-
-
-@pytest.mark.parametrize("name", ["stsr", "mtsr2", "srcnn", "srgan", "compact-stsr"])
+@pytest.mark.parametrize("name", ["mtsr2", "srcnn", "compact-stsr"])
 def test_every_network_learns_in_low_precision(name):
     torch.manual_seed(2)
     net = build(name, 2).train()

@@ -7,7 +7,7 @@ import pytest
 from press_samples import make_press_set
 
 from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses
-from train.data.press_batches import COUNTS_PER_UNIT, PressBatches, read_presses
+from train.data.press_batches import COUNTS_PER_UNIT, PressBatches
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import NAMES, Nuisances
 
@@ -51,23 +51,6 @@ def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
         unknown = np.concatenate([batch.pad[:, -1].numpy() for batch in drawn]) == 0
         assert apart[unknown].max() < 0.51, "no nuisance but the rounding"
         assert apart[~unknown].max() > 1, "gains are estimated, with an error that their certainty states"
-
-
-def test_of_a_third_of_the_pads_nothing_is_known_of_a_third_all(presses):
-    same = replace(presses, constants=np.full_like(presses.constants, 0.7))
-    batches = PressBatches(same, (1.0,), 64, seed=2, nuisances=QUIET)
-    pads = np.concatenate([batches(number).pad.numpy() for number in range(40)])
-    count = len(INPUTS)
-    values, flags, gains = pads[:, :count], pads[:, count:-1], pads[:, -1]
-    assert set(np.unique(flags)) == {0, 1}
-    assert np.unique(gains) == pytest.approx([0, 0.4, 0.7, 0.9])
-    assert not values[flags == 0].any()
-    told = values[flags == 1]
-    assert told.mean() == pytest.approx(0.7, abs=0.01) and told.std() == pytest.approx(0.1, abs=0.01)
-    nothing, everything = (flags == 0).all(axis=1).mean(), (flags == 1).all(axis=1).mean()
-    assert nothing == pytest.approx(0.35, abs=0.05) and everything == pytest.approx(0.35, abs=0.05)
-    assert (gains > 0).mean() == pytest.approx(0.45, abs=0.02)
-    assert not pads[(flags == 0).all(axis=1) & (gains == 0)].any(), "of an unknown pad all is zero"
 
 
 def test_half_of_the_windows_of_one_tap_are_mirror_images_in_all_that_is_known_of_them(presses):
@@ -118,17 +101,6 @@ def test_windows_of_one_tap_come_from_presses_of_one(presses):
     assert drawn[:, 4:].max() < 16
 
 
-def test_absent_taps_are_zeros(presses):
-    batch = PressBatches(presses, (0.5, 0.5), 64, seed=6)(0)
-    older = batch.window[:, 3:].abs().amax(dim=(1, 2, 3)).numpy()
-    assert 0.3 < (older == 0).mean() < 0.7
-    assert (batch.window[:, :3].abs().amax(dim=(1, 2, 3)) > 0).all()
-    readings = read_presses(presses.with_taps(4), Nuisances(), 1)
-    assert readings.shape == (64, 4, 3, 4, 4)
-    assert not readings[:, 2:].any() and readings[:, :2].any(axis=(2, 3, 4)).all()
-    assert np.array_equal(readings, np.rint(readings))
-
-
 def test_frozen_presses_are_read_once_by_sensors_whose_gains_divide_out(presses):
     frozen = freeze_presses(presses, 9, GAINS_ALONE)
     raw, evened = frozen.windows(2), frozen.windows(2, gains_known=True)
@@ -149,12 +121,3 @@ def test_a_frozen_set_is_saved_without_its_gains_and_has_them_again(presses, tmp
     assert np.array_equal(read.windows(1, gains_known=True), frozen.windows(1, gains_known=True))
     some = read.pick(np.arange(3))
     assert len(some) == 3 and np.array_equal(some.gains, frozen.gains[:3])
-
-
-def test_to_the_runtimes_evaluation_it_is_a_frame_a_tap(presses):
-    frozen = freeze_presses(presses, 9)
-    given = frozen.as_frozen_set()
-    assert len(given) == 64 and given.scale == 10
-    assert np.array_equal(given.windows(2), frozen.windows(2))
-    assert np.allclose(given.patterns(), frozen.patterns(), atol=1e-3)
-    assert np.array_equal(given.force_n, presses.force_n[:, 2])

@@ -157,6 +157,7 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
     [
         (["--data", "absent.npz"], "no such file"),
         (["--network", "compact-mtsr4"], "no sequences of 4 taps"),
+        (["--network", "fusion-mtsr4"], "no sequences of 3 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
         (["--network", "compact-stsr", "--scale", "7"], "scale is 7"),
         (["--network", "compact-stsr", "--start-from", "absent", "--keep", "1"], "keep is 1"),

@@ -38,8 +38,7 @@ _AT_ONCE: Final = 16
 def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
-    Raises:
-        DatasetError: the file at `path` or its parts were made otherwise, or cannot be written.
+    DatasetError if files there were made otherwise or cannot be written.
     """
     facts = world.facts()
     if path.exists():

@@ -86,9 +86,7 @@ class PressBatches:
 
     `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped. Windows of one tap are drawn
     from sequences with fewer taps where these exist, because they are many more.
-
-    Raises:
-        DatasetError: there are no presses of K taps.
+    DatasetError if there are no presses of K taps.
     """
 
     def __init__(
@@ -188,11 +186,7 @@ def known_of_pads(
 
 
 class PosedBatches:
-    """Batches of windows with poses, pad inputs, and truth.
-
-    Raises:
-        DatasetError: there are no presses of so many taps.
-    """
+    """Batches of windows with poses, pad inputs, and truth; DatasetError if there are no presses of so many taps."""
 
     def __init__(self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int) -> None:
         self._presses, self._seed = presses, seed

@@ -128,11 +128,7 @@ class PressSet:
         return digest.hexdigest()
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
-        """Write the presses as one npz, atomically.
-
-        Raises:
-            DatasetError: the file cannot be written.
-        """
+        """Write the presses as one npz, atomically; DatasetError if it cannot be written."""
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = json.dumps({"config": self.config, "sha256": self.sha256()})
@@ -153,8 +149,7 @@ class PressSet:
 def load_presses(path: Path) -> PressSet:
     """Load a file that `PressSet.save` has written.
 
-    Raises:
-        DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
+    DatasetError if it is absent, of another or newer format, or damaged.
     """
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
@@ -189,8 +184,7 @@ def load_presses(path: Path) -> PressSet:
 def join_presses(parts: Sequence[PressSet]) -> PressSet:
     """Concatenate sequences, padded to the taps of the longest; pads are renumbered, so that they stay distinct.
 
-    Raises:
-        DatasetError: there are no parts.
+    DatasetError if there are none.
     """
     if not parts:
         raise DatasetError("no presses to join: name at least one file")

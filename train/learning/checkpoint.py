@@ -151,8 +151,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
 def batches_of(data: PressSet, scale: int, recipe: Recipe, seed: int, *, posed: bool = False) -> Callable[[int], Batch]:
     """Return batches for a recipe, whose taps were only turned unless they are posed.
 
-    Raises:
-        DatasetError: no sequence has as many taps, or the scale is not that of the presses.
+    DatasetError if no sequence has as many taps, or the presses have another scale.
     """
     if scale != data.scale:
         raise DatasetError(
@@ -170,8 +169,7 @@ def _path_of(start: str, folder: Path) -> Path:
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
     """Load the network of NAME.pt in evaluation mode, with its report from NAME.json, or of a float32 NAME.onnx.
 
-    Raises:
-        CheckpointError: a file is missing, or the weights do not fit the configuration.
+    CheckpointError if a file is missing, or the weights do not fit.
     """
     try:
         if path.suffix == _GRAPH:

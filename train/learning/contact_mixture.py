@@ -125,8 +125,7 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
 def fit_mixture(presses: PressSet, seed: int = 0) -> ContactMixture:
     """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
 
-    Raises:
-        DatasetError: too few presses for one component, which needs twice as many as there are channels.
+    DatasetError if they are fewer than two for each channel.
     """
     contacts, constants = even_contacts(presses, seed)
     design = np.insert(constants, 0, 1.0, axis=1)
@@ -188,8 +187,7 @@ def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
 def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = 3) -> GainLearner:
     """Return the learner after several passes over contacts (n, 3, rows, cols), zeroed, each that differs once a pass.
 
-    Raises:
-        DatasetError: no contact is strong enough.
+    DatasetError if no contact is strong enough.
     """
     learner = GainLearner(model)
     for number in range(passes):

@@ -155,22 +155,11 @@ def train(
     validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
     keep_every_s: float = 60.0,
 ) -> Trained:
-    """Train a network in place; an interrupted run resumes when this is called again.
+    """Train a network in place, and leave it in evaluation mode; an interrupted run resumes when this is called again.
 
-    Args:
-        net: on any device; left in evaluation mode.
-        objective: loss function.
-        batches: function from a number to its batch.
-        recipe: hyperparameters.
-        resume_path: file that keeps the state; the caller deletes it when the result is safe.
-        identity: of network and data; an interrupted run resumes only with the same identity.
-        log_folder: for TensorBoard, or None.
-        validate: returns figures to log and to keep, of the network in evaluation mode.
-        keep_every_s: time after which the state is kept again.
-
-    Raises:
-        ValueError: a batch cannot be shared evenly by the processes.
-        DivergedError: the loss is not finite; the network is as it was before that step.
+    It resumes with the same `identity`, of network and data, from the state in `resume_path`, which the caller deletes
+    when the result is safe. `validate` returns figures to log and to keep. ValueError if a batch cannot be shared
+    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
     """
     rank, world = rank_and_world()
     if recipe.batch % world:

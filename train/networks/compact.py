@@ -32,19 +32,9 @@ class CompactNet(PatternNet):
     A tap enters the pattern branch divided by its own amplitude, and the newest tap's amplitude multiplies the
     result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes only, and no force
     is out of its range. The amplitude itself enters as a bounded number, for the nonlinear part. An absent tap is all
-    zeros, and stays zero.
-
-    Args:
-        taps: K.
-        scale: pattern pixels per taxel pitch, even.
-        channels: of the trunk, a multiple of the symmetries.
-        blocks: residual blocks of the trunk.
-        known: numbers that say constants of the pad, see train.physics.pad_draws.
-        group: symmetries. Not mirror images: a mirrored pad is turned the other way from tap to tap.
-        intervals: correct the deviations by region, as after `add_intervals`.
-
-    Raises:
-        ValueError: no taps, an odd scale, or channels that do not divide.
+    zeros, and stays zero. `known` numbers state constants of the pad, `intervals` corrects the deviations by region as
+    `add_intervals` does. Mirror images are not in `group`: a mirrored pad is turned the other way from tap to tap.
+    ValueError if there are no taps, the scale is odd, or channels do not divide.
     """
 
     deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
@@ -120,9 +110,7 @@ class CompactNet(PatternNet):
         Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
         again. Deviations are always above zero; their loss does not train the features of the pattern.
 
-        Args:
-            window: (n, 3K, rows, cols) in network units.
-            pad: (n, known), constants of the pads; None for no constants. A network that takes none ignores them.
+        Windows are (n, 3K, rows, cols) in network units, constants of the pads (n, known), None for none.
         """
         return self.finished(self.see(window, pad))
 
@@ -178,10 +166,7 @@ class CompactNet(PatternNet):
         """Copy another network's function of the newest taps; further taps are ignored until trained.
 
         From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
-        again.
-
-        Raises:
-            ValueError: another kind, width, or number of inputs for the pad.
+        again. ValueError if kind, width or inputs of the pad are others.
         """
         if not isinstance(start, CompactNet):
             raise ValueError("expected a compact network")

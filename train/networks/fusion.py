@@ -104,13 +104,10 @@ class FusionNet(CompactNet):
     def forward(
         self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `CompactNet.forward` does.
+        """Return what `CompactNet.forward` does, of windows of 1 to K taps.
 
-        Args:
-            window: (n, 3k, rows, cols), or (n, k, 3, rows, cols), in network units, of 1 to K taps, newest first.
-            pad: (n, known), constants of the pads; None for no constants.
-            poses: (n, k, 5), x, y in [mm] and turn in [deg] of each tap in the newest one's axes, then the standard
-                deviations of place and turn; None for the paper's schedule.
+        Windows are (n, 3k, rows, cols) or (n, k, 3, rows, cols), poses (n, k, 5): x, y in [mm] and turn in [deg] of
+        each tap in the newest one's axes, then the standard deviations of both; None for the paper's schedule.
         """
         return self.finished(self.see(window, pad, poses))
 
@@ -127,7 +124,7 @@ class FusionNet(CompactNet):
             poses = rows_of_schedule.expand(len(taps), -1, -1)
         # Places of cells need more digits than bfloat16 has; a traced graph has no such types to choose from.
         with torch.autocast(window.device.type, enabled=False) if self.training else nullcontext():
-            carrier = Carrier(poses[:, 1:], there, (rows, cols), self._reaches())
+            carrier = _Carrier(poses[:, 1:], there, (rows, cols), self._reaches())
 
         sizes = (amplitude / (amplitude + 1))[:, 1:, 0, 0]
         pads = entered.about[:, None, :-1].expand(-1, there.shape[1], -1)
@@ -151,7 +148,7 @@ class FusionNet(CompactNet):
         return self.leave_pad(state, entered, newest, later)
 
 
-class Carrier:
+class _Carrier:
     """Exchange of features between the cells of earlier taps and those of the newest one, by the taps' poses.
 
     A weight is a Gaussian of two cells' distance; the error of the pose widens it. Cells of an earlier tap are in the

@@ -28,11 +28,7 @@ _SLOPE: Final = 0.2
 
 
 class _PublishedNet(PatternNet):
-    """Network whose layers all work at the pattern's size.
-
-    Raises:
-        ValueError: taps or scale out of range.
-    """
+    """Network whose layers all work at the pattern's size; ValueError if taps or scale are out of range."""
 
     def __init__(self, taps: int, scale: int) -> None:
         super().__init__()

@@ -32,11 +32,7 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
 
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
-    """Build a new network.
-
-    Raises:
-        ValueError: no network of that name; or scale or an option is out of range.
-    """
+    """Build a new network; ValueError if there is none of that name, or an option is out of range."""
     if name not in NETWORKS:
         raise ValueError(f"no network {name!r}, expected one of {', '.join(NETWORKS)}")
     make, says = NETWORKS[name]
@@ -44,13 +40,10 @@ def build(name: str, scale: int, **options: Any) -> PatternNet:
 
 
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
-    """Build a new network that starts from copies of another's weights.
+    """Build a new network that starts from copies of another's weights; ValueError if the weights do not fit.
 
     An MTSR-K can start from an STSR, a compact network from one of any taps, and any from its own kind. At
     another scale a compact network keeps its trunk, and its output layers are initialised again.
-
-    Raises:
-        ValueError: as `build`, or the weights do not fit.
     """
     net = build(name, scale, **options)
     try:

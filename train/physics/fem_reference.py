@@ -138,10 +138,7 @@ class FemPad:
         """Press a surface in at rising indentations (s,), each step starting from the last one's equilibrium.
 
         Depths (size, size) are below its highest point over each node; the image of size x size cells of cell_mm fits,
-        because its rim is the pad's up to a fraction of a cell.
-
-        Raises:
-            NoEquilibriumError: the elements do not converge.
+        because its rim is the pad's up to a fraction of a cell. NoEquilibriumError if the elements do not converge.
         """
         press = _Press(self._region, self._rubber, self.size)
         found = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]

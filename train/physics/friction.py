@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.physics.elastic_layer import Layer, surface_tensor
-from train.physics.pad_grid import PadGrid
+from train.physics.elastic_layer import Layer, PadGrid, surface_tensor
 
 _REMEMBERED: Final = 4
 """Number of past energies whose largest a step may not exceed: the method does not descend at every step."""

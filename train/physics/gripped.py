@@ -95,6 +95,8 @@ class GrippedPad:
     ) -> Presses:
         """Press shapes onto the pad; a press that would exceed MOST_FORCE_N is made less deep.
 
+        SurfaceError if nothing lies under the pad.
+
         Args:
             heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
             indentation_mm: (n,), of the highest part from first contact, above 0 to MAX_INDENTATION_MM.
@@ -103,9 +105,6 @@ class GrippedPad:
             friction: (n,), Coulomb's coefficient.
             covers: one for each press.
             scale: pattern pixels per taxel pitch.
-
-        Raises:
-            SurfaceError: nothing lies under the pad.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
@@ -161,8 +160,7 @@ class GrippedPad:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
 
-        Raises:
-            SurfaceError: nothing lies under the pad.
+        SurfaceError if nothing lies under the pad.
         """
         if self._beside.any():
             heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)

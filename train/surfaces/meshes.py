@@ -45,9 +45,7 @@ def load_mesh(path: Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     """Read an STL, OBJ or PLY file as a closed surface in [mm]: z up as it stands, top at z = 0, centred on x = y = 0.
 
     Several bodies in it are taken together.
-
-    Raises:
-        MeshError: the file is absent, broken, empty, open, flat, or of an impossible size.
+    MeshError if it is absent, broken, empty, open, flat, or of an impossible size.
     """
     if not (isfinite(unit_mm) and unit_mm > 0):
         raise MeshError(f"--unit-mm is {unit_mm:g}; it must be a length above 0, such as 1000 for a file in metres")

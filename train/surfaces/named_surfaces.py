@@ -64,8 +64,7 @@ SURFACES: Final = LETTERS + SHAPES  # names of the 18 surfaces, nine on each pla
 def surface_mesh(name: str) -> trimesh.Trimesh:
     """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0.
 
-    Raises:
-        SurfaceError: no surface of that name.
+    SurfaceError if there is none of that name.
     """
     if name.startswith(MESH) and name != MESH:
         return load_mesh(*mesh_file(name))
@@ -86,8 +85,7 @@ def relief(name: str) -> Relief:
 def figure(name: str) -> BaseGeometry:
     """Return the outline in [mm] of one of SURFACES, centred on the origin, or of glyph:SEED or polygon:SEED.
 
-    Raises:
-        SurfaceError: no figure of that name.
+    SurfaceError if there is none of that name.
     """
     kind, _, seed = name.partition(":")
     if name in SURFACES:

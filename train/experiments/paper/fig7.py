@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall

@@ -28,7 +28,7 @@ from train.data.paper_taps import PaperTaps, between_frames, windows
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet
 from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
-from train.experiments.support.workbench import Figures, Method, Workbench
+from train.experiments.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances, apply_nuisances, read_windows

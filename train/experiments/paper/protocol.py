@@ -13,7 +13,7 @@ from edge.evaluation.test_set import FrozenSet, judge
 from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World
-from train.experiments.support.workbench import Figures, Method, Workbench, median_ms
+from train.experiments.workbench import Figures, Method, Workbench, median_ms
 from train.fit import given_taps
 from train.freeze import CLASSICAL_WINDOWS, fit_classical
 from train.learning.checkpoint import Training

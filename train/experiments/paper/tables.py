@@ -30,7 +30,7 @@ from train.experiments.paper.protocol import (
     seed_size,
     trained,
 )
-from train.experiments.support.workbench import Method, Workbench
+from train.experiments.workbench import Method, Workbench
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.interval_fit import half_width_mm

@@ -23,7 +23,7 @@ from train.data.press_batches import COUNTS_PER_UNIT, read_presses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses
-from train.experiments.support.workbench import Figures, Workbench
+from train.experiments.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE

@@ -31,7 +31,7 @@ from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.data.presses import load_presses
 from train.data.real_grips import Grip, loaded, neighbours_mean, recorded_grips, recordings_folder, z_of
 from train.data.world import World, solve_pad
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.freeze import SCALE, drawn
 from train.report import Report, Row, bootstrap_interval
 

@@ -27,7 +27,7 @@ from train.errors import CheckpointError
 from train.experiments.sensor.real import play
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
 from train.experiments.sensor.shipped import ALL, NOTHING, PushedSensor, known_pads
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.families.catalogue import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, bootstrap_interval, signed_interval
@@ -37,11 +37,7 @@ _MODELS: Final = ("stsr", "mtsr", "stsr-small")
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `trust-checks`.
-
-    Raises:
-        CheckpointError: a shipped model has no checks.
-    """
+    """Write the report `trust-checks`; CheckpointError if a shipped model has no checks."""
     model = bench.model()
     names = _MODELS[:2] if bench.quick else _MODELS
     models = [bench.model(f"{name}{INT8_SUFFIX}") for name in names]
