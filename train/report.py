@@ -89,16 +89,11 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     return float(low), float(high)
 
 
-def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:
-    """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3)."""
+def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2, sign: str = "") -> str:
+    """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3); `sign` "+" shows it."""
     low, high = bootstrap_interval(values, taps)
-    return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
-
-
-def signed_interval(values: NDArray[np.floating], taps: NDArray[np.integer]) -> str:
-    """Format the mean of (n,) differences with its sign and interval: +1.92 (+1.50..+2.31)."""
-    low, high = bootstrap_interval(values, taps)
-    return f"{float(np.mean(values)):+.2f} ({low:+.2f}..{high:+.2f})"
+    form = f"{sign}.{digits}f"
+    return f"{float(np.mean(values)):{form}} ({low:{form}}..{high:{form}})"
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:

@@ -80,7 +80,7 @@ def test_the_demo_is_made_as_the_bundled_one(tmp_path):
 @pytest.mark.night
 def test_the_command_makes_all_files_but_the_frozen_set_that_models_name(tmp_path):
     shutil.copy(BUNDLE_DIR / "frozen.npz", tmp_path)
-    make_press_set(64).save(tmp_path / "seen.npz")
+    make_press_set(600).save(tmp_path / "seen.npz")
     before = (tmp_path / "frozen.npz").stat()
     main([str(tmp_path), "--data", str(tmp_path / "seen.npz")])
     names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "seen", "taxels")]

@@ -10,8 +10,8 @@ from press_samples import make_press_set
 from edge.evaluation.metrics import psnr_db
 from train.data.frozen_presses import freeze_presses
 from train.data.presses import SEED
-from train.errors import CheckpointError
-from train.fit import given_taps, main
+from train.errors import CheckpointError, DatasetError
+from train.fit import bundled, given_taps, main
 from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import Recipe
@@ -141,6 +141,16 @@ def test_the_contact_level_is_the_one_that_overlaps_best():
 def test_windows_of_every_number_of_taps_are_drawn(taps):
     shares = given_taps(taps)
     assert len(shares) == taps and sum(shares) == pytest.approx(1) and min(shares) > 0
+
+
+def test_the_bundled_networks_need_presses_of_as_many_taps_as_they_take(data):
+    assert [(one.name, one.recipe.steps) for one in bundled(make_press_set(taps=7), 1000)] == [
+        *(("stsr", 10), ("stsr-small", 10), ("mtsr", 10)),
+    ]
+    with pytest.raises(DatasetError, match="at most 2 taps, the bundled networks take 7"):
+        bundled(data)
+    with pytest.raises(ValueError, match="--shorten is 0"):
+        bundled(make_press_set(taps=7), 0)
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import distributed, nn
@@ -267,14 +267,7 @@ def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
     return max(by_steps, float(by_time))
 
 
-class _Part(Protocol):
-    """Part of a run that has a state: network, optimizer, objective."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
-
-
-def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
+def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
     """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
     if not path.exists():
         return {"step": 0, "elapsed_s": 0.0, "course": []}
@@ -289,7 +282,7 @@ def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device
     return {"course": []} | state
 
 
-def _keep(path: Path, parts: Mapping[str, _Part], facts: Mapping[str, Any]) -> None:
+def _keep(path: Path, parts: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
     """Keep the state of a run on disk, so that an interruption costs at most a minute."""
     state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
     write_in_place(

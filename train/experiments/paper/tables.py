@@ -35,7 +35,7 @@ from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.interval_fit import half_width_mm
 from train.learning.training_loop import Recipe
-from train.report import Report, Row, signed_interval, with_interval
+from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 
 TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
@@ -89,7 +89,7 @@ def run_table3(bench: Workbench, folder: Path) -> Path:
         f"The networks of the paper were trained for a fixed time, here for so many epochs: {', '.join(epochs)}."
     )
     verdicts = [
-        f"- {better} over {worse} [dB]: {signed_interval(test_db[better] - test_db[worse], test.tap)}"
+        f"- {better} over {worse} [dB]: {with_interval(test_db[better] - test_db[worse], test.tap, sign='+')}"
         for better, worse in COMPARED
         if {better, worse} <= set(test_db)
     ]
@@ -144,7 +144,7 @@ def run_angle(bench: Workbench, folder: Path) -> Path:
         training = from_base(f"mtsr2-{angle_deg:g}-deg", 2, 1500)
         method = bench.network(training, by_angle(bench, angle_deg), validation)
         errors, found_db = judged(method, {"test": turned})
-        over: Row = {"over STSR dB": signed_interval(found_db - alone_db, test.tap)}
+        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
         rows.append({"network": "MTSR-2", "angle deg": angle_deg} | errors | over | method.cost | method.training)
     report = Report("angle", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -169,7 +169,7 @@ def run_taps(bench: Workbench, folder: Path) -> Path:
     for name, given in tracked(ways, "taps", "run"):
         method = methods[name]
         errors, found_db = judged(method, {"test": test}, given)
-        over: Row = {"over STSR dB": signed_interval(found_db - alone_db, test.tap)}
+        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
         rows.append({"network": name, "taps given": given} | errors | over | method.cost | method.training)
     report = Report("taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -214,7 +214,7 @@ def run_unseen(bench: Workbench, folder: Path) -> Path:
             row: Row = {"trained on": name, "tested on": tested, "taps": given}
             row |= error_cells(figures, frozen, "test")
             over_db = figures["psnr_db"] - alone_db.setdefault((tested, given), figures["psnr_db"])  # of the first
-            row["over the 15 dB"] = signed_interval(over_db, frozen.tap)
+            row["over the 15 dB"] = with_interval(over_db, frozen.tap, sign="+")
             row["covered %"] = with_interval(100 * figures["coverage_90"], frozen.tap, 1)
             row["width %"] = with_interval(width_percent.mean(axis=(1, 2)), frozen.tap, 1)
             rows.append(row | method.cost | method.training)

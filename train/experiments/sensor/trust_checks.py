@@ -30,7 +30,7 @@ from train.experiments.sensor.shipped import ALL, NOTHING, PushedSensor, known_p
 from train.experiments.workbench import Workbench
 from train.families.catalogue import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
-from train.report import Report, Row, bootstrap_interval, signed_interval
+from train.report import Report, Row, bootstrap_interval, with_interval
 
 JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
@@ -261,7 +261,7 @@ def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: Fr
         row[single.name] = round(float(alone_db.mean()), 2)
         for how, found_db in (("no guard", off_db), ("guard", on_db)):
             row[f"{name_of}, {how}"] = round(float(found_db.mean()), 2)
-            row[f"{how}, over one tap"] = signed_interval(found_db - alone_db, pads)
+            row[f"{how}, over one tap"] = with_interval(found_db - alone_db, pads, sign="+")
         losses.append(row)
     report.table(dropped, _DROPPED, "taps")
     report.table(losses, _GUARDED, "psnr")
