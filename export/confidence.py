@@ -17,8 +17,6 @@ from train.freeze import freeze
 from train.physics.sensor_noise import Nuisances
 
 BINS: Final = 10
-_SET_FORCES_N: Final = (5.0, 2.0, 1.0)
-"""Set forces of the taps, in [N]: as on the frozen test set, and lighter ones, which carry less information."""
 
 
 def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Collection[FrozenSet]) -> list[str]:
@@ -45,7 +43,8 @@ def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Coll
 
 def confidence_sets(validation: PaperTaps, scale: int) -> list[FrozenSet]:
     """Return the sets to fit confidence on, at a network's scale, from sequences that it was not trained on."""
-    return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in _SET_FORCES_N]
+    # As on the frozen test set, and lighter ones, which carry less information.
+    return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in (5.0, 2.0, 1.0)]
 
 
 def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
@@ -66,8 +65,7 @@ def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[
 def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
     """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
 
-    Raises:
-        ValueError: the model gives no deviation.
+    ValueError if the model gives no deviation.
     """
     rows, contract = [], model.contract
     for window, truth in zip(windows_of(frozen, contract, given), frozen.patterns(), strict=True):

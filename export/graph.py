@@ -28,7 +28,6 @@ from export.errors import ExportError
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.blocks import PatternNet
 
-OPSET: Final = 18
 _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
 """Argument of a network's forward for each input of its graph."""
 _TRACED: Final = 2  # windows with which a graph is traced: with one window, the tracer would take the size 1 as fixed
@@ -37,10 +36,7 @@ _TRACED: Final = 2  # windows with which a graph is traced: with one window, the
 def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
     """Return the network as a checked ONNX graph of any number of windows a run, without a contract.
 
-    The exporter folds batch normalisation into the convolutions before it.
-
-    Raises:
-        ExportError: torch returns no graph.
+    The exporter folds batch normalisation into the convolutions before it. ExportError if torch returns none.
     """
     example = torch.zeros(_TRACED, 3 * net.taps, pad.rows, pad.cols)
     free = {0: torch.export.Dim(ANY_BATCH)}
@@ -59,7 +55,7 @@ def to_model(net: PatternNet, pad: SensorGeometry = USPA44) -> onnx.ModelProto:
             net,
             kwargs={_ARGUMENTS[name]: given for name, given in inputs.items()},
             dynamo=True,
-            opset_version=OPSET,
+            opset_version=18,
             input_names=list(inputs),
             output_names=[OUTPUT_NAME, DEVIATION_NAME, TRACTION_NAME][: len(outputs(net, example))],
             dynamic_shapes={_ARGUMENTS[name]: shape for name, shape in dims.items()},

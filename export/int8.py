@@ -35,33 +35,22 @@ from train.data.presses import PressSet
 from train.learning.checkpoint import batches_of
 from train.learning.training_loop import Recipe
 
-_PERCENTILE: Final = 99.999
-"""Percentage of a layer's values within its range; larger values are cut.
-
-With the whole range the bundled models lose .03 to .07 dB more, because a few large values make all steps coarser.
-"""
-_CALIBRATED_ON: Final = 512
 _FEWEST: Final = 32
 PASSING_ON: Final = {"Relu": any, "Add": any, "Concat": all}
 """Operations that are quantised if any or all of their inputs are."""
-_COMPARING: Final = ("compare", "answer")
-"""Layers of a FusionNet that compare taps: in int8 they made a pattern 2.9 times its largest value too large on windows
-beyond any touch. In float int8 saturates there, for 5 % of the run time with four taps."""
-_RESHAPING: Final = {"Reshape", "Transpose", "Concat"}
 
 
 def calibration_batch(taps: PressSet, contract: Contract) -> Batch:
     """Draw windows with their pad inputs from training taps as in training, light contacts included.
 
-    Raises:
-        ExportError: there are too few sequences for meaningful ranges.
+    ExportError if there are too few sequences.
     """
     if len(taps) < _FEWEST:
         raise ExportError(f"{len(taps)} sequences to take ranges of, expected {_FEWEST} or more")
     given = (1 / contract.taps,) * contract.taps
     if contract.takes_poses:  # its batches have one number of taps each: all, of which some are left out below
         given = (*[0.0] * (contract.taps - 1), 1.0)
-    recipe = Recipe(1, batch=min(len(taps), _CALIBRATED_ON), given=given)
+    recipe = Recipe(1, batch=min(len(taps), 512), given=given)
     batch = batches_of(taps, contract.scale, recipe, 0, posed=contract.takes_poses)(0)
     if contract.takes_poses:
         there = torch.arange(contract.taps) <= torch.arange(len(batch.window))[:, None] % contract.taps
@@ -81,10 +70,7 @@ class _Inputs(CalibrationDataReader):
 def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
     """Return a float graph with quantise and dequantise nodes around all nodes that may be quantised.
 
-    Ranges are measured on the batch `seen`, light contacts included.
-
-    Raises:
-        ExportError: no node of the graph may be quantised.
+    Ranges are measured on the batch `seen`, light contacts included. ExportError if no node may be quantised.
     """
     nodes = integer_nodes(model)
     if not nodes:
@@ -102,7 +88,9 @@ def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
             op_types_to_quantize=["Conv", *PASSING_ON],
             nodes_to_quantize=nodes,
             calibrate_method=CalibrationMethod.Percentile,
-            extra_options={"CalibPercentile": _PERCENTILE},
+            # Larger values are cut: with the whole range the bundled models lose .03 to .07 dB more, because a few
+            # large values make all steps coarser.
+            extra_options={"CalibPercentile": 99.999},
         )
         integers = onnx.load(path)
     onnx.checker.check_model(integers, full_check=True)
@@ -162,7 +150,9 @@ def integer_nodes(model: onnx.ModelProto) -> list[str]:
         windows = _runs(shapes, convs[0])  # the newest taps enter first, one a window
         costly |= {node.name for node in convs if _runs(shapes, node) != windows}
         kept |= _first_convolutions(model) | {node.name for node in convs if _reads_logarithms(node, made_by)}
-        kept |= {node.name for node in convs if node.input[1].partition(".")[0] in _COMPARING}
+        # What compares taps made a pattern in int8 2.9 times its largest value too large on windows beyond any touch.
+        # In float int8 saturates there, for 5 % of the run time with four taps.
+        kept |= {node.name for node in convs if node.input[1].partition(".")[0] in ("compare", "answer")}
     chosen = {node.name for node in convs if node.name in costly - kept}
     for node in model.graph.node:  # every node comes after those of its inputs
         takes = [made_by[name].name for name in node.input if name in made_by]
@@ -202,7 +192,8 @@ def _reads_logarithms(node: NodeProto, made_by: dict[str, NodeProto]) -> bool:
     """Return True if some input of a node is a logarithm, perhaps reshaped."""
     before = [made_by[name] for name in node.input if name in made_by]
     return any(
-        one.op_type == "Log" or (one.op_type in _RESHAPING and _reads_logarithms(one, made_by)) for one in before
+        one.op_type == "Log" or (one.op_type in ("Reshape", "Transpose", "Concat") and _reads_logarithms(one, made_by))
+        for one in before
     )
 
 

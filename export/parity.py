@@ -44,21 +44,8 @@ seed-size ones 2e-6.
 """
 EXTREME_TOLERANCE: Final = 5e-5
 """Largest accepted difference on extreme windows; measured: 3e-5 in a deviation at the full range, patterns 8e-6."""
-DEVIATION_TOLERANCE: Final = 1e-3
-"""Largest accepted difference in a deviation.
-
-A pixel at the contact level lies inside or outside by its last bit; that moves the regions around it, and with their
-sizes the factors of the whole window: measured .0002.
-"""
-FULL_TRACTION_KPA: Final = 100.0
-"""Traction of 40 N evenly on the pad, in [kPa]: differences of smaller tractions are relative to it."""
 FULL_RANGE_COUNTS: Final = 32768
 """Largest distance of a zeroed reading from rest: `firmware_bridge.zeroing.baseline.deformation` wraps around."""
-_DENORMAL_BITS: Final = 0x000116C2
-"""Bits of 1e-40 in float32: written as a number it would be zero wherever a program has set denormals to zero."""
-PARITY_WINDOWS: Final = 100
-"""Approximate number of frozen readings in the parity check; readings have no scale, so they fit every network."""
-_AT_ONCE: Final = 256  # windows of one run of a network
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +105,7 @@ class GraphRun:
 
 def run_network(net: PatternNet, *given: NDArray[np.float32] | None) -> list[NDArray[np.float32]]:
     """Return each output of a network for windows, pads and poses, as a `GraphRun` does of its graph."""
-    parts = [None if one is None else torch.from_numpy(one).split(_AT_ONCE) for one in given]
+    parts = [None if one is None else torch.from_numpy(one).split(256) for one in given]
     count = max(len(part) for part in parts if part is not None)
     runs = [outputs(net, *part) for part in zip(*(part or [None] * count for part in parts), strict=True)]
     return [torch.cat(maps).numpy() for maps in zip(*runs, strict=True)]
@@ -132,8 +119,7 @@ def differences(
 ) -> list[Difference]:
     """Return the differences between outputs, each (n, ...), relative to values in the output's own unit.
 
-    Raises:
-        ParityError: number or shapes of the outputs differ, or a value is not finite.
+    ParityError if shapes differ, or a value is not finite.
     """
     shapes = [[maps.shape for maps in given] for given in (expected, got)]
     if shapes[0] != shapes[1]:
@@ -146,7 +132,8 @@ def differences(
         if not np.isfinite(mine).all():
             raise ParityError(f"the {name} is not finite")
         same_unit = [size for other, size in sizes.items() if (other == TRACTION_NAME) == (name == TRACTION_NAME)]
-        unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: FULL_TRACTION_KPA}.get(name, 0.0)
+        # Differences of small tractions are relative to that of 40 N evenly on the pad, in [kPa].
+        unit = {OUTPUT_NAME: full_scale, TRACTION_NAME: 100.0}.get(name, 0.0)
         apart = np.abs(mine - true).reshape(len(true), -1)
         # Around a pixel that changes regions a deviation is another one: one pixel in ten may be so.
         apart = np.quantile(apart, 0.9, axis=1, method="higher") if name == DEVIATION_NAME else apart.max(axis=1)
@@ -157,7 +144,9 @@ def differences(
 
 def accepted(output: str, tolerance: float) -> float:
     """Return the largest accepted difference in an output, where it is `tolerance` in a pattern."""
-    return max(tolerance, DEVIATION_TOLERANCE) if output == DEVIATION_NAME else tolerance
+    # A pixel at the contact level lies inside or outside by its last bit; that moves the regions around it, and with
+    # their sizes the factors of the deviations in the whole window: measured .0002.
+    return max(tolerance, 1e-3) if output == DEVIATION_NAME else tolerance
 
 
 def example_pads(count: int, width: int) -> NDArray[np.float32]:
@@ -189,8 +178,7 @@ def example_poses(count: int, contract: Contract) -> NDArray[np.float32]:
 def check_parity(net: PatternNet, model: onnx.ModelProto, frozen: FrozenSet, contract: Contract) -> float:
     """Return the largest relative difference between torch and a float32 graph, on readings and extreme windows.
 
-    Raises:
-        ParityError: it is larger than TOLERANCE or EXTREME_TOLERANCE, or a value is not finite.
+    ParityError if it is too large, or a value is not finite.
     """
     run = GraphRun(model)
     largest = 0.0
@@ -212,7 +200,7 @@ def check_parity(net: PatternNet, model: onnx.ModelProto, frozen: FrozenSet, con
     return largest
 
 
-def read_windows(frozen: FrozenSet, contract: Contract, count: int | None = PARITY_WINDOWS) -> NDArray[np.float32]:
+def read_windows(frozen: FrozenSet, contract: Contract, count: int | None = 100) -> NDArray[np.float32]:
     """Return about `count` readings of the frozen set, of all forces, or all: (n, 3K, rows, cols) in network units."""
     # Odd, because an even step could always select the same frame of a tap.
     step = 1 if count is None else max(1, len(frozen) // count) | 1
@@ -248,4 +236,5 @@ def extreme_windows(contract: Contract) -> Mapping[str, NDArray[np.float32]]:
         name: contract.scale_window(window).reshape(1, -1, contract.rows, contract.cols)
         for name, window in counts.items()
     }
-    return windows | {"denormals": np.full(windows["zeros"].shape, _DENORMAL_BITS, dtype=np.uint32).view(np.float32)}
+    # Bits of 1e-40: written as a number it would be zero wherever a program has set denormals to zero.
+    return windows | {"denormals": np.full(windows["zeros"].shape, 0x000116C2, dtype=np.uint32).view(np.float32)}

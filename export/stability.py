@@ -46,16 +46,11 @@ WIDE: Final = 24  # factor of a grid whose copies are farther away than any thic
 INT8_PRESS, INT8_BEYOND = 0.25, 1.05
 """Largest difference of int8 from float32 in any pixel, as a share of the largest value in float32: on presses, as
 `export.verify` has it, and on windows beyond any touch, where int8 saturates and the runtime believes no pattern."""
-SAME: Final = 1e-5
-"""Largest difference by threads and windows of one call, as a share. Beyond any touch a last bit may move int8 by whole
-steps."""
 TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
 NO_TOUCH: Final = ("zeros", "denormals", "a count in one taxel", "press x 1e-06")
-QUIET: Final = 1e-3  # the difference of int8 where nothing touches, as a share of full scale
 MOST_MM: Final = 5.0  # bound of a pattern and its deviation in a record: the pad is 4.5 mm thick
 THREADS: Final = 4
 TOGETHER: Final = 16
-REST: Final = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None]
 LARGEST: Final = 65_535
 PRESS: Final = 3000
 FREE_SCANS, TOUCHED_SCANS, KEPT_SCANS = 30, 40, 10
@@ -223,7 +218,8 @@ def _graph(
     spread = float(np.abs(several.run(window) - pattern).max())
     together = one.run_together([window] * TOGETHER)
     spread = max(spread, float(np.abs(together - pattern).max()))
-    most = SAME if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
+    # Beyond any touch a last bit may move int8 by whole steps.
+    most = 1e-5 if touch or one.contract.arithmetic == "float32" else INT8_BEYOND
     what = f"{THREADS} threads and {TOGETHER} windows, to one"
     yield Case(name, what, spread / max(size, full_scale), most, model=one.name)
     if peer is not None and (touch or extreme):
@@ -231,7 +227,7 @@ def _graph(
         apart, largest_float = float(np.abs(in_float - pattern).max()), float(np.abs(in_float).max())
         share, most = apart / max(largest_float, full_scale), INT8_PRESS if touch else INT8_BEYOND
         if name in NO_TOUCH:
-            share, most = apart / full_scale, QUIET
+            share, most = apart / full_scale, 1e-3
         yield Case(name, "int8 to float32", share, most, model=one.name)
 
 
@@ -292,7 +288,8 @@ def resting(name: str, model: ModelSession, rest: int) -> Case:
 
 
 def _free(count: int) -> NDArray[np.int32]:
-    return np.broadcast_to(REST, (count, *USPA44.scan_shape)) + (np.arange(count) % 2)[:, None, None, None]
+    rest = np.array([16_000, 16_400, 38_600], dtype=np.int32)[:, None, None]
+    return np.broadcast_to(rest, (count, *USPA44.scan_shape)) + (np.arange(count) % 2)[:, None, None, None]
 
 
 def _pressed_raw(counts: int) -> NDArray[np.int32]:
@@ -317,10 +314,10 @@ def worst(cases: list[Case]) -> list[Case]:
     return kept
 
 
-def run(folder: Path) -> list[Case]:
+def run(folder: Path, parts: Mapping[str, Callable[[], Iterator[Case]]] = PARTS) -> list[Case]:
     """Write the report `stability`, and return the rows that are broken."""
     report = Report("stability", folder, __file__, [find_model(path.stem) for path in bundled_models()])
-    cases = {part: list(work()) for part, work in tracked(PARTS.items(), "stability", "part")}
+    cases = {part: list(work()) for part, work in tracked(parts.items(), "stability", "part")}
     every = [case for same in cases.values() for case in same]
     broken = [case for case in every if not case.holds]
     report.say(

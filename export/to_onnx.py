@@ -49,7 +49,6 @@ from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 from train.trust import load_trust
 
-OUTPUT_UNIT: Final = "mm"
 MOST_LOSS_DB: Final = 0.1  # largest accepted loss by int8 on the frozen test set, in [dB]
 _COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interval's coverage by int8
@@ -59,8 +58,7 @@ _UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
     """Return the contract of a network's graph for the pad of the test set, with its error still empty.
 
-    Raises:
-        CheckpointError: the report of the weights lacks a key; the error names it.
+    CheckpointError if the report of the weights lacks a key.
     """
     pad = pad_of(*frozen.newest.shape[-2:])
     example = torch.zeros(1, 3 * net.taps, pad.rows, pad.cols)
@@ -77,7 +75,7 @@ def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> C
         tap_order=TAP_ORDER,
         angle_step_deg=ANGLE_STEP_DEG,
         counts_per_unit=COUNTS_PER_UNIT,
-        output_unit=OUTPUT_UNIT,
+        output_unit="mm",
         output_full_scale=frozen.full_scale_mm,
         contact_level=contact_level,
         sensor=pad.name,
@@ -107,6 +105,7 @@ class IntervalData:
     validation: PressSet
     training: PressSet | None = None
     sensor: OneSensor | None = None  # that reads them, instead of any
+    steps: int = 2000  # of the fit
 
     def conformed(self, net: CompactNet, run: Run) -> dict[str, list[float]]:
         """Shift a corrected network's deviations until they hold for `run`, and return its levels; see `conform`."""
@@ -140,7 +139,7 @@ def export(
         if intervals.training is None:
             net.add_intervals().contact_level.fill_(contract.contact_level)
         else:
-            fit_correction(net, intervals.training, contract.contact_level)
+            fit_correction(net, intervals.training, contract.contact_level, steps=intervals.steps)
         levels = intervals.conformed(net, lambda *given: run_network(net, *given))
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
@@ -154,8 +153,8 @@ def export(
         integer, convs = convolutions(model)
         float_error = _error(in_float, contract, frozen)
         contract = replace(contract, arithmetic="int8")
-        cost = _cost(float_error, _error(model, contract, frozen))
-        facts = [f"{integer} of {convs} convolutions in int8", *cost]
+        lost = cost(float_error, _error(model, contract, frozen))
+        facts = [f"{integer} of {convs} convolutions in int8", *lost]
 
     session = _session(model, contract)
     facts = [*judge_in_contract(session, frozen, validation), *facts]
@@ -190,7 +189,7 @@ def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, st
     return model.SerializeToString(deterministic=True)
 
 
-def _cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
+def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
     """Return the loss by int8 as text, with each exceeded limit; nothing without errors on the test set."""
     if not in_float:
         return []
@@ -235,7 +234,7 @@ def main(arguments: list[str] | None = None) -> None:
             presses = load_presses(options.validation)
             validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
             training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
-            intervals = IntervalData(presses, training, sensor)
+            intervals = IntervalData(presses, training, sensor=sensor)
         trust = None if options.trust is None else load_trust(options.trust, presses)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line = export(
@@ -253,7 +252,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(f"export: {error}")
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
-    costly = {line.partition(":")[0]: [cost for cost in (_COSTLY, _UNSURE) if cost in line] for line in lines}
+    costly = {line.partition(":")[0]: [one for one in (_COSTLY, _UNSURE) if one in line] for line in lines}
     lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")

@@ -10,7 +10,7 @@ quantised. That network is restored from the float32 graph's own weights.
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,7 +27,7 @@ from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import tracked
 from export.errors import ExportError, ParityError
 from export.parity import (
     EXTREME_TOLERANCE,
@@ -56,7 +56,6 @@ Beyond any touch int8 saturates: it is off by the value itself, and the runtime 
 """
 FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "one tap", "recordings")
-PASSES: Final = 1 + len(LEVELS)  # passes over all windows of a model: by torch, and at each level
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,14 +80,8 @@ class Parity:
 COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR change dB", "bound")
 
 
-def verify(
-    path: Path,
-    frozen: FrozenSet,
-    recordings: Path | None = None,
-    *,
-    on_pass: Callable[[], object] = lambda: None,
-) -> Iterator[Parity]:
-    """Compare one model with its network at every level, on every kind of windows; `on_pass` is called PASSES times.
+def verify(path: Path, frozen: FrozenSet, recordings: Path | None = None) -> Iterator[Parity]:
+    """Compare one model with its network at every level, on every kind of windows.
 
     The network is restored from NAME.onnx, that of NAME-int8.onnx too.
     A model of another scale than the test set's is compared with its network, but not evaluated.
@@ -110,20 +103,17 @@ def verify(
         groups["one tap"] = groups["test set"][:, : len(AXES)]
     groups |= extreme_windows(contract)
     expected = {name: run_network(net, windows) for name, windows in groups.items()}
-    on_pass()
     truth = frozen.patterns() if contract.scale == frozen.scale else None
-    for level in LEVELS:
+    for level in tracked(LEVELS, path.stem, "level"):
         run = GraphRun(model, level)
         for name, windows in groups.items():
             found, change_db, broken = (), None, ""
             try:
-                found, change_db, broken = _judge(
-                    name, contract, expected[name], run(windows), truth if name == "test set" else None
-                )
+                true = truth if name == "test set" else None
+                found, change_db, broken = judged(name, contract, expected[name], run(windows), true)
             except ParityError as error:
                 broken = str(error)
             yield Parity(path.stem, level, name, found, change_db, broken)
-        on_pass()
 
 
 def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
@@ -140,7 +130,7 @@ def recorded_windows(folder: Path, contract: Contract) -> NDArray[np.float32]:
     return joined.reshape(len(joined), -1, contract.rows, contract.cols)
 
 
-def _judge(
+def judged(
     windows: str,
     contract: Contract,
     expected: list[NDArray[np.float32]],
@@ -225,10 +215,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         frozen = load_frozen_set(FROZEN)
-        with Progress("verifying", len(options.models) * PASSES, "pass") as bar:
-            rows = [
-                row for path in options.models for row in verify(path, frozen, options.recordings, on_pass=bar.advance)
-            ]
+        rows = [row for path in options.models for row in verify(path, frozen, options.recordings)]
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")
     sys.stdout.write(table(rows) + "\n")

@@ -42,9 +42,6 @@ REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
 MAGNET_FRAMES, MAGNET_ALONE_FRAMES = 80, 30
 """Frames in which the magnet comes near, and in which it leaves, and for which it stays before the pad is tapped."""
-MAGNET_MM: Final = (150.0, 45.0)  # distance at which it begins and ends, and at which it stays, in [mm]
-MAGNET_COUNTS: Final = 900.0  # its largest count there, of any taxel and axis: half of that of the tap
-_REST_COUNTS: Final = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
 _TOWARDS: Final = (0.5, -0.3, 0.8)
 _MOMENT: Final = (-0.3, -0.8, 0.5)
 FOREIGN_SCENE, MAGNET_SCENE, SLIDE_SCENE = 0, 1, 2
@@ -54,11 +51,9 @@ OPTIONS_MM: Final = HALF_PITCH_MM * np.array(
 """Places of the options in the first tap's axes: each tap may be proposed half a pitch from the one before."""
 LETTER_WIDTH_MM, LETTER_Y_MM, LETTER_PX_PER_MM = 14.0, 60.0, 4.0
 """Width of the long letter, which one lane of the pad covers, and its place in the object's plane, beside the taps."""
-SPEED_MM_S: Final = 20.0
 FIGURE_MM: Final = 50.0  # longest side of the long letter
 HALF_LENGTH_MM: Final = 30.0
 _RASTER_MM: Final = 0.05
-_DRAG_MM: Final = 0.3  # movement of the object against the pad's face that friction carries while it slides, in [mm]
 _INDENTATION_MM: Final = (0.15, 0.4)
 _AT_ONCE: Final = 50
 _SENSOR: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
@@ -84,7 +79,8 @@ def demo_recording() -> dict[str, NDArray]:
     magnet[MAGNET_FRAMES + MAGNET_ALONE_FRAMES :][:TAP_FRAMES] += later[2]
     rng = np.random.default_rng([SEED, 2])
     still = _noise(rng, REST_FRAMES).round()
-    rest = (_REST_COUNTS + rng.standard_normal(USPA44.scan_shape) * 300.0).astype(np.float32).round()
+    level = np.array([32700.0, 32800.0, 37400.0])[:, None, None]
+    rest = (level + rng.standard_normal(USPA44.scan_shape) * 300.0).astype(np.float32).round()
     magnet += _noise(rng, len(magnet))
     slid, way, letter = _slide(pad)
     after = _noise(rng, STILL_FRAMES).round()
@@ -180,7 +176,7 @@ def _slide(pad: GrippedPad) -> tuple[NDArray[np.float32], NDArray[np.float64], N
     outline = affinity.translate(affinity.scale(outline, factor, factor, origin=(x_mm, y_mm)), -x_mm, -y_mm)
 
     rng = np.random.default_rng([500, 18])
-    length = round(2 * HALF_LENGTH_MM / SPEED_MM_S * RATE_HZ)
+    length = round(2 * HALF_LENGTH_MM / 20.0 * RATE_HZ)  # 20 mm/s
     friction, turn_deg = rng.uniform(0.2, 0.8), float(rng.uniform(-10, 10))
     place = np.stack([np.linspace(-HALF_LENGTH_MM, HALF_LENGTH_MM, length)] + [np.zeros(length)] * 2, axis=1)
     place[:, 2] = turn_deg
@@ -219,7 +215,8 @@ def _pressed(
         meets = np.flatnonzero((heights > -FIGURE_HEIGHT_MM / 2).any(axis=(1, 2)))
         if len(meets):
             turn = np.radians(place[start + meets, 2])
-            drag = -_DRAG_MM * np.stack([np.cos(turn), -np.sin(turn)], axis=1)  # in the pad's axes
+            # Movement in [mm] against the pad's face that friction carries, in the pad's axes.
+            drag = -0.3 * np.stack([np.cos(turn), -np.sin(turn)], axis=1)
             still, even, bare = np.zeros(len(meets)), np.full(len(meets), friction), [BARE] * len(meets)
             pressed = pad.press(heights[meets], deep_mm[start + meets], drag, still, even, bare)
             counts[start + meets] = pressed.counts
@@ -248,7 +245,7 @@ def _read(taps: Taps, angles_deg: Sequence[float]) -> NDArray[np.float32]:
 
 def _magnet() -> NDArray[np.float32]:
     """Return the counts (n, 3, rows, cols) that a magnet adds that comes near, stays for a tap, and leaves."""
-    far, near = MAGNET_MM
+    far, near = 150.0, 45.0  # distance at which it begins and ends, and at which it stays, in [mm]
     coming = np.linspace(0, 1, MAGNET_FRAMES)
     course = np.concatenate([coming, np.ones(MAGNET_ALONE_FRAMES + TAP_FRAMES), coming[::-1], np.zeros(GAP_FRAMES)])
     distance_mm = (far + (near - far) * course)[:, None, None]
@@ -259,4 +256,5 @@ def _magnet() -> NDArray[np.float32]:
     field_mt = dipole_mt(Magnet(), (chip_x_mm - x_mm, chip_y_mm - y_mm, -z_mm), (east, south, up))
     field = np.stack(np.broadcast_arrays(*field_mt), axis=1)
     field -= field[-1]
-    return (field * (MAGNET_COUNTS / np.abs(field).max())).astype(np.float32)
+    # The largest count of any taxel and axis is half of that of the tap.
+    return (field * (900.0 / np.abs(field).max())).astype(np.float32)

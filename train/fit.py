@@ -55,11 +55,10 @@ def given_taps(taps: int) -> tuple[float, ...]:
     return (0.3, *[0.25 / (taps - 2)] * (taps - 2), 0.45)
 
 
-def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int = 1) -> None:
-    """Train the bundled networks on; `shorten` divides their steps, for tests.
+def bundled(data: PressSet, shorten: int = 1) -> list[Training]:
+    """Return the trainings of the bundled networks; `shorten` divides their steps, for tests.
 
-    Raises:
-        DatasetError: no sequence has as many taps as a network takes.
+    DatasetError if no sequence has as many taps as they take.
     """
     most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
     if most < needed:  # before hours of training of those that come first
@@ -67,12 +66,9 @@ def fit_bundled(data: PressSet, validation: PressSet, folder: Path, shorten: int
             f"the presses have at most {most} taps, the bundled networks take {needed}: add data/taps7.npz, or train "
             "one network with --network"
         )
-    frozen = freeze_presses(validation, SEED).as_frozen_set()
     if shorten < 1:
         raise ValueError(f"--shorten is {shorten}, expected 1 or more")
-    for training in BUNDLED:
-        recipe = replace(training.recipe, steps=max(training.recipe.steps // shorten, 1))
-        _say(_line(fit_network(replace(training, recipe=recipe), data, frozen, folder)))
+    return [replace(one, recipe=replace(one.recipe, steps=max(one.recipe.steps // shorten, 1))) for one in BUNDLED]
 
 
 def _line(report: dict[str, Any]) -> str:
@@ -96,16 +92,14 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         data = join_presses([*map(load_presses, options.data)])
         validation = None if options.validation is None else load_presses(options.validation)
-        if options.network is None:
-            if validation is None:
-                raise ValueError("the bundled networks are calibrated on presses: give --validation")
-            fit_bundled(data, validation, options.folder, options.shorten)
+        if options.network is None and validation is None:
+            raise ValueError("the bundled networks are calibrated on presses: give --validation")
+        trainings = bundled(data, options.shorten) if options.network is None else [_training(options)]
+        if validation is None:
+            frozen = freeze(paper_taps("validation"), Nuisances(), SEED, scale=options.scale)
         else:
-            training = _training(options)
-            if validation is None:
-                frozen = freeze(paper_taps("validation"), Nuisances(), SEED, scale=training.scale)
-            else:
-                frozen = freeze_presses(validation, SEED).as_frozen_set()
+            frozen = freeze_presses(validation, SEED).as_frozen_set()
+        for training in trainings:
             _say(_line(fit_network(training, data, frozen, options.folder)))
     except (TrainError, ValueError) as error:
         sys.exit(f"fit: {error}")

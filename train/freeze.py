@@ -39,11 +39,6 @@ KINDS: Final = 16
 
 More kinds reduce it on figures, but not on contacts that vary little over the pad.
 """
-_PASSES: Final = 10
-_PARTS: Final = 40  # parts in which scans are weighed, to use less than a gigabyte
-_LEAST_COUNTS: Final = 20.0  # least RMS of a reading, below which noise would be scaled up, in [counts]
-_FELT: Final = 0.5
-_STRONG: Final = 0.9
 FIRST_FRAME: Final = 6
 """Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
 
@@ -99,16 +94,18 @@ def fit_kinds(readings: NDArray[np.floating], kinds: int = KINDS) -> NDArray[np.
     much as the strongest ones.
     """
     flat = readings.reshape(len(readings), -1).astype(np.float64)
-    flat /= np.maximum(np.sqrt(np.square(flat).mean(axis=1, keepdims=True)), _LEAST_COUNTS)
+    # Below 20 counts noise would be scaled up.
+    flat /= np.maximum(np.sqrt(np.square(flat).mean(axis=1, keepdims=True)), 20.0)
     z = np.abs(flat[:, -readings.shape[2] * readings.shape[3] :])
-    felt = (z / np.quantile(z, _STRONG, axis=1, keepdims=True) > _FELT).mean(axis=1) + z.mean(axis=1) / 1e3
+    felt = (z / np.quantile(z, 0.9, axis=1, keepdims=True) > 0.5).mean(axis=1) + z.mean(axis=1) / 1e3
     weight = np.eye(kinds)[felt.argsort().argsort() * kinds // len(flat)]
     covariances = np.empty((kinds, flat.shape[1], flat.shape[1]), dtype=np.float64)
-    for _ in range(_PASSES):
+    for _ in range(10):
         for kind, share in enumerate(weight.T):
             covariances[kind] = (flat * share[:, None]).T @ flat / share.sum()
         found = Kinds(ridged(covariances))
-        weight = np.concatenate([found.weigh(part) for part in np.array_split(flat, _PARTS)])
+        # In parts, to use less than a gigabyte.
+        weight = np.concatenate([found.weigh(part) for part in np.array_split(flat, 40)])
     return covariances.astype(np.float32)
 
 

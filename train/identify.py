@@ -12,7 +12,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +29,11 @@ from train.errors import DatasetError, TrainError
 from train.learning.contact_mixture import CONSTANTS, learned, normalise
 from train.physics.pad_draws import RANGES
 
-_APART: Final = 0.1
-"""Least difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
-
 
 def recorded_contacts(folder: Path) -> dict[str, NDArray[np.float32]]:
     """Return the distinct contacts (n, 3, rows, cols) of each sensor.
 
-    Raises:
-        DatasetError: the folder has no recordings, or one cannot be read.
+    DatasetError if there are none, or one cannot be read.
     """
     if not recording_paths(folder):
         raise DatasetError(f"{folder} holds no recordings: expected a folder of TRIAL/xela_SENSOR.csv")
@@ -55,7 +50,8 @@ def distinct(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     kept: list[int] = []
     for number, contact in enumerate(contacts):
         away = contacts[kept] - contact
-        if not kept or np.sqrt((away**2).mean(axis=1)).min() > _APART:
+        # A tenth of the RMS of z is five times the effect of noise and drift.
+        if not kept or np.sqrt((away**2).mean(axis=1)).min() > 0.1:
             kept.append(number)
     return counts[kept]
 

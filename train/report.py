@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,8 +17,6 @@ from train.data.presses import SEED
 
 Cell = str | int | float | None
 Row = dict[str, Cell]
-
-_RESAMPLES: Final = 2000
 
 
 class Report:
@@ -86,22 +83,17 @@ def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], 
     order, start = np.unique(taps, return_inverse=True)
     sums = np.bincount(start, weights=values, minlength=len(order))
     counts = np.bincount(start, minlength=len(order))
-    drawn = np.random.default_rng(seed).integers(len(order), size=(_RESAMPLES, len(order)))
+    drawn = np.random.default_rng(seed).integers(len(order), size=(2000, len(order)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
     return float(low), float(high)
 
 
-def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2) -> str:
-    """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3)."""
+def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digits: int = 2, sign: str = "") -> str:
+    """Format the mean of (n,) values with its interval, as tables show it: 35.92 (35.5..36.3); `sign` "+" shows it."""
     low, high = bootstrap_interval(values, taps)
-    return f"{float(np.mean(values)):.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
-
-
-def signed_interval(values: NDArray[np.floating], taps: NDArray[np.integer]) -> str:
-    """Format the mean of (n,) differences with its sign and interval: +1.92 (+1.50..+2.31)."""
-    low, high = bootstrap_interval(values, taps)
-    return f"{float(np.mean(values)):+.2f} ({low:+.2f}..{high:+.2f})"
+    form = f"{sign}.{digits}f"
+    return f"{float(np.mean(values)):{form}} ({low:{form}}..{high:{form}})"
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:

@@ -39,9 +39,7 @@ def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
     """Return the forward model and checks of a file of this command, or those of NAME.onnx with their limits.
 
     Limits of the file's are set by `validation`, presses of several taps on pads of their own.
-
-    Raises:
-        CheckpointError: absent or damaged, or without presses to set limits by.
+    CheckpointError if it is absent, damaged, or without presses to set limits by.
     """
     try:
         if path.suffix == ".onnx":
@@ -70,8 +68,7 @@ def _trust_of(model: onnx.ModelProto) -> Trust:
 def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
     """Fit forward model, check of contacts, and check of earlier taps by their poses; limits come at export.
 
-    Raises:
-        DatasetError: no sequence has several taps.
+    DatasetError if no sequence has several taps.
     """
     several = presses.pick(np.flatnonzero(presses.counts.any(axis=(2, 3, 4)).sum(axis=1) > 1))
     if not len(several):

@@ -1,4 +1,3 @@
-import csv
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +20,10 @@ from train.experiments.paper.force import (
     course_errors,
     loop_percent,
     pressed,
-    run_recovery,
     training_presses,
 )
-from train.experiments.paper.protocol import classical_methods, mixed
-from train.experiments.support.workbench import Method
+from train.experiments.paper.protocol import mixed
+from train.experiments.workbench import Method
 from train.physics.sensor_noise import NAMES, Nuisances
 
 
@@ -44,19 +42,6 @@ def scans(sequences):
     return force.scans_between(sequences, (0.2, 0.4), 3, [1])
 
 
-@pytest.mark.night
-def test_the_report_has_every_range_and_method(bench, tmp_path):
-    page = force.run_force(bench, tmp_path)
-    with page.with_suffix(".csv").open() as file:
-        rows = list(csv.DictReader(file))
-    columns = {"PSNR dB", "SSIM", "SSIM at own scale", "relative error %", "parameters", "MMAC", "run time ms"}
-    assert set(rows[0]) >= columns
-    assert {row["model"] for row in rows} == {"stsr", "mtsr2", "mtsr4", "linear map", "bilinear"}
-    assert len(rows) == 5 * len({row["force N"] for row in rows})
-    assert rows[0]["force N"] == "0.1..0.2"
-    assert all(int(row["taps"]) <= int(row["scans"]) for row in rows)
-
-
 def test_forces_lie_within_their_range(sequences, scans):
     # Contacts are flat: force is proportional to the pattern, and the whole press' force and pattern are given.
     whole = sequences.patterns_at(scans.tap, np.ones(len(scans.tap))).sum(axis=(1, 2))
@@ -65,22 +50,9 @@ def test_forces_lie_within_their_range(sequences, scans):
     assert (force_n < 0.4 * 1.001).all()
     assert np.ptp(force_n) > 0.1
     assert np.bincount(scans.tap, minlength=len(sequences)).tolist() == [3] * len(sequences)
-
-
-def test_the_newest_tap_is_light_and_the_earlier_ones_have_come_to_their_ends(scans):
     z = scans.windows[:, :, 2].sum(axis=(-2, -1))
-    assert (z[:, 1:].min(axis=1) > 4000).all()  # 5 N at 1400 counts a newton
+    assert (z[:, 1:].min(axis=1) > 4000).all(), "earlier taps have come to their ends: 5 N at 1400 counts a newton"
     assert (z[:, 0] < 3000).all()
-
-
-def test_a_press_that_ends_before_is_left_out(sequences):
-    highest_n = sequences.force_n[:, 0, -1]
-    middle_n = float(np.median(highest_n))
-    found = force.scans_between(sequences, (middle_n, middle_n * 1.001), 2, [1])
-    able = np.flatnonzero(highest_n >= middle_n * 1.001)
-    assert set(able) <= set(found.tap)
-    assert 0 < len(np.unique(found.tap)) < len(sequences)
-    assert force.scans_between(sequences, (50.0, 60.0), 2, [1]) is None
 
 
 def test_a_relative_error_is_that_of_the_scale_and_the_truth_has_none(scans):
@@ -90,33 +62,12 @@ def test_a_relative_error_is_that_of_the_scale_and_the_truth_has_none(scans):
     found = force.errors(_giving(scans.patterns), scans)
     assert np.isinf(found["psnr_db"]).all() and (found["relative_percent"] == 0).all()
     np.testing.assert_allclose(found["ssim_own"], 1)
-
-
-def test_shape_figures_do_not_know_the_force_and_the_others_do(scans):
     blurred = (scans.patterns + np.roll(scans.patterns, 2, axis=1)) / 2
     light = force.errors(_giving(blurred), scans)
-    heavy_scans = force.Bin(scans.force_n, scans.windows, 5 * scans.patterns, scans.touching, scans.tap)
-    heavy = force.errors(_giving(5 * blurred), heavy_scans)
+    heavy = force.errors(_giving(5 * blurred), scans._replace(patterns=5 * scans.patterns))
     for key in ("ssim_own", "relative_percent", "contact_iou"):
         np.testing.assert_allclose(heavy[key], light[key], rtol=1e-4)
-    np.testing.assert_allclose(light["psnr_db"] - heavy["psnr_db"], 20 * np.log10(5), rtol=1e-4)
-    assert (heavy["ssim"] < light["ssim"]).all()
-
-
-def test_classical_methods_are_fitted_once_and_cost_what_they_multiply(bench):
-    data = mixed(bench)
-    linear, cubic = classical_methods(bench, data, ("linear map", "bicubic"))
-    path = next(bench.data_folder.glob("classical-*.npz"))
-    written_ns = path.stat().st_mtime_ns
-    again = classical_methods(bench, data, ("linear map",))[0]
-    assert path.stat().st_mtime_ns == written_ns
-    windows = np.random.default_rng(0).normal(0, 500, (2, 4, 3, 4, 4)).astype(np.float32)
-    np.testing.assert_array_equal(linear.patterns(windows), again.patterns(windows))
-    # A linear map is linear, and blind to the earlier taps.
-    np.testing.assert_allclose(linear.patterns(2 * windows), 2 * linear.patterns(windows), rtol=1e-4, atol=1e-5)
-    np.testing.assert_array_equal(linear.patterns(windows), linear.patterns(windows[:, :1]))
-    assert linear.cost["parameters"] == 48 * 1600 and cubic.cost["parameters"] == 1
-    assert linear.cost["MMAC"] == pytest.approx(48 * 1600 / 1e6, abs=1e-3)
+    assert (heavy["ssim"] < light["ssim"]).all() and (heavy["psnr_db"] < light["psnr_db"]).all()
 
 
 def _giving(patterns):
@@ -136,25 +87,6 @@ def four(bench):
 
 def z_of(scans):
     return scans.windows[:, 0, 2].sum(axis=(1, 2))
-
-
-@pytest.mark.night
-def test_the_report_of_a_course_has_every_gauge_under_both_conditions(bench, tmp_path):
-    page = run_recovery(bench, tmp_path)
-    with page.with_suffix(".csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["nuisances"], row["model"]) for row in rows] == [
-        (condition, model)
-        for condition in ("just zeroed", "drifted")
-        for model in ("summed z", "stsr", "mtsr4", "true pattern")
-    ]
-    assert set(rows[0]) >= {"error %", "loop %", "at no load %", "parameters", "MMAC", "run time ms"}
-    for row in rows:
-        if row["model"] == "true pattern":  # is in proportion to the force, and ends with it
-            assert row["with its own factor %"].startswith("0.00")
-            assert row["loop %"].startswith("0.00")
-            assert row["false contact, % of scans"].startswith("0.00")
-    assert page.with_name("force-recovery-surfaces.csv").exists()
 
 
 def test_a_course_presses_holds_releases_and_rests():
@@ -179,47 +111,17 @@ def test_without_nuisances_a_press_and_its_release_read_alike(four):
         clean = between_frames(four.counts[:1, tap], end[:, tap : tap + 1])[0, 0]
         np.testing.assert_allclose(scans.windows[100, tap], np.rint(clean), atol=1)
     assert (scans.windows[:, 1:] == scans.windows[:1, 1:]).all()
-
-
-def test_what_lags_reads_less_on_the_way_in_than_on_the_way_out_and_stays_behind(four):
-    free = z_of(pressed(four, 0, COURSE, NONE))
-    lagging = z_of(pressed(four, 0, COURSE, replace(NONE, hysteresis=0.11)))
-    press, hold, release, rest = (COURSE.phase == phase for phase in range(4))
-    assert (lagging[press][5:] < free[press][5:]).all()
-    assert np.corrcoef(lagging[hold][:40], np.arange(40))[0, 1] > 0.9  # it creeps up
-    assert lagging[hold][-1] > lagging[hold][0] + 10
-    assert (lagging[release] > free[release])[-5:].all()
-    assert lagging[rest][0] > 0
-    assert lagging[rest][-1] < lagging[rest][0] / 2
-    scans = pressed(four, 0, COURSE, NONE)
-    assert loop_percent(scans.force_n, lagging / 1400, COURSE) > loop_percent(scans.force_n, free / 1400, COURSE)
-
-
-def test_one_sensor_reads_the_course_and_the_earlier_taps(four):
-    clean = pressed(four, 0, COURSE, NONE).windows[100]
-    read = pressed(four, 0, COURSE, GAINS).windows[100]
-    clear = np.abs(clean).min(axis=0) > 200
-    gain = np.where(clear, read / np.where(clear, clean, 1), 1)
-    assert clear.sum() > 10
-    np.testing.assert_allclose(gain[1:], np.broadcast_to(gain[0], gain[1:].shape), atol=0.01)
-    assert np.ptp(gain[0][clear]) > 0.05
-    other = pressed(four, 1, COURSE, GAINS).windows[100]
-    other_clean = pressed(four, 1, COURSE, NONE).windows[100]
-    both = clear & (np.abs(other_clean).min(axis=0) > 200)
-    assert not np.allclose((other[0] / other_clean[0])[both], gain[0][both], atol=0.02)
+    lagging = pressed(four, 0, COURSE, replace(NONE, hysteresis=0.11))
+    assert loop_percent(scans.force_n, z_of(lagging) / 1400, COURSE) > 0.5
 
 
 def test_a_loop_is_the_largest_difference_at_equal_force():
     found = RAMP_N.copy()
     assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(0, abs=1e-9)
     release = COURSE.phase == RELEASE
-    found[release] += 0.1
-    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(100 * 0.1 / RANGE_N)
-    found[release] = RAMP_N[release] + 0.4 * np.sin(np.pi * RAMP_N[release] / 5)  # widest half-way
-    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(8, rel=0.01)
-    found[COURSE.phase == HOLD] = 99  # neither the hold nor the rest are part of it
-    found[COURSE.phase == REST] = 99
-    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(8, rel=0.01)
+    found[release] += 0.4 * np.sin(np.pi * RAMP_N[release] / 5)  # widest half-way
+    found[(COURSE.phase == HOLD) | (COURSE.phase == REST)] = 99  # neither is part of it
+    assert loop_percent(RAMP_N, found, COURSE) == pytest.approx(100 * 0.4 / RANGE_N, rel=0.01)
 
 
 def figures(found_n, gate):

@@ -11,7 +11,7 @@ from edge.perception.taxel_health import HOLD_SCANS
 from train.data.real_grips import neighbours_mean, recorded_grips, recorded_sets
 from train.errors import DatasetError
 from train.experiments.sensor import real
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 
 
 @pytest.fixture

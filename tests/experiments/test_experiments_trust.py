@@ -13,7 +13,7 @@ from edge.inference.contract import ANY_BATCH
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
 from train.experiments.sensor import trust_checks
-from train.experiments.sensor.sensor_faults import FAULTS, FIELDS, steel_field
+from train.experiments.sensor.sensor_faults import FAULTS
 from train.experiments.sensor.shipped import PushedSensor
 from train.families.catalogue import SHARES
 
@@ -28,26 +28,6 @@ def press(z=3000.0, x=0.0):
 @pytest.fixture(scope="module")
 def wide():
     return load_frozen_presses().pick(np.arange(60))
-
-
-class TestFaults:
-    @pytest.mark.parametrize("name", FAULTS)
-    def test_a_fault_is_the_same_in_all_contacts(self, name):
-        counts = np.random.default_rng(0).normal(0, 500, (5, 3, 4, 4)).astype(np.float32)
-        counts[3] = counts[0]
-        kept = counts.copy()
-        wrong = FAULTS[name](np.random.default_rng(1), counts)
-        assert np.array_equal(counts, kept) and wrong.shape == counts.shape
-        assert (wrong != counts).any() and wrong[3] == pytest.approx(wrong[0])
-
-    def test_steel_raises_z_everywhere_and_pulls_x_and_y_to_the_middle(self):
-        fields = np.stack([steel_field(np.random.default_rng(seed)) for seed in range(200)])
-        assert (fields[:, 2] > 0).all()
-        most = np.abs(fields).max(axis=(1, 2, 3))
-        assert most.min() >= 150 and most.max() <= 1500
-        mean = fields.mean(axis=0)
-        assert (mean[0, :, 0] * mean[0, :, -1] < 0).all() and (mean[1, 0] * mean[1, -1] < 0).all()
-        assert set(FIELDS) <= set(FAULTS)
 
 
 class TestVerdicts:
@@ -78,11 +58,6 @@ class TestVerdicts:
             assert np.ptp(one.gains[mine], axis=0).max() == 0
             even = one.presses.counts[mine] / one.gains[mine][:, None]
             assert even == pytest.approx(wide.presses.counts[mine] / wide.gains[mine][:, None], rel=1e-4)
-
-    def test_every_sensor_has_as_many_contacts(self, wide):
-        contacts = trust_checks.contacts_of(wide)
-        assert {len(one) for one in contacts} == {trust_checks.CONTACTS}
-        assert all(len(np.unique(wide.presses.pad[one])) == 1 for one in contacts)
 
 
 def test_patterns_that_are_off_are_counted_by_how_far(wide):
@@ -120,11 +95,6 @@ class TestTaps:
         assert np.array_equal(image[..., ::-1], truth)
         assert np.array_equal(mirrored[:, :, 0, :, ::-1], -right[:, :, 0])
         assert np.array_equal(mirrored[:, :, 1:, :, ::-1], right[:, :, 1:])
-
-    def test_the_next_press_is_another_of_the_same_pad(self):
-        pads = np.array([3, 3, 5, 7, 7, 7])
-        following = trust_checks.next_of_pad(pads)
-        assert following.tolist() == [1, 0, 3, 4, 5, 3]
 
 
 def test_a_pushed_sensor_remembers_suspicion():

@@ -1,12 +1,14 @@
 """Patterns of the default model for real grips: the face of a box over the whole pad, not figures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from edge.api import infer
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
-from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
+from train.data.real_grips import Grip, recorded_grips, recording_paths, recordings_folder
 from train.experiments.sensor.real import Played, has_hole, play, share_touched, unevenness
 
 RECORDINGS = recordings_folder()
@@ -24,13 +26,17 @@ pytestmark = pytest.mark.skipif(not PATHS, reason=f"no real recordings at {RECOR
 @pytest.fixture(scope="module")
 def played() -> dict[str, Played]:
     model = ModelSession(find_model(DEFAULT_MODEL))
-    return {f"{grip.trial} {grip.free.sensor}": play(grip, model) for grip in recorded_grips(RECORDINGS)}
+    return {f"{grip.trial} {grip.free.sensor}": play(grip, model) for grip in every_other_scan()}
+
+
+def every_other_scan() -> list[Grip]:
+    return [replace(grip, counts=grip.counts[::2]) for grip in recorded_grips(RECORDINGS)]
 
 
 def test_every_scan_under_load_has_a_pattern(played):
     assert sorted(played) == sorted(f"{path.parent.name} {path.stem}" for path in PATHS)
     for name, one in played.items():
-        assert len(one.patterns) > 100 and np.isfinite(one.patterns).all(), name
+        assert len(one.patterns) > 50 and np.isfinite(one.patterns).all(), name
 
 
 def test_the_strongest_moment_of_every_grip_covers_the_pad_evenly_without_a_hole(played):
@@ -67,12 +73,12 @@ def test_patterns_of_real_grips_are_believed(played):
     model = ModelSession(find_model(DEFAULT_MODEL))
     assert model.contract.read_trust() is not None, "the default model has no checks"
     believed = np.concatenate([one.believed for one in played.values()])
-    assert len(believed) > 1000 and believed.mean() >= 1 - MOST_DOUBTED
+    assert len(believed) > 500 and believed.mean() >= 1 - MOST_DOUBTED
 
 
 def test_two_pads_of_one_grip_carry_equal_and_opposite_forces():
     """By the wrench as nearly as by the plain sums of counts, which know nothing of patterns."""
-    grips = recorded_grips(RECORDINGS)
+    grips = every_other_scan()
     for trial in dict.fromkeys(grip.trial for grip in grips):
         pads = [(infer(DEFAULT_MODEL, grip.counts, grip.free), grip) for grip in grips if grip.trial == trial]
         scans = min(len(results) for results, _ in pads)
@@ -82,7 +88,7 @@ def test_two_pads_of_one_grip_carry_equal_and_opposite_forces():
             [[none if one.wrench is None else one.wrench.force_n for one in results[:scans]] for results, _ in pads]
         )
         held = (sums[:, :, 2] > HELD_COUNTS).all(axis=0) & np.isfinite(forces).all(axis=(0, 2))
-        assert held.sum() > 100, trial
+        assert held.sum() > 50, trial
         mirrored, mirrored_counts = (np.corrcoef(*one[:, held, 1])[0, 1] for one in (forces, sums))
         scatter, scatter_counts = (np.divide(*one[:, held, 2]).std() for one in (forces, sums))
         assert mirrored < mirrored_counts + 0.15 and scatter < 1.2 * scatter_counts, trial

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from train.report import Report, bootstrap_interval, with_interval
+from train.report import Report, bootstrap_interval
 
 
 def test_frames_of_one_tap_are_not_independent():
@@ -24,10 +24,6 @@ def test_the_interval_holds_the_mean_as_often_as_it_says():
         low, high = bootstrap_interval(tap, np.repeat(np.arange(40), 4), seed=run)
         held += low <= 0 <= high
     assert 0.88 < held / 200 < 0.99
-
-
-def test_a_single_tap_has_no_spread():
-    assert with_interval(np.array([1.0, 2.0, 3.0]), np.zeros(3, dtype=int)) == "2.00 (2.00..2.00)"
 
 
 def test_a_report_is_a_page_a_table_and_a_plot(tmp_path):

@@ -16,7 +16,7 @@ from train.data.press_batches import Batch
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    return made_once(tmp_path_factory, small_models) / "plain" / "sure.onnx"
+    return made_once(tmp_path_factory, small_models) / "sure.onnx"
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +49,7 @@ def test_the_largest_grid_is_done_in_integers_but_for_what_gives_the_outputs(mod
     assert (convolutions(model), convolutions(integers)) == ((0, 16), (4, 16)), "once optimised"
 
 
+@pytest.mark.night
 def test_of_a_published_network_all_but_the_last(seen, tmp_path_factory):
     model = onnx.load(made_once(tmp_path_factory, published_model) / "peer.onnx")
     count = sum(node.op_type == "Conv" for node in model.graph.node)
@@ -73,11 +74,8 @@ def test_the_same_windows_give_the_same_bytes_and_the_given_graph_is_left_as_it_
 
 
 def test_a_graph_without_convolutions_is_refused(seen):
-    graph = onnx.helper.make_graph(
-        [onnx.helper.make_node("Relu", ["window"], ["pattern"])],
-        "none",
-        *[[onnx.helper.make_tensor_value_info(name, 1, [1, 6, 4, 4])] for name in ("window", "pattern")],
-    )
+    ends = [[onnx.helper.make_tensor_value_info(name, 1, [1, 6, 4, 4])] for name in ("window", "pattern")]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["window"], ["pattern"])], "none", *ends)
     with pytest.raises(ExportError, match=r"no convolution .* without --int8"):
         quantised(onnx.helper.make_model(graph), seen)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording
 
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 
 
 def quick_bench(tmp_path_factory: pytest.TempPathFactory) -> Workbench:

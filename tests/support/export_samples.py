@@ -12,24 +12,25 @@ from press_samples import make_press_set
 
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import find_model
-from edge.inference.onnx_session import ModelSession
 from export.to_onnx import IntervalData, export
 from train.data.frozen_presses import freeze_presses
-from train.data.presses import PressSet
-from train.learning import interval_fit
 from train.learning.checkpoint import Training, fit_network, load_network
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.networks.fusion import FusionNet
 from train.networks.registry import build
 from train.physics.pad_draws import KNOWN
+from train.trust import load_trust
 
 OPTIONS: Final = {"channels": 16, "blocks": 1, "known": KNOWN}
 PRESSES: Final = make_press_set(count=64, taps=2)
 TAPS: Final = 4
-POSED_PRESSES: Final = make_press_set(64, taps=TAPS)
+POSED_PRESSES: Final = make_press_set(40, taps=TAPS)
 SURE: Final = Training("sure", "compact-mtsr2", Recipe(steps=2, batch=4, given=(0.5, 0.5)), options=OPTIONS)
 FUSED: Final = Training("fused", "fusion-mtsr4", Recipe(3, batch=8, given=(0.25,) * TAPS), options=OPTIONS)
+INTERVALS: Final = IntervalData(PRESSES, PRESSES, steps=50)
+BEFORE: Final = b"the one before"
+"""Content of sure.onnx before it is written."""
 
 
 def some_frames(taps: int = TAPS) -> FrozenSet:
@@ -53,7 +54,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory, make: Callable[[Path], o
 
 
 def small_models(folder: Path) -> None:
-    """Write sure.pt, sure.onnx with intervals, and plain/sure.onnx without."""
+    """Write sure.pt, and sure.onnx with intervals."""
     fit_network(SURE, PRESSES, some_frames(), folder)
     net, _ = load_network(folder / "sure.pt")
     with torch.no_grad():
@@ -62,23 +63,8 @@ def small_models(folder: Path) -> None:
             torch.nn.init.normal_(weight, 0, 0.05)
         net.get_parameter("leave.2.bias_free").add_(0.02)
     torch.save(net.state_dict(), folder / "sure.pt")
-    (folder / "plain").mkdir()
-    export(folder / "sure.pt", folder / "plain", some_frames())
-    export_with_intervals(folder / "sure.pt", folder)
-
-
-def export_with_intervals(checkpoint: Path, folder: Path, calibration: PressSet | None = None) -> None:
-    """Write NAME.onnx, or NAME-int8.onnx."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interval_fit, "_STEPS", 50)
-        export(
-            checkpoint,
-            folder,
-            some_frames(),
-            validation=[some_frames(2)],
-            intervals=IntervalData(PRESSES, PRESSES),
-            calibration=calibration,
-        )
+    (folder / "sure.onnx").write_bytes(BEFORE)
+    export(folder / "sure.pt", folder, some_frames(), validation=[some_frames(2)], intervals=INTERVALS)
 
 
 def published_model(folder: Path) -> None:
@@ -105,9 +91,7 @@ def save_checkpoint(path: Path, net: PatternNet, name: str, **options: int) -> P
 
 def posed_models(folder: Path) -> None:
     """Write fused.onnx, which takes poses, with checks."""
-    trust = ModelSession(find_model("stsr-int8")).contract.read_trust()
-    validation = freeze_presses(POSED_PRESSES, 1).as_frozen_set()
-    fit_network(FUSED, POSED_PRESSES, validation, folder)
+    fit_network(FUSED, POSED_PRESSES, freeze_presses(POSED_PRESSES, 1).as_frozen_set(), folder)
     net, _ = load_network(folder / "fused.pt")
     torch.manual_seed(0)
     assert isinstance(net, FusionNet)
@@ -115,7 +99,5 @@ def posed_models(folder: Path) -> None:
         for free in part.parameters():
             torch.nn.init.normal_(free, 0, 0.1)
     torch.save(net.state_dict(), folder / "fused.pt")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interval_fit, "_STEPS", 50)
-        intervals = IntervalData(POSED_PRESSES, POSED_PRESSES)
-        export(folder / "fused.pt", folder, some_frames(), intervals=intervals, trust=trust)
+    intervals, trust = IntervalData(POSED_PRESSES, POSED_PRESSES, steps=50), load_trust(find_model("stsr-int8"))
+    export(folder / "fused.pt", folder, some_frames(), intervals=intervals, trust=trust)

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, SurfaceError
-from train.families import catalogue
 from train.families.catalogue import FIGURES, SHARES, draw_shape
-from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, SOLIDS, Lie, drawn, flat
+from train.families.shape import NOWHERE_MM, SHAPES
 from train.physics.contact import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.physics.pad_draws import NOMINAL
@@ -19,12 +18,6 @@ def pad():
     return GrippedPad(NOMINAL)
 
 
-@pytest.fixture
-def level(monkeypatch):
-    """Lay shapes level, so that their highest part is fixed."""
-    monkeypatch.setattr(catalogue, "_LEVEL", 1.0)
-
-
 def draw(pad, family, seed=0, taps=1):
     return draw_shape(np.random.default_rng(seed), family, pad, turns(np.random.default_rng(), taps))
 
@@ -33,10 +26,6 @@ def highest(pad, heights_mm):
     """Place of the highest part, x and y in [mm]."""
     row, col = np.unravel_index(heights_mm.argmax(), heights_mm.shape)
     return pad.places_mm[0][0, col], pad.places_mm[1][row, 0]
-
-
-def angle_deg(x_mm, y_mm):
-    return np.degrees(np.arctan2(y_mm, x_mm))
 
 
 @pytest.mark.parametrize("family", SHARES)
@@ -52,15 +41,6 @@ def test_every_family_gives_finite_heights_that_reach_the_pad(pad, family):
     again = draw(pad, family, 0, taps=2)
     assert np.array_equal(again.heights_mm, draw(pad, family, 0, taps=2).heights_mm)
     assert any(not np.array_equal(again.heights_mm, draw(pad, family, seed, taps=2).heights_mm) for seed in range(1, 9))
-
-
-@pytest.mark.parametrize("solid", SOLIDS)
-def test_every_solid_is_a_shape_of_its_own(pad, solid):
-    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
-    one, other = (solid(np.random.default_rng(seed), x_mm, y_mm) for seed in (0, 1))
-    assert np.isfinite(one).all() and one.shape == x_mm.shape
-    assert not np.array_equal(one, other)
-    assert (one > -10).any(), "it lies under the pad that is over it"
 
 
 def test_all_families_are_drawn_and_figures_are_half_of_what_is_rigid():
@@ -91,40 +71,6 @@ def test_a_tap_that_would_miss_the_shape_lands_nearer(pad):
     tapped = draw_shape(np.random.default_rng(1), "solid", pad, poses)
     assert 0 < tapped.poses[1, 0] < 100 and tapped.poses[1, 2] == 10
     assert tapped.heights_mm[1].max() > NOWHERE_MM / 2
-
-
-def test_a_tilt_raises_one_side_by_its_slope(pad):
-    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
-    lie = Lie(1.0, -2.0, 40.0, slope_x=0.03, slope_y=-0.02)
-    assert np.allclose(
-        lie.seen(drawn(np.random.default_rng(0), flat), x_mm, y_mm), 0.03 * x_mm - 0.02 * y_mm, atol=1e-5
-    )
-    slopes = []
-    for seed in range(60):
-        heights = draw(pad, "flat", seed).heights_mm[0]
-        slopes.append(np.hypot(np.ptp(heights[:, 0]), np.ptp(heights[0])) / np.ptp(pad.places_mm[0]))
-    assert np.max(slopes) <= 1.01 * SLOPE and np.max(slopes) > 0.6 * SLOPE
-    assert 0.15 < np.mean(np.array(slopes) < 1e-6) < 0.45, "some lie level"
-
-
-def test_a_tilt_turns_with_the_shape_from_tap_to_tap(pad):
-    for seed in range(40):
-        heights = draw(pad, "flat", seed, taps=3).heights_mm
-        slope = np.stack([heights[:, 0, -1] - heights[:, 0, 0], heights[:, -1, 0] - heights[:, 0, 0]])
-        if np.hypot(*slope[:, 0]) > 0.1:
-            turned = [(one - angle_deg(*slope[:, 0]) + 180) % 360 - 180 for one in angle_deg(*slope)]
-            assert turned == pytest.approx([0, -5, -10], abs=0.1)
-            return
-    pytest.fail("every face lies level")
-
-
-def test_two_shapes_lie_on_either_side_at_one_height(pad, level, monkeypatch):
-    monkeypatch.setattr(catalogue, "_PAIRED", ("block",))
-    heights = np.stack([draw(pad, "two", seed).heights_mm[0] for seed in range(12)])
-    middle = heights.shape[-1] // 2
-    left, right = heights[..., :middle].max(axis=(1, 2)), heights[..., middle:].max(axis=(1, 2))
-    assert (np.abs(left) < 1e-4).all() and (np.abs(right) < 1e-4).all()
-    assert (heights < NOWHERE_MM / 2).any(axis=(1, 2)).any(), "there is a gap beside some"
 
 
 def test_a_users_mesh_is_a_family(pad, tmp_path):

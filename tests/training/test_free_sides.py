@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from firmware_bridge.pad_geometry import USPA44
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.pad_draws import Pad
@@ -26,12 +25,6 @@ def solver(layer, sides):
     return ContactSolver(layer, SIZE, CELL_MM, torch.float64, sides=sides)
 
 
-def discs(count):
-    rows, columns = np.mgrid[:SIZE, :SIZE]
-    places = np.random.default_rng(5).uniform(6, SIZE - 7, (count, 2))
-    return np.array([np.where(np.hypot(rows - y, columns - x) < 5.3, 0, 1e3) for y, x in places], dtype=np.float32)
-
-
 @pytest.mark.parametrize("poisson", ELEMENTS)
 def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
     layer, (stiffness, shape, down, out) = Layer(poisson=poisson), ELEMENTS[poisson]
@@ -47,17 +40,6 @@ def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
     assert quarter[:, 0] == pytest.approx(out, rel=0.12)
 
 
-def test_boxes_give_what_the_whole_pad_gives():
-    # The discs take boxes of one shape at places of their own; some of them lie within reach of the sides.
-    depths_mm = discs(6)
-    corners = depths_mm.copy()
-    corners[:, [0, -1], [0, -1]] = 1.49  # within reach, but not touching
-    boxed, whole = (solver(Layer(), FreeSides()).solve(one, 1.0, 1e-5) for one in (depths_mm, corners))
-    assert boxed.force_n == pytest.approx(whole.force_n, rel=1e-4)
-    assert np.abs(boxed.pressure_mpa - whole.pressure_mpa).max() < 1e-3 * whole.pressure_mpa.max()
-    assert (boxed.residual < 1e-5).all()
-
-
 def test_sides_are_felt_near_them_alone_and_are_all_alike():
     def force_n(row, column):
         depth_mm = np.full((SIZE, SIZE), 1e3, dtype=np.float32)
@@ -70,27 +52,3 @@ def test_sides_are_felt_near_them_alone_and_are_all_alike():
     assert beside == pytest.approx([beside[0]] * 4, rel=1e-4)
     assert beside[0] < 0.8 * without
     assert force_n(0, 36)[0] < beside[0]
-
-
-def test_what_sides_add_is_a_load_at_work_never_against_it():
-    across, along = FreeSides(0.7).profiles(Layer(), CELLS_MM)
-    assert across.min() > 0
-    for bell in along:
-        assert np.allclose(bell, bell.T)
-        assert np.linalg.eigvalsh(bell).min() > -1e-9 * bell.max()
-
-
-def test_magnets_go_outwards_and_mirror_each_other():
-    moved = FreeSides().movement(Layer(), CELLS_MM, USPA44.taxel_centres_mm())
-    even = moved.sum(axis=(2, 3)).reshape(4, 4, 5)
-    right, back, down, lean_x, lean_y = np.moveaxis(even, -1, 0)
-    assert (right[:, 2:] > 0).all()
-    assert np.allclose(right, -right[:, ::-1])
-    assert np.allclose(right, back.T)
-    assert np.allclose(lean_x, lean_y.T)
-    assert (down > 0).all()
-    assert np.allclose(down, down[::-1])
-    turned = moved.reshape(4, 4, 5, SIZE, SIZE).transpose(1, 0, 2, 4, 3).reshape(moved.shape)  # x for y
-    assert np.allclose(moved[:, [0, 2, 3]], turned[:, [1, 2, 4]])
-    one = moved[7, 0, 30, 40]  # the second row's last magnet, a load below it to the right
-    assert one > moved[7, 0, 41, 40] > 0

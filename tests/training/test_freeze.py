@@ -1,15 +1,12 @@
-import itertools
-from dataclasses import replace
+import shutil
 
 import numpy as np
 import pytest
 from press_samples import make_press_set
 
-from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.test_set import judge
 from edge.inference.bundled import BUNDLE_DIR
-from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.recording.formats import load_recording
 from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import SEED
@@ -17,17 +14,13 @@ from train.data.world import World, solve_pad
 from train.demo import demo_recording
 from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
-from train.physics.sensor_noise import NAMES, Nuisances
-from train.surfaces.poses import HALF_PITCH_MM, PLACES_MM
+from train.physics.sensor_noise import Nuisances
+from train.surfaces.poses import PLACES_MM
 
 
 @pytest.fixture(scope="module")
 def sequences() -> PaperTaps:
     return paper_taps("test", ("O", "small circle"), taps=3)
-
-
-def figures_alone(count: int) -> World:
-    return World(count=count, per_pad=count, families={"O": 1.0, "small circle": 1.0}, spread=0.0, seed=9)
 
 
 @pytest.fixture(scope="module")
@@ -60,31 +53,8 @@ def test_the_truth_is_the_press(frozen):
     assert patterns[inside].mean() > 4 * patterns[~inside].mean()
 
 
-def test_one_seed_freezes_the_same_and_another_reads_by_other_sensors(sequences, frozen):
-    assert freeze(sequences, Nuisances(), SEED).sha256() == frozen.sha256()
-    other = freeze(sequences, Nuisances(), SEED + 1)
-    assert other.sha256() != frozen.sha256() and np.array_equal(other.unit_patterns, frozen.unit_patterns)
-    assert not np.array_equal(other.newest, frozen.newest)
-
-
-def test_frames_of_a_tap_are_read_by_one_sensor(sequences):
-    """Gains stay from frame to frame: without other nuisances each taxel's readings are in one proportion."""
-    quiet = Nuisances().without(*NAMES)
-    clean, gained = (freeze(sequences, n, SEED) for n in (quiet, replace(quiet, gain_spread=0.075)))
-    strong = np.abs(clean.newest[:FRAMES]).min(axis=0) > 100
-    ratio = gained.newest[:FRAMES, strong] / clean.newest[:FRAMES, strong]
-    assert np.abs(ratio - ratio.mean(axis=0)).max() < 0.02 and ratio.mean(axis=0).std() > 0.03
-
-
-def test_another_scale_is_the_same_tap(sequences, frozen):
-    coarse = freeze(sequences, Nuisances(), SEED, scale=4)
-    assert coarse.unit_patterns.shape[1:] == (16, 16) and np.array_equal(coarse.newest, frozen.newest)
-    assert coarse.patterns().mean() == pytest.approx(frozen.patterns().mean(), rel=0.01)
-
-
-def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
-    data = solve_pad(figures_alone(96), 0)
-    np.savez(tmp_path / "classical.npz", allow_pickle=False, **fit_classical(data, windows=2000))
+def test_classical_methods_beat_nothing_and_are_in_order(frozen, presses, tmp_path):
+    np.savez(tmp_path / "classical.npz", allow_pickle=False, **fit_classical(presses, windows=2000))
     methods = fitted_methods(tmp_path / "classical.npz", frozen.scale)
     newest = frozen.newest.astype(np.float32)
     psnr = {name: judge(method(newest), frozen, 0.5)["psnr_db"].mean() for name, method in methods.items()}
@@ -93,72 +63,34 @@ def test_classical_methods_beat_nothing_and_are_in_order(frozen, tmp_path):
     assert nothing < psnr["bilinear"] < psnr["linear map"]
 
 
-def test_the_demo_taps_four_times_or_where_it_is_proposed_and_scores_none_of_the_scenes_after(tmp_path):
-    arrays = demo_recording()
-    again = demo_recording()
-    assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
-    np.savez(tmp_path / "demo.npz", allow_pickle=False, **arrays)
-    series = load_recording(tmp_path / "demo.npz")
-    assert series
-    rest = np.median(arrays["counts"][arrays["tap"] < 0][:100], axis=0)
-    force = (arrays["counts"] - rest)[:, 2].sum(axis=(1, 2))
-    pressed = force > ON_COUNTS
-    scene = arrays["scene"]
-    begins = np.flatnonzero(np.diff(pressed.astype(int)) == 1)
-    assert scene[begins].tolist() == [-1] * 4 + [0, 0, 1, 2]
-    assert np.all(force[(arrays["tap"] < 0) & (scene < 0)] < ON_COUNTS)
-    assert np.all(arrays["tap"][scene >= 0] == -1)
-    assert arrays["unit_patterns"].max(axis=(1, 2)) == pytest.approx(1, abs=2e-3)
-    places = arrays["option_pose"][:, :2] / HALF_PITCH_MM
-    assert {tuple(place) for place in places.round().tolist()} == set(itertools.product(range(-3, 4), repeat=2))
-    same = places.any(axis=1) == 0
-    (here,) = arrays["option_unit_patterns"][same]
-    assert np.abs(here.astype(float) - arrays["unit_patterns"][0]).mean() < 0.05, "but for the error of a pose"
-    there = arrays["option_unit_patterns"][(places.round() == [2, 0]).all(axis=1)][0].astype(float)
-    moved = arrays["unit_patterns"][0].astype(float)[:, 10:]
-    assert np.abs(there[:, :-10] - moved).mean() < 0.05 < np.abs(there[:, 10:] - moved).mean()
-    assert series.poses and (BUNDLE_DIR / "demo.npz").stat().st_size < 1_000_000
+def test_the_demo_is_made_as_the_bundled_one(tmp_path):
+    """But for rounding, in which processors differ: tests of the program hold what the bundled one shows."""
+    made, bundled = demo_recording(), dict(np.load(BUNDLE_DIR / "demo.npz"))
+    assert set(made) == set(bundled)
+    for name, array in bundled.items():
+        if array.dtype.kind in "Ub":
+            assert np.array_equal(made[name], array), name
+        else:
+            apart = np.abs(made[name].astype(float) - array)
+            assert apart.mean() < 1e-3 or apart.max() <= 1, name
+    np.savez(tmp_path / "demo.npz", allow_pickle=False, **made)
+    assert load_recording(tmp_path / "demo.npz").poses
+
+
+@pytest.mark.night
+def test_the_command_makes_all_files_but_the_frozen_set_that_models_name(tmp_path):
+    shutil.copy(BUNDLE_DIR / "frozen.npz", tmp_path)
+    make_press_set(600).save(tmp_path / "seen.npz")
+    before = (tmp_path / "frozen.npz").stat()
+    main([str(tmp_path), "--data", str(tmp_path / "seen.npz")])
+    names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "seen", "taxels")]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    assert (tmp_path / "frozen.npz").stat() == before
 
 
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
     with pytest.raises(SystemExit, match=r"^freeze: .*no such file"):
         main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
-
-
-def test_files_are_replaced_by_those_that_load_and_stay_as_bak(tmp_path, monkeypatch, frozen):
-    bundled = {name: dict(np.load(BUNDLE_DIR / f"{name}.npz")) for name in ("classical", "taxels", "demo")}
-    made = {"load_presses": make_press_set(4), "freeze": frozen, "demo_recording": bundled["demo"]}
-    made |= {"fit_classical": bundled["classical"], "fit_taxels": bundled["taxels"]}
-    for name, value in made.items():
-        monkeypatch.setattr(f"train.freeze.{name}", lambda *_, value=value: value)
-    names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "taxels")]
-    main([str(tmp_path), "--data", "seen.npz"])
-    assert sorted(path.name for path in tmp_path.iterdir()) == names
-    test_set = (tmp_path / "frozen.npz").stat()
-    monkeypatch.setattr("train.freeze.freeze", lambda *_: pytest.fail("models name the frozen set that is there"))
-    main([str(tmp_path), "--data", "seen.npz"])
-    baks = [f"{name}.bak" for name in names if name != "frozen.npz"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, *baks])
-    assert (tmp_path / "frozen.npz").stat() == test_set
-    before = (tmp_path / "taxels.npz").read_bytes()
-    monkeypatch.setattr("train.freeze.fit_taxels", lambda _: {"covariance": np.zeros(3)})
-    with pytest.raises(EdgeError, match="cannot be read"):
-        main([str(tmp_path), "--data", "seen.npz"])
-    assert (tmp_path / "taxels.npz").read_bytes() == before
-
-
-def test_presses_are_drawn_like_taps_whole_and_each_with_its_own_truth():
-    presses = solve_pad(World(count=12, taps=2, per_pad=12, spread=0.0, seed=3), 0)
-    newest, patterns = drawn(presses, windows=len(presses))
-    assert newest.shape == (len(presses), 3, 4, 4) and patterns.shape == (len(presses), 40, 40)
-    assert len(np.unique(patterns.sum(axis=(1, 2)))) == len(presses)
-    for reading, pattern in zip(newest, patterns, strict=True):
-        (mine,) = np.flatnonzero((presses.patterns == pattern).all(axis=(1, 2)))
-        clean = presses.counts[:, 0].reshape(len(presses), -1)
-        assert np.argmax([np.corrcoef(reading.ravel(), one)[0, 1] for one in clean]) == mine
-    more, _ = drawn(presses, windows=3 * len(presses))
-    assert len(more) == 3 * len(presses)
-    assert set(fit_classical(presses, windows=20)) == {"bilinear_gain", "bicubic_gain", "linear_map"}
 
 
 def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
@@ -175,13 +107,28 @@ def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
     np.testing.assert_allclose(sorted(angles, reverse=True), np.eye(2), atol=0.15)
 
 
-def test_taxels_covary_as_their_readings_do():
-    presses = solve_pad(figures_alone(48), 0)
+@pytest.fixture(scope="module")
+def presses():
+    figures = {"O": 1.0, "small circle": 1.0}
+    return solve_pad(World(count=64, per_pad=64, families=figures, spread=0.0, seed=9), 0)
+
+
+def test_every_press_is_drawn_as_often_with_its_own_truth(presses):
+    newest, patterns = drawn(presses, windows=2 * len(presses))
+    marks = [pattern.tobytes() for pattern in presses.patterns.astype(np.float32)]
+    index = [marks.index(pattern.tobytes()) for pattern in patterns]
+    assert np.bincount(index).tolist() == [2] * len(presses)
+    clean = presses.counts[index, 0].reshape(len(index), -1)
+    alike = [np.corrcoef(*pair)[0, 1] for pair in zip(newest.reshape(len(index), -1), clean, strict=True)]
+    assert np.median(alike) > 0.95
+
+
+def test_taxels_covary_as_their_readings_do(presses):
     covariances = fit_taxels(presses, windows=400)["covariances"]
     assert covariances.shape == (KINDS, 48, 48) and covariances.dtype == np.float32
     np.testing.assert_allclose(covariances, covariances.transpose(0, 2, 1), rtol=1e-4, atol=1e-6)
     # The press is mostly in z, since some are dragged, and of one strength in all of them.
     traces = np.trace(covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, 48, rtol=0.01)
-    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.5 * traces).all()
+    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.45 * traces).all()
     np.testing.assert_array_equal(covariances, fit_taxels(presses, windows=400)["covariances"])

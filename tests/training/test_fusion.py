@@ -1,12 +1,10 @@
 """Network that fuses taps from any poses: one tap is a network of one tap, and the geometry is exact."""
 
-import numpy as np
 import pytest
 import torch
 from press_samples import make_press_set
 
-from train.data.press_batches import PosedBatches, stated_poses
-from train.errors import DatasetError
+from train.data.press_batches import PosedBatches
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.fusion import FusionNet
 from train.networks.registry import grown
@@ -80,24 +78,6 @@ def test_the_order_of_earlier_taps_is_free_and_absent_ones_change_nothing(net, i
     assert torch.allclose(run(net, longer, pad, padded)[0], pattern, atol=1e-6)
 
 
-def test_a_shift_by_half_a_pitch_moves_what_an_earlier_tap_shows_by_a_cell(net):
-    """Carried features land where the pose says: the same tap shifted by two cells changes the pattern two cells on."""
-    from train.networks.fusion import _Carrier
-
-    there = torch.ones(1, 1, 1, 1, 1)
-    state = torch.zeros(1, 1, 8, 8)
-    state[0, 0, 3, 4] = 1
-    pose = torch.tensor([[[2.35, -2.35, 0.0, 0.0, 0.0]]])
-    moved = _Carrier(pose, there, (4, 4), REACHES).to_taps(state)
-    assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (4, 3), (
-        "one cell up and to the right of the newest tap"
-    )
-    turned = torch.tensor([[[0.0, 0.0, 90.0, 0.0, 0.0]]])
-    moved = _Carrier(turned, there, (4, 4), REACHES).to_taps(state)
-    # x of the turned pad points down the newest one's rows: half a cell right, half a cell up is half up, half left.
-    assert np.unravel_index(int(torch.pixel_shuffle(moved, 2).argmax()), (8, 8)) == (3, 3)
-
-
 def test_without_poses_the_schedule_of_the_paper_is_assumed(net, inputs):
     window, pad, _ = inputs
     poses = torch.zeros(2, 3, 5)
@@ -124,25 +104,3 @@ class TestBatches:
         one, again = draw(5), PosedBatches(presses, (0.25,) * 4, 16, seed=3)(5)
         assert torch.equal(one.window, again.window) and torch.equal(one.poses, again.poses)
         assert one.poses.shape[1] * 3 == one.window.shape[1] and not one.poses[:, 0].any()
-
-    def test_stated_errors_are_kept_to(self):
-        rng = np.random.default_rng(0)
-        true = np.zeros((4000, 3, 3), dtype=np.float32)
-        stated = stated_poses(rng, true, (0.2, 1.0))
-        assert np.allclose(stated[:, 1:, 3:], (0.2, 1.0)) and not stated[:, 0].any()
-        assert stated[:, 1:, 0].std() == pytest.approx(0.2, rel=0.1)
-        assert stated[:, 1:, 2].std() == pytest.approx(1.0, rel=0.1)
-        drawn = stated_poses(rng, true)[:, 1:].reshape(-1, 5)
-        assert 0.05 <= drawn[:, 3].min() < 0.06 and 1.4 < drawn[:, 3].max() <= 1.5
-        beyond = (np.abs(drawn[:, 0]) > 2.01 * drawn[:, 3]).mean()
-        assert 0.01 < beyond < 0.05, "some lie farther off than stated"
-
-    def test_mirror_images_of_poses_go_with_those_of_windows(self):
-        batch = PosedBatches(make_press_set(48, taps=4), (0, 0, 0, 1.0), 16, seed=3)(0)
-        image = batch.mirrored(torch.ones(16, dtype=torch.bool))
-        assert torch.equal(image.poses, batch.poses * torch.tensor([-1.0, 1, -1, 1, 1]))
-        assert torch.equal(image.mirrored(torch.ones(16, dtype=torch.bool)).window, batch.window)
-
-    def test_too_few_taps_are_refused(self):
-        with pytest.raises(DatasetError, match="no sequences of 5 taps"):
-            PosedBatches(make_press_set(48, taps=4), (0.2,) * 5, 16, seed=3)

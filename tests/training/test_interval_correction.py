@@ -1,4 +1,6 @@
-"""Correction of deviations by region: nothing before it is fitted, symmetric, and conformal after."""
+"""Calibration of deviations, and their correction by region: nothing before it is fitted, conformal after."""
+
+import math
 
 import numpy as np
 import pytest
@@ -6,8 +8,15 @@ import torch
 from press_samples import make_press_set
 
 from edge.inference.intervals import REGIONS, regions
-from train.learning import interval_fit
-from train.learning.interval_fit import Readings, conform, fit_correction, half_width_mm, readings_of_presses
+from train.learning.interval_fit import (
+    Readings,
+    calibrate,
+    conform,
+    fit_correction,
+    half_width_mm,
+    interval_coverage,
+    readings_of_presses,
+)
 from train.networks.compact import CompactNet
 from train.networks.interval_correction import LOG_RANGE
 from train.physics.pad_draws import KNOWN
@@ -46,21 +55,28 @@ def _no_gradients():
         yield
 
 
-def test_a_new_correction_changes_nothing():
-    net = make_net()
-    before = net(windows())
-    net.add_intervals()
-    for one, other in zip(before, net(windows()), strict=True):
-        assert torch.allclose(one, other, rtol=1e-6)
+def laplace():
+    """Return patterns with errors of a given standard deviation: half of the pixels are four times as far off."""
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 0.5, (60, 40, 40))
+    deviation = np.where(rng.random(truth.shape) < 0.5, 0.01, 0.04)
+    return truth, truth + rng.laplace(0, deviation / math.sqrt(2)), deviation
 
 
-def test_weights_of_a_correction_load_into_a_network_built_with_one():
-    net = make_net()
-    corrected(net)
-    again = CompactNet(2, 10, channels=16, blocks=1, known=KNOWN, intervals=True).eval()
-    again.load_state_dict(net.state_dict())
-    assert torch.equal(net(windows())[1], again(windows())[1])
-    assert "intervals.centre" not in make_net().state_dict()
+def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_wrong_ones_back():
+    levels = [0.1, 0.5, 0.8, 0.9, 0.99]
+    truth, pattern, deviation = laplace()
+    assert [interval_coverage(truth, pattern, deviation, one) for one in levels] == pytest.approx(levels, abs=0.005)
+    for level in (0.5, 0.9):
+        factor = calibrate(truth, pattern, 7 * deviation, level)
+        assert factor == pytest.approx(1 / 7, rel=0.02)
+        assert interval_coverage(truth, pattern, factor * 7 * deviation, level) == pytest.approx(level, abs=1e-4)
+    uniform = np.random.default_rng(1).uniform(-0.03, 0.03, truth.shape)
+    factor = calibrate(truth, truth + uniform, deviation)
+    covered = interval_coverage(truth, truth + uniform, factor * deviation)
+    assert covered == pytest.approx(0.9, abs=1e-4), "whatever the density"
+    with pytest.raises(ValueError, match="not above zero"):
+        calibrate(truth, pattern, 0 * deviation)
 
 
 def test_the_correction_changes_deviations_alone_and_only_in_use():
@@ -132,15 +148,12 @@ def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
         assert [held[region == number].mean() for number in range(4)] == pytest.approx([0.9] * 4, abs=0.01)
 
 
-def test_a_fitted_correction_tells_windows_apart(monkeypatch):
-    monkeypatch.setattr(interval_fit, "_STEPS", 300)
+def test_a_fitted_correction_tells_windows_apart():
     presses = make_press_set(count=120, taps=1)
-    net = make_net(taps=1)
-    with torch.enable_grad():
-        fit_correction(net, presses, LEVEL)
-    again = make_net(taps=1)
-    with torch.enable_grad():
-        fit_correction(again, presses, LEVEL)
+    net, again = make_net(taps=1), make_net(taps=1)
+    for one in (net, again):
+        with torch.enable_grad():
+            fit_correction(one, presses, LEVEL, steps=300)
     assert torch.equal(net.intervals.leave.weight, again.intervals.leave.weight), "the same seed, the same weights"
     readings = readings_of_presses(presses, 1, times=1)[0]
     pattern, deviation = run(net)(readings.with_taps(1), readings.pads)[:2]

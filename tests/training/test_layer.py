@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from train.physics.elastic_layer import Layer, inner_displacement, inner_tangential, surface_compliance
+from train.physics.elastic_layer import Layer, inner_displacement, surface_compliance
 
 WAVES = np.array([0.0, 1e-6, 1e-3, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 1e3, 1e6])
 
@@ -26,27 +26,6 @@ def test_closed_form_is_the_formula_of_its_docstring():
     kappa = 3 - 4 * nu
     share = (kappa * np.sinh(2 * a) - 2 * a) / (kappa * np.cosh(2 * a) + 2 * a**2 + 5 - 12 * nu + 8 * nu**2)
     assert np.allclose(surface_compliance(layer, q), (1 - nu) / (layer.shear_modulus_mpa * q) * share)
-
-
-@pytest.mark.parametrize("load", ["pressure", "traction"])
-def test_inside_obeys_equilibrium(load):
-    layer, q, step = Layer(poisson=0.45), np.array([0.5]), 1e-3
-    heights = [2.0 - step, 2.0, 2.0 + step]
-    if load == "pressure":
-        w, u = np.array(
-            [(-down[0], along[0]) for down, along in (inner_displacement(layer, q, at) for at in heights)]
-        ).T
-    else:
-        fields = [inner_tangential(layer, q, height) for height in heights]
-        w, u, across = np.array([(field.sunk[0], field.along[0], field.across[0]) for field in fields]).T
-        assert (across[2] - 2 * across[1] + across[0]) / step**2 == pytest.approx(q[0] ** 2 * across[1], rel=1e-4)
-    slope_w, slope_u = (w[2] - w[0]) / (2 * step), (u[2] - u[0]) / (2 * step)
-    bend_w, bend_u = (w[2] - 2 * w[1] + w[0]) / step**2, (u[2] - 2 * u[1] + u[0]) / step**2
-    stiff = 1 / (1 - 2 * layer.poisson)
-    along_x = bend_u - q[0] ** 2 * u[1] + stiff * q[0] * (slope_w - q[0] * u[1])
-    along_z = bend_w - q[0] ** 2 * w[1] + stiff * (bend_w - q[0] * slope_u)
-    assert abs(along_x) < 1e-4 * abs(stiff * q[0] ** 2 * u[1])
-    assert abs(along_z) < 1e-4 * abs(stiff * q[0] ** 2 * w[1])
 
 
 @pytest.mark.parametrize("settings", [{"poisson": 0.5}, {"poisson": -0.1}, {"thickness_mm": 0.0}])

@@ -77,13 +77,6 @@ def test_what_is_no_file_of_presses_is_refused_in_one_line(tmp_path, content):
         load_presses(path)
 
 
-def test_a_file_that_cannot_be_written_is_said_and_leaves_nothing(tmp_path):
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(DatasetError, match=r"taken.*cannot be written"):
-        make_press_set(count=3).save(tmp_path / "taken" / "presses.npz")
-    assert (tmp_path / "taken").read_text() == ""
-
-
 def test_absent_taps_are_zeros_and_come_last():
     made = make_press_set(taps=2)
     more, fewer = made.with_taps(4), made.with_taps(1)

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from firmware_bridge.pad_geometry import USPA44
-from train.networks.tpsf_net import PsfNet, degrade, fit_psf_net, tpsf
+from train.experiments.paper.fig5 import PsfNet, degrade, fit_psf_net, tpsf
 
 PIXEL_MM = 0.47
 
@@ -49,29 +49,6 @@ def test_extreme_numbers_stay_finite_with_their_gradients(value):
     reading.sum().backward()
     assert torch.isfinite(reading).all() and (reading >= 0).all() and not reading[1].any() and (reading[2] > 0).all()
     assert all(torch.isfinite(one.grad).all() for one in given)
-
-
-def test_the_network_is_the_papers_and_divides_by_nothing():
-    net = PsfNet()
-    widths = [(layer.in_features, layer.out_features) for layer in net.layers if isinstance(layer, torch.nn.Linear)]
-    assert widths == [(48, 256), (256, 1024), (1024, 256), (256, 2)]
-    with torch.no_grad():
-        net.layers[-1].bias.fill_(-1e4)
-    counts, depth = torch.zeros(2, 3, 4, 4), rectangles(2)
-    assert torch.isfinite(net.degraded(net(counts), depth)).all()
-    net.loss(counts, depth).backward()
-    assert all(torch.isfinite(p.grad).all() for p in net.parameters())
-
-
-def test_the_loss_is_equation_9():
-    net, depth = PsfNet(), rectangles(3)
-    counts = torch.randn(3, 3, 4, 4) * 300
-    with torch.no_grad():
-        reading = net.degraded(net(counts), depth)
-        expected = np.mean(
-            [float(torch.linalg.vector_norm(reading[i] - counts[i, 2].clamp_min(0) / 100) ** 2) for i in range(3)]
-        )
-        assert float(net.loss(counts, depth)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_training_finds_the_patterns_of_a_sensor_that_is_the_model():

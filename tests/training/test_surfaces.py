@@ -1,5 +1,3 @@
-from math import pi, sin, sqrt
-
 import numpy as np
 import pytest
 import shapely
@@ -40,26 +38,9 @@ def test_every_surface_is_closed_and_fits_its_plate(name):
     assert mesh.euler_number == (2 if name in WITH_A_HOLE else 4)  # plate and figure, less two for the hole
 
 
-def test_shapes_have_the_areas_of_their_circumscribed_circles():
-    def regular(corners, radius_mm):
-        return corners / 2 * radius_mm**2 * sin(2 * pi / corners)
-
-    assert top_mm2(surface_mesh("large circle")) == pytest.approx(regular(96, 7))
-    assert top_mm2(surface_mesh("small square")) == pytest.approx(2 * 3.5**2)
-    assert top_mm2(surface_mesh("large triangle")) == pytest.approx(3 * sqrt(3) / 4 * 7**2)
-    inner = ((3.5 - 2.5) / 3.5) ** 2  # the triangle's inscribed circle has half the radius, the wall leaves 1 mm of it
-    assert top_mm2(surface_mesh("hollow triangle")) == pytest.approx(regular(3, 7) * (1 - inner))
-
-
-def test_letters_are_strokes_of_three_millimetres():
-    assert top_mm2(surface_mesh("T")) == pytest.approx(11 * 3 + 12 * 3)
-    corner = (pi / 4 - 1) * 1.5**2  # round outside, overlapping inside
-    assert top_mm2(surface_mesh("L")) == pytest.approx((12 + 8 + 2 * 1.5) * 3 + corner, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     "name",
-    ["Q", "", "s", "glyph", "glyph:", "glyph:-1", "glyph:1.5", "polygon:x", "polygon:²", "mesh", "mesh:", "cone:3"],
+    ["Q", "", "s", "glyph", "glyph:", "glyph:-1", "glyph:1.5", "polygon:²", "mesh", "mesh:", "cone:3"],
 )
 def test_an_unknown_name_lists_the_kinds(name):
     with pytest.raises(SurfaceError, match=r"small triangle.*glyph:SEED.*mesh:PATH"):
@@ -73,7 +54,7 @@ def test_a_users_file_is_a_surface_like_any_other(tmp_path):
     assert mesh.bounds.ravel() == pytest.approx([-3, -2, -2, 3, 2, 0])
 
 
-SEEDS = range(250)
+SEEDS = range(100)
 REACH_MM = {"glyph": GLYPH_REACH_MM, "polygon": POLYGON_REACH_MM}
 
 # Area, and centre x and y, of the first seeds.
@@ -109,16 +90,6 @@ def test_every_random_figure_is_valid_within_bounds_and_coarse_enough_to_feel(dr
 
 
 @pytest.mark.parametrize("kind", REACH_MM)
-def test_every_random_figure_is_raised_as_closed_bodies(drawn, kind):
-    for seed in SEEDS[::4]:
-        outline, mesh = drawn[kind][seed], surface_mesh(f"{kind}:{seed}")
-        assert mesh.is_watertight, seed
-        assert mesh.volume == pytest.approx(PLATE_MM**2 + FIGURE_HEIGHT_MM * outline.area), seed
-        tops = mesh.triangles[(mesh.triangles[:, :, 2] == 0).all(axis=1)]
-        assert shapely.contains_xy(outline, *tops.mean(axis=1)[:, :2].T).all(), seed
-
-
-@pytest.mark.parametrize("kind", REACH_MM)
 def test_a_seed_gives_one_figure_in_whole_micrometres_and_another_seed_another(drawn, kind):
     for seed in SEEDS[::25]:
         outline = figure(f"{kind}:{seed}")
@@ -135,7 +106,3 @@ def test_seeds_mean_the_same_figures_as_when_models_were_trained(drawn, kind):
     for seed, (area_mm2, x_mm, y_mm) in enumerate(known):
         centre = drawn[kind][seed].centroid
         assert [drawn[kind][seed].area, centre.x, centre.y] == pytest.approx([area_mm2, x_mm, y_mm], abs=0.05)
-
-
-def test_an_outline_that_simplifying_makes_cross_itself_is_drawn_again():
-    assert figure("glyph:2002433").is_valid

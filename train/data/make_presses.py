@@ -32,15 +32,13 @@ from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
 
-_INTERRUPTED: Final = 130
 _AT_ONCE: Final = 16
 
 
 def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
     """Solve the presses of a world, and write them; an interrupted call resumes.
 
-    Raises:
-        DatasetError: the file at `path` or its parts were made otherwise, or cannot be written.
+    DatasetError if files there were made otherwise or cannot be written.
     """
     facts = world.facts()
     if path.exists():
@@ -120,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         sys.stderr.write("train.data.make_presses: interrupted; the same command continues\n")
-        return _INTERRUPTED
+        return 130
     rate = len(made) * made.taps / (time.monotonic() - started_s)
     sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
     if len(made) < world.count:

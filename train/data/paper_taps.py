@@ -32,7 +32,6 @@ from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANG
 FORCE_N: Final = 9.2  # force at which presses end, so that set forces up to 8 N with 15 % of spread lie on them
 _AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bundled frozen set has its poses
 _PER_TAP: Final = ("poses", "counts", "force_n", "indentation_mm")
-_ARRAYS: Final = ("surfaces", *_PER_TAP, "unit_patterns", "touching")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,8 @@ class PaperTaps:
 
     def pick(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> "PaperTaps":
         """Return the sequences at the indices."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
+        names = ("surfaces", *_PER_TAP, "unit_patterns", "touching")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def at_scale(self, scale: int) -> "PaperTaps":
         """Return the sequences with the truth at another scale."""

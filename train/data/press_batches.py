@@ -81,7 +81,6 @@ The first two are new sensors, the second kind wider than most; in the others ca
 of the spread, which the certainty of the gains states.
 """
 _NEW_SENSORS: Final = Nuisances(dead_taxels=0.02)
-_SURE: Final = 0.1  # standard deviation of a constant used as input, over its spread: error that calibration leaves
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +117,7 @@ class PressBatches:
 
     `given` is the share of windows with 1, 2, ... K taps, whose older taps are dropped. Windows of one tap are drawn
     from sequences with fewer taps where these exist, because they are many more.
-
-    Raises:
-        DatasetError: there are no presses of K taps.
+    DatasetError if there are no presses of K taps.
     """
 
     def __init__(
@@ -221,27 +218,13 @@ def known_of_pads(
     toss = rng.random(len(constants))[:, None]
     coins = rng.random(constants.shape) < 0.5
     known = np.where(toss < _NOTHING, False, (toss < _NOTHING + _ALL) | coins)
-    unsure = (_SURE * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
+    # A tenth of a constant's spread is the error that calibration leaves.
+    unsure = (0.1 * rng.standard_normal(constants.shape).astype(np.float32)).astype(np.float32)
     return known_numbers(constants + unsure, known, certainty)
 
 
-_SINGLE: Final = 0.7
-"""Share of batches of one tap that are drawn from presses of one tap, if there are any: they are many more."""
-_AS_MADE: Final = 0.5
-"""Share of batches that keep a sequence's newest taps; in the others any of its earlier taps are left out."""
-_ERRORS_MM: Final = (0.05, 1.5)
-_ERRORS_DEG: Final = (0.3, 6.0)  # bounds of the stated errors of a window's poses, drawn evenly by their logarithms
-_ASTRAY: Final = 0.04  # share of earlier taps that are farther off than stated: by several of the largest stated errors
-_ASTRAY_MM: Final = 2.0
-_ASTRAY_DEG: Final = 8.0
-
-
 class PosedBatches:
-    """Batches of windows with poses, pad inputs, and truth.
-
-    Raises:
-        DatasetError: there are no presses of so many taps.
-    """
+    """Batches of windows with poses, pad inputs, and truth; DatasetError if there are no presses of so many taps."""
 
     def __init__(
         self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int, sensor: OneSensor | None = None
@@ -261,7 +244,8 @@ class PosedBatches:
         rng = np.random.default_rng([self._seed, 2, number])
         taps = 1 + int(rng.choice(len(self._given), p=self._given))
         rows = self._rows[taps - 1]
-        if taps == 1 and len(self._single) and rng.random() < _SINGLE:
+        # Most batches of one tap are drawn from presses of one tap, if there are any: they are many more.
+        if taps == 1 and len(self._single) and rng.random() < 0.7:
             rows = self._single
         picked = self._presses.pick(rng.choice(rows, self._batch, replace=len(rows) < self._batch))
         picked = _some_of(rng, picked, taps)
@@ -280,14 +264,16 @@ def stated_poses(
     shape = (*poses.shape[:2], 1)
     if errors is None:
         one = (len(poses), 1, 1)
-        size = np.concatenate([log_uniform(rng, *bounds, one) for bounds in (_ERRORS_MM, _ERRORS_DEG)], axis=2)
+        # In [mm] and [deg].
+        size = np.concatenate([log_uniform(rng, *bounds, one) for bounds in ((0.05, 1.5), (0.3, 6.0))], axis=2)
     else:
         size = np.broadcast_to(np.array(errors), (len(poses), 1, 2))
     size = np.repeat(size, shape[1], axis=1)
     off = rng.standard_normal(poses.shape).clip(-2, 2) * size[..., [0, 0, 1]]
     if errors is None:
-        astray = rng.standard_normal(poses.shape) * (_ASTRAY_MM, _ASTRAY_MM, _ASTRAY_DEG)
-        off = np.where(rng.random(shape) < _ASTRAY, astray, off)
+        astray = rng.standard_normal(poses.shape) * (2.0, 2.0, 8.0)
+        # Some are farther off than stated, by several of the largest stated errors.
+        off = np.where(rng.random(shape) < 0.04, astray, off)
     stated = np.concatenate([poses + off, size], axis=2)
     stated[:, 0] = 0
     return stated.astype(np.float32)
@@ -295,7 +281,8 @@ def stated_poses(
 
 def _some_of(rng: np.random.Generator, presses: PressSet, taps: int) -> PressSet:
     """Return sequences with `taps` taps each, the newest among them."""
-    if taps == presses.taps or rng.random() < _AS_MADE:
+    # Half of the batches keep a sequence's newest taps; in the others any of its earlier taps are left out.
+    if taps == presses.taps or rng.random() < 0.5:
         return presses.with_taps(taps)
     there = presses.counts.any(axis=(2, 3, 4))
     rank = np.where(there, rng.random(there.shape), 2.0)

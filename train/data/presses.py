@@ -27,8 +27,6 @@ SEED: Final = 20240228
 SCHEMA: Final = "tactile-edge-sr presses"
 VERSION: Final = 3
 """Version of the presses; 2 corrected the outlines' places and reduced the spread of the magnets, 3 added poses."""
-_NO_POSES: Final = 2  # version without poses, which is still loaded: its taps were turned at one place
-_MOST_BYTES: Final = 1 << 33
 _MOST_FACTS_BYTES: Final = 1 << 22  # largest configuration read, in bytes; real ones take a few kB
 _AXES: Final = {
     "family": ("U", "n"),
@@ -130,11 +128,7 @@ class PressSet:
         return digest.hexdigest()
 
     def save(self, path: Path, *, compressed: bool = False) -> None:
-        """Write the presses as one npz, atomically.
-
-        Raises:
-            DatasetError: the file cannot be written.
-        """
+        """Write the presses as one npz, atomically; DatasetError if it cannot be written."""
         arrays = {name: getattr(self, name) for name in _AXES}
         arrays["touching"] = np.packbits(self.touching, axis=-1)
         facts = json.dumps({"config": self.config, "sha256": self.sha256()})
@@ -155,8 +149,7 @@ class PressSet:
 def load_presses(path: Path) -> PressSet:
     """Load a file that `PressSet.save` has written.
 
-    Raises:
-        DatasetError: absent, of another format, of a newer schema, incomplete, or damaged.
+    DatasetError if it is absent, of another or newer format, or damaged.
     """
     try:
         about = read_npz(path, ("schema", "version", "facts"), _MOST_FACTS_BYTES)
@@ -166,8 +159,9 @@ def load_presses(path: Path) -> PressSet:
                 f"at most {VERSION}: make it with 'python -m train.data.make_presses'"
             )
         facts: Any = json.loads(str(about["facts"]))
-        names = [name for name in _AXES if name != "poses" or int(about["version"]) > _NO_POSES]
-        arrays = dict(read_npz(path, names, _MOST_BYTES))
+        # Version 2 has no poses: its taps were turned at one place.
+        names = [name for name in _AXES if name != "poses" or int(about["version"]) > 2]
+        arrays = dict(read_npz(path, names, 1 << 33))
         if "poses" not in arrays:
             turns_deg = arrays["angle_deg"][:, :1] - arrays["angle_deg"]
             arrays["poses"] = np.stack([*np.zeros((2, *turns_deg.shape), np.float32), turns_deg], axis=2)
@@ -190,8 +184,7 @@ def load_presses(path: Path) -> PressSet:
 def join_presses(parts: Sequence[PressSet]) -> PressSet:
     """Concatenate sequences, padded to the taps of the longest; pads are renumbered, so that they stay distinct.
 
-    Raises:
-        DatasetError: there are no parts.
+    DatasetError if there are none.
     """
     if not parts:
         raise DatasetError("no presses to join: name at least one file")

@@ -63,9 +63,7 @@ def recorded_grips(folder: Path) -> list[Grip]:
     """Load the recordings of real sensors, each with its sensor's rest level.
 
     The rest level is taken from the end of the trial that ends with the least load: there the grip was released.
-
-    Raises:
-        DatasetError: the folder or recordings in it do not exist, or one cannot be read.
+    DatasetError if there are none, or one cannot be read.
     """
     paths = recording_paths(folder)
     if not paths:

@@ -26,11 +26,6 @@ LEAST_FORCE_N: Final = 0.1
 """Least force of a press that is kept: about twice the force at which a contact is detected above the noise."""
 MOST_DRAWS: Final = 40
 """Most draws of a press of a user's mesh: of a sloping finger one in seven is kept, so that all are found."""
-_STILL: Final = 0.35  # share of presses without any drag; half of the others are twisted as well
-_SLIDE_MM: Final = (0.02, 0.6)
-_TWIST_RAD: Final = 0.03
-_LEAST_BEGUN: Final = 0.2  # least depth of a newest tap that has only begun, over that of the earlier ones
-_FRICTION: Final = (0.2, 1.2)  # bounds of Coulomb's coefficient: polished steel to rubber on silicone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,18 +135,18 @@ def press_shapes(
     depths_mm = np.repeat(rng.uniform(*INDENTATION_MM, n)[:, None], taps, axis=1)
     depths_mm[:, 1:] *= rng.uniform(0.85, 1.15, (n, taps - 1))  # ends of taps differ
     only_begun = rng.random(n) < begun
-    depths_mm[only_begun, 1:] /= rng.uniform(_LEAST_BEGUN, 1, (int(only_begun.sum()), 1))
+    depths_mm[only_begun, 1:] /= rng.uniform(0.2, 1, (int(only_begun.sum()), 1))
     depth_mm = depths_mm.ravel()
-    dragged = rng.random(n * taps) > _STILL
+    dragged = rng.random(n * taps) > 0.35  # half of these are twisted as well
     way = rng.uniform(0, 2 * np.pi, n * taps)
-    far = log_uniform(rng, *_SLIDE_MM, (n * taps,)) * dragged
-    twist = rng.normal(0, _TWIST_RAD, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
+    far = log_uniform(rng, 0.02, 0.6, (n * taps,)) * dragged
+    twist = rng.normal(0, 0.03, n * taps) * (dragged & (rng.random(n * taps) < 0.5))
     done = gripped.press(
         np.concatenate([one.heights_mm for one in tapped]),
         np.clip(depth_mm, *INDENTATION_MM),
         np.stack([far * np.cos(way), far * np.sin(way)], axis=1),
         twist,
-        rng.uniform(*_FRICTION, n * taps),
+        rng.uniform(0.2, 1.2, n * taps),  # Coulomb's coefficient: polished steel to rubber on silicone
         [one.cover for one in tapped for _ in range(taps)],
         scale=scale,
     )

@@ -15,7 +15,7 @@ from edge.errors import EdgeError
 from edge.inference.bundled import BUNDLE_DIR
 from edge.terminal.progress_bar import tracked
 from train.errors import TrainError
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 
 EXPERIMENTS: Final = {
     "families": ("sensor.families", "the shipped model and its intervals on every family, next to baselines"),

@@ -49,8 +49,6 @@ _LEVEL: Final = 0.3
 """Share of shapes that lie level; the others tilt by up to three degrees, most of them by less than one."""
 _REACH_MM: Final = 6.0
 _FIGURE_SLOPE: Final = float(np.tan(np.radians(0.5)))
-_FIGURES_PER_SEED: Final = 1_000_000
-_MOST_TRIES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +93,7 @@ def _that_meet(
     maps, met = [], poses.copy()
     for pose in met:
         heights_mm = seen_from(pose)
-        for _ in range(_MOST_TRIES):
+        for _ in range(6):
             if heights_mm.max() > NOWHERE_MM / 2:
                 break
             pose[:2] /= 2
@@ -133,7 +131,7 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
     if family == "paper":
         name = str(rng.choice(SURFACES))
     elif family in FIGURES:
-        name = f"{family}:{int(rng.integers(_FIGURES_PER_SEED, 2**40))}"
+        name = f"{family}:{int(rng.integers(1_000_000, 2**40))}"
     newest = random_poses(rng, 1)[0]
 
     def seen_from(pose: NDArray[np.float64]) -> NDArray[np.float32]:

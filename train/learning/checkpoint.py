@@ -42,10 +42,8 @@ from train.networks.registry import build, grown
 from train.networks.symmetric import read_back
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
-_INFERRED_AT_ONCE: Final = 128
 _GRAPH: Final = ".onnx"
 ORIGIN_KEY: Final = "tactile.origin"
-_STATED: Final = ("network", "scale", "options", "training_sha256")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +155,7 @@ def batches_of(
 ) -> Callable[[int], Batch]:
     """Return batches for a recipe, whose taps were only turned unless they are posed.
 
-    Raises:
-        DatasetError: no sequence has as many taps, or the scale is not that of the presses.
+    DatasetError if no sequence has as many taps, or the presses have another scale.
     """
     if scale != data.scale:
         raise DatasetError(
@@ -177,8 +174,7 @@ def _path_of(start: str, folder: Path) -> Path:
 def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
     """Load the network of NAME.pt in evaluation mode, with its report from NAME.json, or of a float32 NAME.onnx.
 
-    Raises:
-        CheckpointError: a file is missing, or the weights do not fit the configuration.
+    CheckpointError if a file is missing, or the weights do not fit.
     """
     try:
         if path.suffix == _GRAPH:
@@ -203,7 +199,8 @@ def sensor_of(report: Mapping[str, Any]) -> OneSensor | None:
 
 def origin(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the metadata that identify a graph's network, from a checkpoint's report."""
-    return {ORIGIN_KEY: json.dumps({key: report[key] for key in _STATED}, sort_keys=True)}
+    stated = {key: report[key] for key in ("network", "scale", "options", "training_sha256")}
+    return {ORIGIN_KEY: json.dumps(stated, sort_keys=True)}
 
 
 def origin_of(model: onnx.ModelProto) -> dict[str, Any]:
@@ -231,7 +228,7 @@ def infer(net: PatternNet, windows: NDArray[np.float32]) -> tuple[NDArray[np.flo
     device = next(net.parameters()).device
     rows: list[tuple[torch.Tensor, ...]] = []
     with torch.inference_mode():
-        for part in torch.split(network_input(windows), _INFERRED_AT_ONCE):
+        for part in torch.split(network_input(windows), 128):
             given = net(part.to(device))
             rows.append(given if isinstance(given, tuple) else (given,))
     outputs = [torch.cat(maps).float().cpu().numpy() for maps in zip(*rows, strict=True)]

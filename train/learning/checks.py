@@ -28,7 +28,6 @@ from train.physics.sensor_noise import Nuisances
 _FAR_MM: Final = (25.0, 80.0)
 _FIELD_COUNTS: Final = (150.0, 1500.0)
 """Largest count of a far magnet's field on the pad: from a tenth of a firm press to the end of the range of x and y."""
-_WRONG_GAINS: Final = 0.25
 Counts = NDArray[np.float32]
 Spoiling = Callable[[np.random.Generator, Counts], Counts]
 
@@ -108,7 +107,7 @@ def _half_of_another(rng: np.random.Generator, counts: Counts) -> Counts:
 
 
 def _wrong_gains(rng: np.random.Generator, counts: Counts) -> Counts:
-    return (counts * (1 + _WRONG_GAINS * rng.standard_normal(counts.shape))).astype(np.float32)
+    return (counts * (1 + 0.25 * rng.standard_normal(counts.shape))).astype(np.float32)
 
 
 SPOILINGS: Final[tuple[Spoiling, ...]] = (
@@ -127,20 +126,15 @@ def spoiled(rng: np.random.Generator, counts: Counts) -> Counts:
     return wrong
 
 
-_CONTACT_ROUNDS: Final = 5  # readings of each press
-_CONTACT_WIDTHS: Final = (256, 128, 64)
-_CONTACT_WEIGHT_DECAY: Final = 0.03
 _CERTAINTIES: Final = (0.0, 0.0, 0.5, 0.8)
 _BATCH: Final = 512
-_LEARNING_RATE: Final = 4e-3
-_LEAST_SPREAD: Final = 1e-3
 
 
 def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
     """Fit the network to presses read by sensors with gains more or less certain, and to the same, spoiled."""
     rng = np.random.default_rng([seed, 3])
     right, wrong = [], []
-    for number in range(_CONTACT_ROUNDS):
+    for number in range(5):  # readings of each press
         readings, pads = drawn_readings(presses, seed + number)
         strong = readings[:, 2].max(axis=(1, 2)) > LEAST_COUNTS
         readings, pads = moved(rng, readings[strong]), pads[strong]
@@ -150,7 +144,7 @@ def fit_contact_network(presses: PressSet, seed: int, steps: int) -> SmallNetwor
             changed = (faulty != readings).any(axis=(1, 2, 3))
             wrong.append(features_of(faulty[changed], pads[changed]))
     sides = np.concatenate(right), np.concatenate(wrong)
-    return fit_classifier(*sides, _CONTACT_WIDTHS, steps, seed, _CONTACT_WEIGHT_DECAY)
+    return fit_classifier(*sides, (256, 128, 64), steps, seed, 0.03)
 
 
 def drawn_readings(presses: PressSet, seed: int) -> tuple[Counts, NDArray[np.float32]]:
@@ -201,26 +195,20 @@ def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float,
 
 
 _DEPTHS: Final = (0.85, 1.15)
-_TAP_ROUNDS: Final = 3  # readings of each sequence, each by another sensor, and half of them of mirror images
-_PAIRS: Final = 6  # pairs of taps of each reading of a sequence
-_TAP_WIDTHS: Final = (192, 96)
-_TAP_WEIGHT_DECAY: Final = 0.1
 _OFF_MM: Final = (1.5, 6.0)
 _OFF_DEG: Final = (10.0, 90.0)
 """Bounds of the errors of a pose that is wrong, or a tap that is there although the pad did not move."""
 _FAR: Final = 3.0  # errors of a pose that is wrong, in stated deviations at least
 _USUAL: Final = (0.2, 1.0)
-_MIRROR: Final = 4  # number of the mirror image, left for right, among the symmetries
-_MIRRORED_POSE: Final = np.array([-1, 1, -1], dtype=np.float32)
 
 
 def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
     """Fit the network to pairs of taps at poses as stated, and to others."""
     rng = np.random.default_rng([seed, 7])
     right, wrong = [], []
-    for number in range(_TAP_ROUNDS):
+    for number in range(3):  # readings of each sequence, each by another sensor, and half of them of mirror images
         readings, poses = strong_taps(presses, seed + number, mirror=number % 2 == 1)
-        for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:_PAIRS]:
+        for newest, earlier in rng.permutation([*permutations(range(presses.taps), 2)])[:6]:
             there = readings[:, [newest, earlier]].any(axis=(2, 3, 4)).min(axis=1)
             pair = readings[there][:, [newest, earlier]]
             pose = relative(poses[there, newest], poses[there, earlier])
@@ -230,7 +218,7 @@ def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
             near = (np.hypot(*off[:, :2].T) <= _FAR * stated[:, 1, 3]) & (off[:, 2] <= _FAR * stated[:, 1, 4])
             right.append(pair_features(pair[near], stated[near]))
             wrong += [pair_features(*one) for one in _wrong(rng, pair, pose, stated)]
-    return fit_classifier(np.concatenate(right), np.concatenate(wrong), _TAP_WIDTHS, steps, seed, _TAP_WEIGHT_DECAY)
+    return fit_classifier(np.concatenate(right), np.concatenate(wrong), (192, 96), steps, seed, 0.1)
 
 
 def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
@@ -264,7 +252,8 @@ def strong_taps(presses: PressSet, seed: int, *, mirror: bool = False) -> tuple[
     """Return windows (n, K, 3, rows, cols) in counts whose taps are strong enough or absent, and their poses."""
     readings, poses = read_presses(presses, Nuisances(), seed), presses.poses
     if mirror:
-        readings, poses = moved_scans(readings, _MIRROR), poses * _MIRRORED_POSE
+        # Left for right.
+        readings, poses = moved_scans(readings, 4), poses * np.array([-1, 1, -1], dtype=np.float32)
     there = presses.counts.any(axis=(2, 3, 4))
     strong = ((readings[:, :, 2].max(axis=(2, 3)) > LEAST_COUNTS) | ~there).all(axis=1)
     return readings[strong], poses[strong]
@@ -307,13 +296,13 @@ def fit_classifier(
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     centre = right.mean(axis=0)
-    spread = right.std(axis=0) + _LEAST_SPREAD
+    spread = right.std(axis=0) + 1e-3
     sides = [torch.from_numpy((rows - centre) / spread) for rows in (right, wrong)]
     sizes = [right.shape[1], *widths, 1]
     layers = [nn.Linear(a, b) for a, b in pairwise(sizes)]
     network = nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())))[:-1]
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _LEARNING_RATE, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 4e-3, total_steps=steps)
     truth = torch.cat([torch.zeros(_BATCH), torch.ones(_BATCH)])
     for _ in range(steps):
         rows = torch.cat([side[torch.from_numpy(rng.integers(len(side), size=_BATCH))] for side in sides])

@@ -44,11 +44,7 @@ _SCALES: Final = (
     (CONSTANTS[-1], Nuisances().cross_talk / 2, Nuisances().cross_talk / 2),
 )
 """Name, middle and half range of each."""
-PASSES: Final = 3
-_COMPONENTS: Final = 48
 _ROUNDS: Final = 12
-_RIDGE: Final = 1e-4  # variance added on each channel: a hundredth of the mean z
-_SOFT: Final = 2.0 * CHANNELS  # presses of a middle pad that a component's slopes over each constant are drawn to
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,12 +125,11 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
 def fit_mixture(presses: PressSet, seed: int = 0) -> ContactMixture:
     """Fit the mixture by expectation-maximisation to presses, as of `even_contacts`.
 
-    Raises:
-        DatasetError: too few presses for one component, which needs twice as many as there are channels.
+    DatasetError if they are fewer than two for each channel.
     """
     contacts, constants = even_contacts(presses, seed)
     design = np.insert(constants, 0, 1.0, axis=1)
-    components = min(_COMPONENTS, len(contacts) // (2 * CHANNELS))
+    components = min(48, len(contacts) // (2 * CHANNELS))
     if not components:
         raise DatasetError(f"{len(contacts)} presses strong enough, expected {2 * CHANNELS} or more: make more")
     mixture = _fitted(contacts, design, _nearest(contacts, np.random.default_rng(seed), components))
@@ -189,11 +184,10 @@ def _widening(ratios: Sequence[NDArray[np.floating]]) -> float:
     return float(np.quantile(np.abs(np.concatenate(ratios)), 0.9)) / LEVEL_90
 
 
-def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = PASSES) -> GainLearner:
+def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = 3) -> GainLearner:
     """Return the learner after several passes over contacts (n, 3, rows, cols), zeroed, each that differs once a pass.
 
-    Raises:
-        DatasetError: no contact is strong enough.
+    DatasetError if no contact is strong enough.
     """
     learner = GainLearner(model)
     for number in range(passes):
@@ -231,7 +225,8 @@ def _nearest(contacts: NDArray[np.float64], rng: np.random.Generator, components
 def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights: NDArray[np.float64]) -> ContactMixture:
     """Fit components by weighted least squares; those of few presses are regularised by the covariance of all."""
     pooled = np.cov(contacts.T)
-    soft = np.diag([1e-6, *[_SOFT] * len(CONSTANTS)])
+    # Slopes over each constant are drawn to those of a middle pad, with the weight of so many presses.
+    soft = np.diag([1e-6, *[2.0 * CHANNELS] * len(CONSTANTS)])
     means, covariances = [], []
     for weight in weights.T:
         used = np.flatnonzero(weight > 1e-4)
@@ -240,7 +235,8 @@ def _fitted(contacts: NDArray[np.float64], design: NDArray[np.float64], weights:
         away = read - columns @ mean
         spread = away.T @ (part[:, None] * away) + 0.1 * pooled
         means.append(mean)
-        covariances.append(spread / (part.sum() + 1) + _RIDGE * np.eye(CHANNELS))
+        # A hundredth of the mean z on each channel.
+        covariances.append(spread / (part.sum() + 1) + 1e-4 * np.eye(CHANNELS))
     share = (weights.sum(axis=0) + 1) / (len(weights) + weights.shape[1])
     return ContactMixture(share, np.array(means), np.array(covariances))
 

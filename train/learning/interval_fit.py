@@ -31,17 +31,9 @@ from train.physics.sensor_noise import Nuisances
 
 LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.8, 0.9, 0.95)
-_PER_FAMILY: Final = 1000  # training presses of each family: rare families weigh as much as frequent ones
 _SAMPLES: Final = 24  # pixels of each region of a window
-_PRESSES_AT_ONCE: Final = 512
-_ROUNDS: Final = 2  # sensors that read each training press
-_STEPS: Final = 2000
-_BATCH: Final = 512
 _RATE: Final = 5e-3
-_DECAY: Final = 0.1
-_LEAST_ERROR_MM: Final = 1e-6
 _LEAST_RATIO: Final = 1e-3
-_READINGS: Final = 3  # sensors that read each validation press
 
 Run = Callable[
     [NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None], Sequence[NDArray[np.float32]]
@@ -84,7 +76,7 @@ class Readings:
 
 
 def readings_of_presses(
-    presses: PressSet, taps: int, times: int = _READINGS, *, posed: bool = False, sensor: OneSensor | None = None
+    presses: PressSet, taps: int, times: int = 3, *, posed: bool = False, sensor: OneSensor | None = None
 ) -> list[Readings]:
     """Return presses as sensors of their own read them, with nothing and with everything known of each sensor.
 
@@ -106,7 +98,7 @@ def readings_of_presses(
     return found
 
 
-def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0) -> None:
+def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, seed: int = 0, steps: int = 2000) -> None:
     """Add a correction to a trained network in evaluation mode, fitted on presses, some of them with all its taps."""
     torch.manual_seed(seed)
     correction = net.add_intervals()
@@ -117,10 +109,10 @@ def fit_correction(net: CompactNet, presses: PressSet, contact_level: float, see
     correction.spread.copy_(torch.where(spread > 1e-3, spread, torch.ones_like(spread)))
     there = ~ratios.isnan()
     ratios = ratios.nan_to_num()
-    optimiser = torch.optim.AdamW(correction.parameters(), _RATE, weight_decay=_DECAY)
-    course = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=_STEPS)
-    for _ in range(_STEPS):
-        picked = torch.randint(len(summary), (min(_BATCH, len(summary)),))
+    optimiser = torch.optim.AdamW(correction.parameters(), _RATE, weight_decay=0.1)
+    course = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
+    for _ in range(steps):
+        picked = torch.randint(len(summary), (min(512, len(summary)),))
         beyond = ratios[picked] - correction.log_factors(summary[picked], later[picked])[:, :, None]
         loss = (torch.maximum(LEVEL * beyond, (LEVEL - 1) * beyond) * there[picked]).sum() / there[picked].sum()
         optimiser.zero_grad()
@@ -181,21 +173,23 @@ def _samples(
     whole = presses.with_taps(net.taps)
     usable = np.flatnonzero(whole.counts[:, -1].any(axis=(1, 2, 3)) & (presses.taps >= net.taps))
     names = whole.family[usable]
-    kept = [rng.permutation(usable[names == name])[:_PER_FAMILY] for name in np.unique(names)]
+    # Rare families weigh as much as frequent ones.
+    kept = [rng.permutation(usable[names == name])[:1000] for name in np.unique(names)]
     chosen = whole.pick(rng.permutation(np.concatenate(kept))) if kept else whole
-    at_once = min(_PRESSES_AT_ONCE, len(chosen))
+    at_once = min(512, len(chosen))
     batches = PosedBatches if net.takes_poses else PressBatches
     draw = batches(chosen, (1 / net.taps,) * net.taps, at_once, seed)
     unit = float(half_width_mm(1.0))
     found: list[tuple[Any, ...]] = []
-    for number in tracked(range(max(_ROUNDS * len(chosen) // at_once, 1)), "intervals", "batch"):
+    # Two sensors read each press.
+    for number in tracked(range(max(2 * len(chosen) // at_once, 1)), "intervals", "batch"):
         batch = draw(number)
         with torch.inference_mode():
             posed = () if batch.poses is None else (batch.poses,)
             seen = net.see(batch.window, batch.pad, *posed)
             pattern = torch.relu(seen.pattern)
             _, summary = correction.summary(seen.features, pattern, seen.deviation, seen.about, seen.later)
-            error = (pattern - batch.pattern / seen.newest).abs() + _LEAST_ERROR_MM
+            error = (pattern - batch.pattern / seen.newest).abs() + 1e-6
             region = regions(pattern.numpy(), float(correction.contact_level), correction.near)
             found.append((summary, seen.later, _drawn(torch.log(error / (seen.deviation * unit)), region)))
     # A copy, because tensors of inference take no gradient.

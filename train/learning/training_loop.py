@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 import torch
 from torch import distributed, nn
@@ -39,8 +39,6 @@ _VALIDATIONS: Final = 5  # number of validations over a run
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
-_KEEP_EVERY_S: Final = 60.0
-_LOG_EVERY: Final = 50
 
 
 DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFError, UnpicklingError)
@@ -155,22 +153,13 @@ def train(
     identity: str = "",
     log_folder: Path | None = None,
     validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
+    keep_every_s: float = 60.0,
 ) -> Trained:
-    """Train a network in place; an interrupted run resumes when this is called again.
+    """Train a network in place, and leave it in evaluation mode; an interrupted run resumes when this is called again.
 
-    Args:
-        net: on any device; left in evaluation mode.
-        objective: loss function.
-        batches: function from a number to its batch.
-        recipe: hyperparameters.
-        resume_path: file that keeps the state; the caller deletes it when the result is safe.
-        identity: of network and data; an interrupted run resumes only with the same identity.
-        log_folder: for TensorBoard, or None.
-        validate: returns figures to log and to keep, of the network in evaluation mode.
-
-    Raises:
-        ValueError: a batch cannot be shared evenly by the processes.
-        DivergedError: the loss is not finite; the network is as it was before that step.
+    It resumes with the same `identity`, of network and data, from the state in `resume_path`, which the caller deletes
+    when the result is safe. `validate` returns figures to log and to keep. ValueError if a batch cannot be shared
+    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
     """
     rank, world = rank_and_world()
     if recipe.batch % world:
@@ -213,7 +202,7 @@ def train(
                 course.append({"step": step, **figures})
                 net.train()
             now_s = time.monotonic()
-            if rank == 0 and now_s - kept_s > _KEEP_EVERY_S:
+            if rank == 0 and now_s - kept_s > keep_every_s:
                 figures = {"step": step, "elapsed_s": now_s - started_s, "course": course}
                 _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
                 kept_s = time.monotonic()
@@ -252,7 +241,7 @@ class _Log:
 
     def step(self, step: int, loss: float, rate: float) -> None:
         self._bar.advance()
-        if step % _LOG_EVERY == 0:
+        if step % 50 == 0:
             self._bar.note(f"loss {loss:.4f}")
             self.figures(step, {"loss": loss, "learning rate": rate})
 
@@ -278,14 +267,7 @@ def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
     return max(by_steps, float(by_time))
 
 
-class _Part(Protocol):
-    """Part of a run that has a state: network, optimizer, objective."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
-
-
-def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
+def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
     """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
     if not path.exists():
         return {"step": 0, "elapsed_s": 0.0, "course": []}
@@ -300,7 +282,7 @@ def _restored(path: Path, parts: Mapping[str, _Part], recipe_sha256: str, device
     return {"course": []} | state
 
 
-def _keep(path: Path, parts: Mapping[str, _Part], facts: Mapping[str, Any]) -> None:
+def _keep(path: Path, parts: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
     """Keep the state of a run on disk, so that an interruption costs at most a minute."""
     state = {name: part.state_dict() for name, part in parts.items()} | dict(facts)
     write_in_place(

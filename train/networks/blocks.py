@@ -1,16 +1,12 @@
 """Bases of all networks and objectives; a loss is relative to each pattern's size, so light contacts count."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from train.data.press_batches import Batch
-
-_LEAST_TRUTH_MM: Final = 1e-4
-"""Least RMS of a truth, in [mm]; smaller ones count as this, because a micrometre deep is no contact."""
-_LEAST_SHARE_SQUARED: Final = 1e-6  # term added below the root, whose slope at 0 is unbounded
 
 
 class PatternNet(nn.Module):
@@ -82,9 +78,10 @@ def relative_rms_error(patterns: Tensor, truth: Tensor) -> Tensor:
     Its minimum is near the mean of the possible patterns, which gains .1 dB over their median (docs/decisions.md).
     """
     share = (patterns - truth) / truth_size(truth)
-    return (share.square().mean(dim=(1, 2)) + _LEAST_SHARE_SQUARED).sqrt().mean()
+    return (share.square().mean(dim=(1, 2)) + 1e-6).sqrt().mean()  # the root's slope at 0 is unbounded
 
 
 def truth_size(truth: Tensor) -> Tensor:
     """Return the RMS of each pattern of (n, H, W), bounded below, as (n, 1, 1) in [mm]."""
-    return truth.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp_min(_LEAST_TRUTH_MM)
+    # A tenth of a micrometre deep is no contact.
+    return truth.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp_min(1e-4)

@@ -22,17 +22,8 @@ QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a tap's own before the division by it: noise and absent taps stay small."""
 TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
-_LEAST_DEVIATION: Final = 1e-4
-"""Smallest deviation of a tap of amplitude 1, in [mm]: .05 % of the indentation of such a tap."""
-_FIRST_UNCERTAINTY: Final = log(expm1(0.02))
-"""Offset before the softplus: the initial deviation of a tap of amplitude 1 is about 0.02 mm."""
 _MOST_LOGIT: Final = 8.0
 """Bound of what the deviation is the softplus of: no tap of amplitude 1 has a deviation of 8 mm."""
-_LEAST_SHARE: Final = 1e-3
-"""Deviation added in the loss, as a share of the truth's RMS, so that no pixel with a tiny error dominates."""
-_TRACTION_KPA: Final = 30.0  # traction of an output of 1 and a tap of amplitude 1, in [kPa]
-_TRACTION_SHARE: Final = 0.2  # weight of the traction's relative error in the loss
-_LEAST_KPA: Final = 0.05  # least RMS traction of a truth, in [kPa]; smaller ones count as this
 
 
 class CompactNet(PatternNet):
@@ -41,19 +32,9 @@ class CompactNet(PatternNet):
     A tap enters the pattern branch divided by its own amplitude, and the newest tap's amplitude multiplies the
     result: a flat contact's pattern is nearly linear in its force, so the trunk has to learn shapes only, and no force
     is out of its range. The amplitude itself enters as a bounded number, for the nonlinear part. An absent tap is all
-    zeros, and stays zero.
-
-    Args:
-        taps: K.
-        scale: pattern pixels per taxel pitch, even.
-        channels: of the trunk, a multiple of the symmetries.
-        blocks: residual blocks of the trunk.
-        known: numbers that say constants of the pad, see train.physics.pad_draws.
-        group: symmetries. Not mirror images: a mirrored pad is turned the other way from tap to tap.
-        intervals: correct the deviations by region, as after `add_intervals`.
-
-    Raises:
-        ValueError: no taps, an odd scale, or channels that do not divide.
+    zeros, and stays zero. `known` numbers state constants of the pad, `intervals` corrects the deviations by region as
+    `add_intervals` does. Mirror images are not in `group`: a mirrored pad is turned the other way from tap to tap.
+    ValueError if there are no taps, the scale is odd, or channels do not divide.
     """
 
     deviation_scale: Tensor  # factor on the deviation, see train.learning.interval_fit.calibrate
@@ -129,9 +110,7 @@ class CompactNet(PatternNet):
         Patterns are cut at zero in evaluation but not in training: a sub-pixel that is cut everywhere would never learn
         again. Deviations are always above zero; their loss does not train the features of the pattern.
 
-        Args:
-            window: (n, 3K, rows, cols) in network units.
-            pad: (n, known), constants of the pads; None for no constants. A network that takes none ignores them.
+        Windows are (n, 3K, rows, cols) in network units, constants of the pads (n, known), None for none.
         """
         return self.finished(self.see(window, pad))
 
@@ -175,21 +154,19 @@ class CompactNet(PatternNet):
         """Return the outputs of the trunk's last state, for amplitudes `newest` (n, 1, 1) and earlier taps `later`."""
         features = torch.cat([state, entered.felt], dim=1)
         pattern = self.leave(features)[:, 0]
-        traction = self.traction(features) * (newest * _TRACTION_KPA)[:, None]
-        # Not an exponential, which would be unbounded on a window unlike all others.
-        logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + _FIRST_UNCERTAINTY
+        traction = self.traction(features) * (newest * 30.0)[:, None]  # in [kPa], of an output of 1
+        # Not an exponential, which would be unbounded on a window unlike all others. It begins at about 0.02 mm.
+        logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + log(expm1(0.02))
         uncertainty = F.softplus(logits) if self.training else _softplus(logits)
-        deviation = (uncertainty + _LEAST_DEVIATION) * self.deviation_scale
+        # At least .05 % of the indentation of such a tap.
+        deviation = (uncertainty + 1e-4) * self.deviation_scale
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 
     def take_over(self, start: PatternNet) -> None:
         """Copy another network's function of the newest taps; further taps are ignored until trained.
 
         From fewer symmetries to more, the asymmetric part is lost. At another scale the output layers are initialised
-        again.
-
-        Raises:
-            ValueError: another kind, width, or number of inputs for the pad.
+        again. ValueError if kind, width or inputs of the pad are others.
         """
         if not isinstance(start, CompactNet):
             raise ValueError("expected a compact network")
@@ -254,8 +231,8 @@ class HeteroscedasticError(Objective):
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
-            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(_LEAST_KPA)
-            loss = loss + _TRACTION_SHARE * ((traction - batch.traction).abs() / size).mean()
+            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(0.05)
+            loss = loss + 0.2 * ((traction - batch.traction).abs() / size).mean()
         return loss
 
 
@@ -270,6 +247,6 @@ def heteroscedastic_loss(pattern: Tensor, deviation: Tensor, truth: Tensor) -> T
     """
     size = truth_size(truth)
     error = (pattern.detach() - truth).abs() / size
-    spread = deviation / sqrt(2) / size + _LEAST_SHARE
+    spread = deviation / sqrt(2) / size + 1e-3  # so that no pixel with a tiny error dominates
     uncertainty_error = spread.detach() * (spread.log() + error / spread)
     return relative_rms_error(pattern, truth) + uncertainty_error.mean()

@@ -29,13 +29,8 @@ from train.surfaces.poses import ANGLE_STEP_DEG
 _CARRIED: Final = 48  # channels that are carried between the taps' axes
 _HEADS: Final = 12  # weights of each cell, one for every field of carried channels
 _CELLS: Final = 2  # cells per taxel pitch, those of the trunk: readings hold no finer wave than two pitches
-_FIRST_REACH: Final = 0.5  # distance in cells at which a weight has fallen to .6, before training
 _LEAST_WEIGHT: Final = 1e-2
-_TERMS: Final = 4
 _CELL_MM: Final = USPA44.pitch_mm / _CELLS
-_APART: Final = 5  # dimensions of a window whose taps have a dimension of their own
-_PLACE_MM: Final = 5.0
-_TURN_ERROR_DEG: Final = 5.0  # lengths and angles that enter as 1
 
 
 class FusionNet(CompactNet):
@@ -72,7 +67,7 @@ class FusionNet(CompactNet):
             for part in added.parameters():
                 nn.init.zeros_(part)
         self.own_share = nn.Parameter(torch.zeros(()))
-        self.log_reach = nn.Parameter(torch.full((2,), log(_FIRST_REACH)))
+        self.log_reach = nn.Parameter(torch.full((2,), log(0.5)))  # cells at which a weight has fallen to .6
         if intervals:
             self.add_intervals()
 
@@ -109,19 +104,16 @@ class FusionNet(CompactNet):
     def forward(
         self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what `CompactNet.forward` does.
+        """Return what `CompactNet.forward` does, of windows of 1 to K taps.
 
-        Args:
-            window: (n, 3k, rows, cols), or (n, k, 3, rows, cols), in network units, of 1 to K taps, newest first.
-            pad: (n, known), constants of the pads; None for no constants.
-            poses: (n, k, 5), x, y in [mm] and turn in [deg] of each tap in the newest one's axes, then the standard
-                deviations of place and turn; None for the paper's schedule.
+        Windows are (n, 3k, rows, cols) or (n, k, 3, rows, cols), poses (n, k, 5): x, y in [mm] and turn in [deg] of
+        each tap in the newest one's axes, then the standard deviations of both; None for the paper's schedule.
         """
         return self.finished(self.see(window, pad, poses))
 
     def see(self, window: Tensor, pad: Tensor | None = None, poses: Tensor | None = None) -> Seen:
         """Return the outputs before any correction, and what they were made of; arguments as `forward`."""
-        taps = window if window.ndim == _APART else window.unflatten(1, (-1, 3))
+        taps = window if window.ndim == 5 else window.unflatten(1, (-1, 3))
         rows, cols = taps.shape[3:]
         amplitude = tap_amplitude(taps)
         shapes, newest = taps / amplitude, amplitude[:, 0, 0]
@@ -183,7 +175,7 @@ class _Carrier:
         # linearly.
         x, y = place[..., :1], place[..., 1:]
         moved = [cosine, sine, place, cosine * x + sine * y, cosine * y - sine * x, x * x + y * y]
-        terms = (torch.cat([*moved, torch.ones_like(x)], dim=2) @ course).unflatten(2, (_TERMS, -1))
+        terms = (torch.cat([*moved, torch.ones_like(x)], dim=2) @ course).unflatten(2, (4, -1))
         squared = torch.cat([errors[..., :1] / _CELL_MM, torch.deg2rad(errors[..., 1:])], dim=2).square()
         variance = (squared @ spread)[:, :, None]
         self._weights: list[Tensor] = []  # (n, cells, (k - 1) cells)
@@ -220,10 +212,10 @@ class _Carrier:
 def _encoding() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return factors (6, 7) and offsets (7,) from x, y, cosine, sine and both errors to inputs of the encoder."""
     factors, offsets = np.zeros((6, 7), dtype=np.float32), np.zeros(7, dtype=np.float32)
-    factors[0, 0] = factors[1, 1] = 1 / _PLACE_MM  # a vector, whose third part is 0
+    factors[0, 0] = factors[1, 1] = 1 / 5.0  # of 5 mm, a vector, whose third part is 0
     factors[2, 3], offsets[3] = -1, 1
     factors[3, 4] = factors[4, 5] = 1
-    factors[5, 6] = 1 / _TURN_ERROR_DEG
+    factors[5, 6] = 1 / 5.0  # of 5 degrees
     return factors, offsets
 
 

@@ -28,14 +28,8 @@ class IntervalCorrection(nn.Module):
     """Factors on the deviations of a compact network, by region.
 
     A factor's logarithm is the sum of what three overlapping masks add, and of what all pixels have: the four
-    regions in the fewest steps of a graph.
-
-    Args:
-        scale: pattern pixels per taxel pitch.
-        features: channels of the network's features.
-        symmetries: number of consecutive features that symmetries permute; their mean is not changed by any.
-        about: numbers that the network takes of the pad and the tap's amplitude.
-        taps: K.
+    regions in the fewest steps of a graph. Of the `features`, so many consecutive ones as there are `symmetries` are
+    permuted by these, which do not change their mean; `about` is the number of the pad's inputs and the amplitude.
 
     Attributes:
         near: pixels outside the contact that are near it.

@@ -22,22 +22,13 @@ from train.networks.blocks import Objective, PatternNet, Residual, relative_erro
 CHANNELS: Final = 64
 BLOCKS: Final = 6
 MAX_TAPS: Final = 7
-_MM_PER_UNIT: Final = 0.02
-"""Size of an output of 1, in [mm]: the networks were made for patterns of up to 25, those here reach 0.5 mm."""
 _NORM_START: Final = 0.1  # initial scale and shift of batch normalisation, as in the authors' code
 _CRITIC_CHANNELS: Final = (32, 64, 128)
 _SLOPE: Final = 0.2
-_PENALTY: Final = 10.0
-_CRITIC_STEPS: Final = 2
-_TINY: Final = 1e-12
 
 
 class _PublishedNet(PatternNet):
-    """Network whose layers all work at the pattern's size.
-
-    Raises:
-        ValueError: taps or scale out of range.
-    """
+    """Network whose layers all work at the pattern's size; ValueError if taps or scale are out of range."""
 
     def __init__(self, taps: int, scale: int) -> None:
         super().__init__()
@@ -64,7 +55,8 @@ class _PublishedNet(PatternNet):
 
         They are cut at zero in evaluation; in training too, as published, 3 of 16 seeds tried would never learn.
         """
-        pattern = output[:, 0].float() * _MM_PER_UNIT
+        # The networks were made for patterns of up to 25, those here reach 0.5 mm.
+        pattern = output[:, 0].float() * 0.02
         return pattern if self.training else torch.relu(pattern)
 
 
@@ -205,7 +197,7 @@ class SrganObjective(Objective):
         if self._seen is None:
             return
         self.critic.requires_grad_(True)
-        for _ in range(_CRITIC_STEPS):
+        for _ in range(2):
             self._optimizer.zero_grad()
             self.critic_loss(*self._seen).backward()
             _average_gradients(self.critic)
@@ -217,9 +209,9 @@ class SrganObjective(Objective):
         mix = torch.rand(len(true), 1, 1, generator=self._rng).to(true.device)
         between = (mix * true + (1 - mix) * false).requires_grad_(True)
         (slope,) = torch.autograd.grad(self.critic(between).sum(), between, create_graph=True)
-        steepness = (slope.square().sum(dim=(1, 2)) + _TINY).sqrt()  # keeps the slope of the root finite at 0
+        steepness = (slope.square().sum(dim=(1, 2)) + 1e-12).sqrt()  # keeps the slope of the root finite at 0
         penalty = (steepness - 1).square().mean()
-        return self.critic(false).mean() - self.critic(true).mean() + _PENALTY * penalty
+        return self.critic(false).mean() - self.critic(true).mean() + 10.0 * penalty
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the discriminator, its optimizer, and the random draws."""

@@ -78,8 +78,7 @@ def vectors(group: Group, count: int = 1) -> Channels:
 def fields(group: Group, channels: int) -> Channels:
     """Return hidden channels in groups of as many as there are symmetries, which permute them.
 
-    Raises:
-        ValueError: the channels do not divide into such groups.
+    ValueError if they do not divide.
     """
     elements = len(_ELEMENTS[group])
     if channels % elements:

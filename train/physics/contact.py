@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.elastic_layer import Layer, surface_compliance
-from train.physics.pad_grid import PadGrid, waves
+from train.physics.elastic_layer import Layer, PadGrid, surface_compliance, waves
 from train.physics.side_correction import FreeSides, SideGive
 
 

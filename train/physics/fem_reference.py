@@ -47,9 +47,6 @@ LAYER: Final = replace(Layer(), poisson=0.495)
 C2_SHARE: Final = 0.2
 """Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
 _EDITION: Final = 1  # edition of kept results; raise it when the results of the elements change
-_RESIDUAL: Final = 1e-6  # out-of-balance forces at which a step is done, as a share of the reactions
-_MAX_NEWTON: Final = 12
-_MAX_SETS: Final = 20
 _SLACK: Final = 1e-4
 """Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
 
@@ -141,10 +138,7 @@ class FemPad:
         """Press a surface in at rising indentations (s,), each step starting from the last one's equilibrium.
 
         Depths (size, size) are below its highest point over each node; the image of size x size cells of cell_mm fits,
-        because its rim is the pad's up to a fraction of a cell.
-
-        Raises:
-            NoEquilibriumError: the elements do not converge.
+        because its rim is the pad's up to a fraction of a cell. NoEquilibriumError if the elements do not converge.
         """
         press = _Press(self._region, self._rubber, self.size)
         found = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]
@@ -184,7 +178,7 @@ class _Press:
             # Nearly linear: the last step's field, scaled up, is close to the next one's.
             self._field[0].values *= indentation_mm / self._indentation_mm
         self._touch(self._touching | (wanted_mm > self._down_mm()))
-        for _ in range(_MAX_SETS):
+        for _ in range(20):
             upwards_n = self._balance(wanted_mm, indentation_mm).reshape(-1, 3)[:, 2]
             push_n = np.where(self._touching, -upwards_n[self._top].reshape(self._touching.shape), 0.0)
             down_mm = self._down_mm()
@@ -218,8 +212,8 @@ class _Press:
                     dof1=np.flatnonzero(~fixed),
                     ext0=held.ravel()[fixed],
                     solver=self._solve,
-                    tol=_RESIDUAL,
-                    maxiter=_MAX_NEWTON,
+                    tol=1e-6,  # out-of-balance forces at which a step is done, as a share of the reactions
+                    maxiter=12,
                     verbose=False,
                 )
         except felupe.NewtonConvergenceError as error:

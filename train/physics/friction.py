@@ -17,10 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from train.physics.elastic_layer import Layer, surface_tensor
-from train.physics.pad_grid import PadGrid
+from train.physics.elastic_layer import Layer, PadGrid, surface_tensor
 
-_MAX_STEPS: Final = 60
 _REMEMBERED: Final = 4
 """Number of past energies whose largest a step may not exceed: the method does not descend at every step."""
 
@@ -102,7 +100,7 @@ class FrictionSolver:
             short = cell * (traction - _project(traction - slip / cell, limit))
             error = torch.sqrt(_dot(short, short)[:, 0, 0, 0] / cells) / scale
             done = error < tolerance
-            if steps == _MAX_STEPS:
+            if steps == 60:
                 done[:] = True
             if bool(done.any()):
                 result[working[done]], residual[working[done]] = traction[done], error[done]

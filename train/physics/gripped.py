@@ -31,9 +31,6 @@ TRACTION_SCALE: Final = 2
 """Traction pixels per taxel pitch: the layer passes 3 % of a wave of two such pixels, so finer is not measurable."""
 _CELLS_PER_PITCH: Final = 10
 _MOST_TRIES: Final = 6
-_WALL_MM: Final = 0.1  # depth below a cell's highest part from which a part of it carries no load, in [mm]
-_STEEP: Final = 2.0
-"""Depth in indentations from which a shape counts as steep: its edge then follows from the pressure alone."""
 
 _Kind = TypeVar("_Kind", bound=np.generic)
 
@@ -98,6 +95,8 @@ class GrippedPad:
     ) -> Presses:
         """Press shapes onto the pad; a press that would exceed MOST_FORCE_N is made less deep.
 
+        SurfaceError if nothing lies under the pad.
+
         Args:
             heights_mm: (n, m, m) at `places_mm`, in [mm]; higher parts touch the pad first.
             indentation_mm: (n,), of the highest part from first contact, above 0 to MAX_INDENTATION_MM.
@@ -106,9 +105,6 @@ class GrippedPad:
             friction: (n,), Coulomb's coefficient.
             covers: one for each press.
             scale: pattern pixels per taxel pitch.
-
-        Raises:
-            SurfaceError: nothing lies under the pad.
         """
         depth_mm, cells_mm, share = self._under(heights_mm)
         depth = np.array(indentation_mm, dtype=np.float64)
@@ -164,8 +160,7 @@ class GrippedPad:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return depths below the highest part at the places and in the cells, and the cells' carrying shares.
 
-        Raises:
-            SurfaceError: nothing lies under the pad.
+        SurfaceError if nothing lies under the pad.
         """
         if self._beside.any():
             heights_mm = np.where(self._beside, np.float32(-NOTHING_MM), heights_mm)
@@ -228,7 +223,8 @@ class GrippedPad:
             solver = self._solver(cover)
             gap_mm = solver.displacement_mm(pressure_mpa[which]) - (indented_mm[which] - cells_mm[which])
             close_mm[which] = pressure_mpa[which] * np.float32(solver.cell_compliance_mm_per_mpa) - gap_mm
-        close_mm = np.where(cells_mm > _STEEP * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
+        # The edge of a steep shape follows from the pressure alone.
+        close_mm = np.where(cells_mm > 2.0 * indented_mm, np.minimum(pressure_mpa, 0), close_mm)
         to_pixels = _between(self.size, pixels)
         touching = (to_pixels @ close_mm @ to_pixels.T > 0) & (fine_mm < REACH * indented_mm)
         # The press always reaches the highest part, whichever cells that lies between.
@@ -264,7 +260,8 @@ def _carrying(depth_mm: NDArray[np.floating], cells: int) -> tuple[NDArray[np.fl
     """
     samples = depth_mm.shape[1] // cells
     parts = depth_mm.reshape(len(depth_mm), cells, samples, cells, samples)
-    carries = parts < parts.min(axis=(2, 4), keepdims=True) + _WALL_MM
+    # A part 0.1 mm below a cell's highest one carries no load.
+    carries = parts < parts.min(axis=(2, 4), keepdims=True) + 0.1
     count = carries.sum(axis=(2, 4))
     return np.where(carries, parts, 0).sum(axis=(2, 4)) / count, (count / samples**2).astype(np.float32)
 

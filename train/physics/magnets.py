@@ -16,8 +16,6 @@ from firmware_bridge.pad_geometry import SensorGeometry
 MOVEMENT: Final = ("right_mm", "back_mm", "down_mm", "lean_x", "lean_y")
 """Components of a magnet's movement: along x and y, towards the board, and the slopes dx/dz and dy/dz of its axis."""
 _DOWN: Final = MOVEMENT.index("down_mm")
-_DIPOLE_CLEARANCE: Final = 0.75
-"""Clearance, in diameters of the magnet, below which a dipole is off by more than 30 %; see docs/decisions.md."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +84,8 @@ class MagnetArray:
         moments: NDArray[np.floating] | float = 1.0,
     ) -> None:
         self.magnet = magnet
-        self._least_clear_mm = _DIPOLE_CLEARANCE * magnet.diameter_mm
+        # Nearer to its chip, in diameters, a dipole is off by more than 30 % (docs/decisions.md).
+        self._least_clear_mm = 0.75 * magnet.diameter_mm
         nowhere = np.zeros((geometry.taxel_count, len(MOVEMENT)))
         self._rest = (nowhere if rest is None else rest).astype(np.float32)
         self._moments = np.asarray(moments, dtype=np.float32)

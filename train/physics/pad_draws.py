@@ -14,7 +14,6 @@ from train.physics.side_correction import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085  # by the data sheet, for the sum of z
 
-_UNEVEN_MM: Final = 0.015  # largest RMS of a pad's own unevenness, for a moulded silicone face, in [mm]
 _UNEVEN_WAVES: Final = 8
 _TILT_RAD: Final = 0.05
 """Standard deviation of a magnet's lean: three degrees, for a part of a millimetre placed by a machine."""
@@ -125,7 +124,8 @@ def draw_pad(rng: np.random.Generator, spread: float = 1.0, ranges: Mapping[str,
     for name, bounds in ranges.items():
         nominal = getattr(NOMINAL, name)
         drawn[name] = nominal + spread * (rng.uniform(*bounds) - nominal)
-    return Pad(**drawn, uneven_mm=spread * rng.uniform(0, _UNEVEN_MM), seed=int(rng.integers(2**31)))
+    # A moulded silicone face is uneven by 0.015 mm at most.
+    return Pad(**drawn, uneven_mm=spread * rng.uniform(0, 0.015), seed=int(rng.integers(2**31)))
 
 
 def input_scale() -> list[tuple[str, float, float]]:

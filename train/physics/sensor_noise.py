@@ -26,8 +26,6 @@ Seed = int | Sequence[int] | np.random.SeedSequence
 LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
 """Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
 TAP_S: Final = (0.2, 2.5)  # bounds of a press' duration, in [s]: a fast robot, and the press of the paper's Fig. 15.
-_RELAXATION_S: Final = (0.2, 5.0)
-_OFF: Final = {"saturation_counts": (inf, inf, inf)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +64,8 @@ class Nuisances:
 
     def without(self, *names: str) -> Self:
         """Return these nuisances with the named ones off."""
-        return replace(self, **{name: _OFF.get(name, 0.0) for name in names})
+        off = {"saturation_counts": (inf, inf, inf)}
+        return replace(self, **{name: off.get(name, 0.0) for name in names})
 
 
 NAMES: Final = tuple(field.name for field in fields(Nuisances))  # names of all nuisances in the order in which they act
@@ -104,7 +103,7 @@ def apply_nuisances(
     if nuisances.hysteresis:
         rng = stream("hysteresis")
         lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
-        lag[1] = log_uniform(rng, *_RELAXATION_S, (n,))
+        lag[1] = log_uniform(rng, 0.2, 5.0, (n,))
     duration_s = log_uniform(stream("tap_s"), *TAP_S, (n, taps)) if tap_s is None else np.asarray(tap_s)
     weights = frame_weights(frame, frames, np.broadcast_to(duration_s, (n, taps)) / frames, *lag)
     flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)

@@ -21,10 +21,6 @@ from train.physics.elastic_layer import Layer
 
 _WIDTH_MM: Final = 20.0
 _GIVES: Final = ((0.959, 0.3415, 0.2247), (0.0255, 1.590, 0.6034))  # terms (a, b, c) of the surface's compliance
-_DOWN: Final = (0.0404, 0.690, 1.147, 0.420)
-"""Term of the magnets' way down: factor on 1 / (G h), decay lengths to magnet and load, width along the side."""
-_OUT: Final = (0.1703, 1.117, 0.592, 0.593)  # term of their way to the side
-_LEAN: Final = (1.000, 0.431, 0.317, 0.463)  # term of their axes, tops towards the side; its factor is on 1 / (G h^2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +50,12 @@ class FreeSides:
         """
         scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
 
+        # Factor, decay lengths to magnet and load, width along the side; unit; signs at lower and upper side.
         parts = (
-            (_OUT, scale, (-1.0, 1.0)),
-            (_DOWN, scale, (1.0, 1.0)),
-            (_LEAN, scale / thickness_mm, (-1.0, 1.0)),
-        )  # each with its unit, and its signs at lower and upper side
+            ((0.1703, 1.117, 0.592, 0.593), scale, (-1.0, 1.0)),  # their way to the side
+            ((0.0404, 0.690, 1.147, 0.420), scale, (1.0, 1.0)),  # down
+            ((1.000, 0.431, 0.317, 0.463), scale / thickness_mm, (-1.0, 1.0)),  # their axes, tops towards the side
+        )
 
         def by_sides(at_mm: NDArray[np.floating], beside_mm: NDArray[np.floating]) -> list[NDArray[np.float64]]:
             """Return the parts of the two sides at the ends of one axis; magnets are at `at_mm` along it."""

@@ -48,9 +48,7 @@ def depth_image(relief: Relief, pose: Pose, size: int, cell_mm: float) -> NDArra
     surface. Off the surface the depth is NOTHING_MM. Depth counts from the highest point under the footprint, not under
     the mesh: indentation is measured from first contact. Between the cells' centres that point is searched on the
     triangles' edges; a point there that stands out by more than _UNFELT_MM is finer than a cell and is left out.
-
-    Raises:
-        ValueError: nothing lies under the pad.
+    ValueError if nothing lies under the pad.
     """
     width_mm = size * cell_mm
     triangles = _under(relief, pose, width_mm)

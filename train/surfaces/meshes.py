@@ -18,8 +18,6 @@ MAX_TRIANGLES: Final = 2_000_000
 MAX_FILE_BYTES: Final = 400_000_000
 """Largest file read: two million triangles in the most verbose OBJ. A longer one would fill the memory first."""
 _TO_ASCII: Final = bytes(range(128)) + b"?" * 128
-_FLAT: Final = 1e-5
-"""Ratio of thickness to length below which a body is a sheet: a hundred times the rounding of single precision."""
 
 
 def mesh_name(path: Path, unit_mm: float = 1.0) -> str:
@@ -47,9 +45,7 @@ def load_mesh(path: Path, unit_mm: float = 1.0) -> trimesh.Trimesh:
     """Read an STL, OBJ or PLY file as a closed surface in [mm]: z up as it stands, top at z = 0, centred on x = y = 0.
 
     Several bodies in it are taken together.
-
-    Raises:
-        MeshError: the file is absent, broken, empty, open, flat, or of an impossible size.
+    MeshError if it is absent, broken, empty, open, flat, or of an impossible size.
     """
     if not (isfinite(unit_mm) and unit_mm > 0):
         raise MeshError(f"--unit-mm is {unit_mm:g}; it must be a length above 0, such as 1000 for a file in metres")
@@ -140,7 +136,8 @@ def _check_size(path: Path, corners: NDArray[np.float64], unit_mm: float) -> Non
             "a file is taken to be in mm: pass --unit-mm 1000 if it is in metres, 25.4 if in inches"
         )
     spreads = np.linalg.eigvalsh(np.cov(corners, rowvar=False))
-    if spreads[0] <= _FLAT**2 * spreads[-1]:
+    # A sheet is thinner than a hundred times the rounding of single precision.
+    if spreads[0] <= 1e-5**2 * spreads[-1]:
         raise MeshError(f"{path}: flat, a sheet without thickness ({sides}); extrude it to a closed body")
 
 

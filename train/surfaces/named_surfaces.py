@@ -26,10 +26,6 @@ from train.surfaces.meshes import MESH, load_mesh, mesh_file
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0
 _PLATE_THICKNESS_MM: Final = 1.0
-_STROKE_MM: Final = 3.0
-_WALL_MM: Final = 2.5
-_LARGE_RADIUS_MM: Final = 7.0
-_SMALL_RADIUS_MM: Final = 3.5
 _W, _H = 4.0, 6.0  # half the width and height of a letter, between stroke centres
 GLYPH_REACH_MM: Final = 8.0  # largest distance of a glyph's points from the plate's centre along x and y
 POLYGON_REACH_MM: Final = 9.5
@@ -68,8 +64,7 @@ SURFACES: Final = LETTERS + SHAPES  # names of the 18 surfaces, nine on each pla
 def surface_mesh(name: str) -> trimesh.Trimesh:
     """Return the mesh of a `figure` on its plate, closed bodies side by side, or a user's, centred on x = y = 0.
 
-    Raises:
-        SurfaceError: no surface of that name.
+    SurfaceError if there is none of that name.
     """
     if name.startswith(MESH) and name != MESH:
         return load_mesh(*mesh_file(name))
@@ -90,8 +85,7 @@ def relief(name: str) -> Relief:
 def figure(name: str) -> BaseGeometry:
     """Return the outline in [mm] of one of SURFACES, centred on the origin, or of glyph:SEED or polygon:SEED.
 
-    Raises:
-        SurfaceError: no figure of that name.
+    SurfaceError if there is none of that name.
     """
     kind, _, seed = name.partition(":")
     if name in SURFACES:
@@ -110,15 +104,15 @@ def figure(name: str) -> BaseGeometry:
 
 
 def _letter(name: str) -> BaseGeometry:
-    strokes = [LineString(points).buffer(_STROKE_MM / 2, cap_style="square") for points in _STROKES[name]]
+    strokes = [LineString(points).buffer(3.0 / 2, cap_style="square") for points in _STROKES[name]]
     return unary_union(strokes).simplify(0.01)  # where strokes meet, points 1e-15 mm apart would open the mesh
 
 
 def _shape(form: str, shape: str) -> BaseGeometry:
     if form == "small":
-        return _regular(_CORNERS[shape], _SMALL_RADIUS_MM)
-    large = _regular(_CORNERS[shape], _LARGE_RADIUS_MM)
-    return large if form == "large" else large.difference(large.buffer(-_WALL_MM, join_style="mitre"))
+        return _regular(_CORNERS[shape], 3.5)
+    large = _regular(_CORNERS[shape], 7.0)
+    return large if form == "large" else large.difference(large.buffer(-2.5, join_style="mitre"))
 
 
 def _regular(corners: int, radius_mm: float) -> Polygon:

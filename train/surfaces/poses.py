@@ -103,8 +103,7 @@ def mixed(rng: np.random.Generator, taps: int) -> NDArray[np.float64]:
 def schedule_of(name: str) -> Schedule:
     """Return a schedule by its name; `turns:30` turns by 30 degrees from tap to tap.
 
-    Raises:
-        ValueError: there is no schedule of that name.
+    ValueError if there is none of that name.
     """
     if name.startswith("turns:"):
         step = float(name.partition(":")[2]) / ANGLE_STEP_DEG

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
 from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall
@@ -27,14 +27,11 @@ from train.report import Report, Row
 from train.surfaces.depth_image import depth_image
 from train.surfaces.named_surfaces import LETTERS, relief
 
-STEPS: Final = 10
 PSF_BETAS_MM: Final = (0.4, 0.5, 0.6, 0.7, 0.8, 1.0, BETA_MM, 1.6, 2.0)
 MESHES: Final = (FINEST, Mesh(10, 4), Mesh(7, 6), Mesh(5, 4))
 """Meshes, the finest as the truth. The second has nodes on the same pixels; the others' lie between pixels."""
-_QUICK_MESHES: Final = (Mesh(4, 2), Mesh(3, 2))
 _PIXEL_MM: Final = USPA44.pixel_pitch_mm(SCALE)
 _PAD_PX: Final = 42
-_ON_TOP_MM: Final = 1e-3
 
 Maps = NDArray[np.float32]  # maps (surfaces, steps, 40, 40) in [mm]
 
@@ -66,7 +63,7 @@ def run(bench: Workbench, folder: Path) -> Path:
 
     The full run takes about half an hour on one core, nearly all of it for the finite elements.
     """
-    surfaces, meshes, steps = (LETTERS[:2], _QUICK_MESHES, 2) if bench.quick else (LETTERS, MESHES, STEPS)
+    surfaces, meshes, steps = (LETTERS[:2], (Mesh(4, 2), Mesh(3, 2)), 2) if bench.quick else (LETTERS, MESHES, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
     verdicts = {
         mesh: [
@@ -115,7 +112,7 @@ def _methods(
     margin = (_PAD_PX - 4 * SCALE) // 2
     depth_mm = np.stack([depth_image(relief(name), CENTRE, _PAD_PX, _PIXEL_MM) for name in surfaces])
     window = slice(margin, _PAD_PX - margin)
-    touching = np.repeat(depth_mm[:, None, window, window] < _ON_TOP_MM, len(indentation_mm), axis=1)
+    touching = np.repeat(depth_mm[:, None, window, window] < 1e-3, len(indentation_mm), axis=1)
     step_mm = indentation_mm.astype(np.float32)
     solver = ContactSolver(Layer(), _PAD_PX, _PIXEL_MM)
 

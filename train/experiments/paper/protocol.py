@@ -13,7 +13,7 @@ from edge.evaluation.test_set import FrozenSet, judge
 from firmware_bridge.pad_geometry import USPA44
 from train.data.presses import PressSet, join_presses
 from train.data.world import World
-from train.experiments.support.workbench import Figures, Method, Workbench, median_ms
+from train.experiments.workbench import Figures, Method, Workbench, median_ms
 from train.fit import given_taps
 from train.freeze import CLASSICAL_WINDOWS, fit_classical
 from train.learning.checkpoint import Training
@@ -23,7 +23,6 @@ from train.report import Row, with_interval
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
-_QUICK_WINDOWS: Final = 300
 HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")  # surfaces that Fig. 16 leaves out of a training.
 KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
 _SET: Final = World(taps=MAX_TAPS, schedule="turns", spread=0.0, scale=FINE_SCALE)
@@ -36,10 +35,7 @@ SETS: Final = {
 
 _SEED_MINUTES: Final = {"srcnn": 6.0, "srgan": 6.0, "stsr": 17.0}
 """Training time of the paper's networks, in [min]: the STSR as long as the compact one; srgan on top of srcnn."""
-_SEED_MINUTES_MORE: Final = 4.0
-"""Training time of every MTSR-K on top of the STSR, in [min]. All networks take two hours on two cores."""
 SEED_BATCH: Final = 16
-_ENDLESS: Final = 1_000_000
 BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
 """Compact STSR trained on the paper's figures and random ones, without pad constants."""
 
@@ -84,13 +80,13 @@ def seed_size(name: str) -> Training:
     network, _, longer = name.partition(" ")
     taps = int(network.removeprefix("mtsr")) if network.startswith("mtsr") else 1
     recipe = Recipe(
-        steps=_ENDLESS,
+        steps=1_000_000,  # the time ends it before
         batch=SEED_BATCH,
         learning_rate=5e-4,
         weight_decay=1e-2,
         given=given_taps(taps),
         bf16=True,
-        minutes=_SEED_MINUTES.get(name, _SEED_MINUTES_MORE),
+        minutes=_SEED_MINUTES.get(name, 4.0),  # every MTSR-K on top of the STSR; all take two hours on two cores
     )
     start = "seed-srcnn" if network == "srgan" else "seed-stsr" if taps > 1 or longer else None
     return Training(f"seed-{name}", network, recipe, start=start)
@@ -116,7 +112,7 @@ def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) ->
     """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
     path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
     if not path.exists():
-        fitted = fit_classical(data, _QUICK_WINDOWS if bench.quick else CLASSICAL_WINDOWS)
+        fitted = fit_classical(data, 300 if bench.quick else CLASSICAL_WINDOWS)
         np.savez_compressed(path, allow_pickle=False, **fitted)
     fits, scan = fitted_methods(path, SCALE), np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
 

@@ -30,12 +30,12 @@ from train.experiments.paper.protocol import (
     seed_size,
     trained,
 )
-from train.experiments.support.workbench import Method, Workbench
+from train.experiments.workbench import Method, Workbench
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.interval_fit import half_width_mm
 from train.learning.training_loop import Recipe
-from train.report import Report, Row, signed_interval, with_interval
+from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 
 TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
@@ -56,14 +56,11 @@ TABLE_4: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10
 """Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""
 
 SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7", "stsr longer")
-CLASSICAL: Final = ("bilinear", "bicubic", "linear map")
-COMPACT_NETWORKS: Final = ("stsr", "mtsr2", "mtsr4", "mtsr7")
 COMPARED: Final = (
     *(("compact stsr", "stsr"), ("compact mtsr4", "mtsr4")),
     *(("mtsr2", "stsr longer"), ("compact mtsr2", "compact stsr")),
 )
 ONE_IN: Final = 8  # step between evaluated frames of a tap
-ANGLES_DEG: Final = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
 
 
 def run_table3(bench: Workbench, folder: Path) -> Path:
@@ -92,7 +89,7 @@ def run_table3(bench: Workbench, folder: Path) -> Path:
         f"The networks of the paper were trained for a fixed time, here for so many epochs: {', '.join(epochs)}."
     )
     verdicts = [
-        f"- {better} over {worse} [dB]: {signed_interval(test_db[better] - test_db[worse], test.tap)}"
+        f"- {better} over {worse} [dB]: {with_interval(test_db[better] - test_db[worse], test.tap, sign='+')}"
         for better, worse in COMPARED
         if {better, worse} <= set(test_db)
     ]
@@ -105,11 +102,11 @@ def _methods(
     bench: Workbench, data: PressSet, validation: FrozenSet, thinned: FrozenSet
 ) -> Iterator[tuple[str, str, Method]]:
     """Yield each method with its name in the table and in the paper's; large networks are calibrated on few frames."""
-    for method in classical_methods(bench, data, CLASSICAL):
+    for method in classical_methods(bench, data, ("bilinear", "bicubic", "linear map")):
         yield method.name, method.name, method
     names = (*SEED_NETWORKS[1:4], SEED_NETWORKS[-1]) if bench.quick else SEED_NETWORKS
     networks = [(name, seed_size(name), thinned) for name in names]
-    networks += [(f"compact {name}", compact(name), validation) for name in COMPACT_NETWORKS]
+    networks += [(f"compact {name}", compact(name), validation) for name in ("stsr", "mtsr2", "mtsr4", "mtsr7")]
     for name, training, calibrated_on in tracked(networks, "networks", "network"):
         yield name, training.network.removeprefix("compact-"), trained(bench, training, data, calibrated_on)
 
@@ -142,12 +139,12 @@ def run_angle(bench: Workbench, folder: Path) -> Path:
     stsr = trained(bench, compact("stsr"), mixed(bench), bench.frozen("validation"))
     errors, alone_db = judged(stsr, {"test": test})
     rows: list[Row] = [{"network": "STSR", "angle deg": None} | errors | stsr.cost]
-    for angle_deg in tracked(ANGLES_DEG, "angles", "angle"):
+    for angle_deg in tracked((5.0, 10.0, 15.0, 20.0, 25.0, 30.0), "angles", "angle"):
         validation, turned = (bench.frozen(split, angle_step_deg=angle_deg) for split in ("validation", "test"))
         training = from_base(f"mtsr2-{angle_deg:g}-deg", 2, 1500)
         method = bench.network(training, by_angle(bench, angle_deg), validation)
         errors, found_db = judged(method, {"test": turned})
-        over: Row = {"over STSR dB": signed_interval(found_db - alone_db, test.tap)}
+        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
         rows.append({"network": "MTSR-2", "angle deg": angle_deg} | errors | over | method.cost | method.training)
     report = Report("angle", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -172,7 +169,7 @@ def run_taps(bench: Workbench, folder: Path) -> Path:
     for name, given in tracked(ways, "taps", "run"):
         method = methods[name]
         errors, found_db = judged(method, {"test": test}, given)
-        over: Row = {"over STSR dB": signed_interval(found_db - alone_db, test.tap)}
+        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
         rows.append({"network": name, "taps given": given} | errors | over | method.cost | method.training)
     report = Report("taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -186,7 +183,6 @@ def run_taps(bench: Workbench, folder: Path) -> Path:
 TEST_SEED: Final = 999_000_000
 TEST_FIGURES: Final = 24
 GIVEN: Final = (1, 4)
-_FEW_FIGURES: Final = 833  # number of figures that make a tenth of the windows
 _EVERY: Final = Training("unseen-all", "compact-mtsr4", Recipe(steps=16_000, given=given_taps(max(GIVEN)), bf16=True))
 
 
@@ -218,7 +214,7 @@ def run_unseen(bench: Workbench, folder: Path) -> Path:
             row: Row = {"trained on": name, "tested on": tested, "taps": given}
             row |= error_cells(figures, frozen, "test")
             over_db = figures["psnr_db"] - alone_db.setdefault((tested, given), figures["psnr_db"])  # of the first
-            row["over the 15 dB"] = signed_interval(over_db, frozen.tap)
+            row["over the 15 dB"] = with_interval(over_db, frozen.tap, sign="+")
             row["covered %"] = with_interval(100 * figures["coverage_90"], frozen.tap, 1)
             row["width %"] = with_interval(width_percent.mean(axis=(1, 2)), frozen.tap, 1)
             rows.append(row | method.cost | method.training)
@@ -250,7 +246,7 @@ def test_sets(bench: Workbench) -> dict[str, FrozenSet]:
 def training_sets(bench: Workbench) -> dict[str, tuple[Training, PressSet]]:
     """Return the trainings with their presses, by name; all but the last are without the held-out surfaces."""
     known, held_out, figures = (presses(bench, name).at_scale(_EVERY.scale) for name in SETS)
-    few = figures.pick(np.arange(min(_FEW_FIGURES, len(figures))))  # both kinds alternate
+    few = figures.pick(np.arange(min(833, len(figures))))  # a tenth of the windows; both kinds alternate
     half = replace(_EVERY.recipe, steps=_EVERY.recipe.steps // 2)
     return {
         "15": (replace(_EVERY, name="unseen-alone"), known),

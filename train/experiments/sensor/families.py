@@ -23,7 +23,7 @@ from train.data.press_batches import COUNTS_PER_UNIT, read_presses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, Inferred, infer_presses
-from train.experiments.support.workbench import Figures, Workbench
+from train.experiments.workbench import Figures, Workbench
 from train.families.catalogue import SHARES
 from train.learning.checkpoint import best_contact_level
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE
@@ -37,7 +37,6 @@ _MODEL: Final = (NOTHING, ALL)
 _OURS: Final = tuple(SHORT[known] for known in _MODEL)
 _LEVEL: Final = "90"
 _NEAREST: Final = 8
-_TIMED_SCANS: Final = 100
 _AT_ONCE: Final = 64
 
 
@@ -59,7 +58,7 @@ class Baseline(NamedTuple):
     def found(self, wide: FrozenPresses) -> Found:
         """Return the errors on a set, and the median run time of a scan."""
         newest, times_s = wide.windows(1)[:, 0], []
-        for index in range(min(len(newest), _TIMED_SCANS)):
+        for index in range(min(len(newest), 100)):
             started_s = time.perf_counter()
             self.run(newest[index : index + 1])
             times_s.append(time.perf_counter() - started_s)

@@ -19,7 +19,7 @@ from train.data.frozen_presses import freeze_presses
 from train.data.presses import SEED, PressSet, one_thread
 from train.data.world import press_shapes
 from train.experiments.sensor.shipped import ALL, NOTHING, SHORT, infer_presses
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.families.catalogue import Tapped, draw_shape
 from train.physics.gripped import MAX_INDENTATION_MM, GrippedPad
 from train.physics.pad_draws import INPUTS, NOMINAL, Pad

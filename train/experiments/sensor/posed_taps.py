@@ -21,13 +21,12 @@ from train.data.press_batches import stated_poses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS
 
-MODEL: Final = POSED_MODEL
 SCHEDULES: Final = ("half-pitch", "near", "turns", "slide")
 PAPER: Final = World(
     count=720, taps=MAX_TAPS, schedule="turns", begun=0.0, families={"paper": 1.0}, spread=0.0, seed=2_000_029
@@ -37,16 +36,13 @@ PAPER: Final = World(
 Source: Wu and Liu 2024, Fig. 13."""
 _WAYS: Final = ((DEFAULT_MODEL, 1), (POSED_MODEL, 2), (POSED_MODEL, 4), (POSED_MODEL, MAX_TAPS))
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)  # errors of poses, in [mm] and [deg], where a robot states none
-_OFF: Final = ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0))
-"""Errors of every earlier tap's pose in the rows on robustness, in [mm] and [deg]."""
-_SHOWN: Final = (1, 2, 3, 4, 7)
 _WINDOW: Final = 4
 
 
 def run(bench: Workbench, folder: Path) -> Path:
     """Evaluate the model that takes poses and write the report `posed-taps`."""
     models = {name: bench.model(name) for name, _ in _WAYS}
-    model = models[MODEL]
+    model = models[POSED_MODEL]
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
     report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
@@ -103,7 +99,7 @@ def presses_of(bench: Workbench, schedule: str, *, figures: bool) -> PressSet:
 
 
 def _rows(
-    model: ModelSession, schedule: str, frozen: FrozenPresses, known: str, numbers: tuple[int, ...] = _SHOWN
+    model: ModelSession, schedule: str, frozen: FrozenPresses, known: str, numbers: tuple[int, ...] = (1, 2, 3, 4, 7)
 ) -> list[Row]:
     """Return a row for each number of taps."""
     poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, USUAL)
@@ -121,7 +117,7 @@ def _wrong(model: ModelSession, frozen: FrozenPresses) -> list[Row]:
     true, each = frozen.presses.poses[:, :_WINDOW], np.arange(len(frozen))
     alone, _ = _psnr(model, frozen, 1, NOTHING, stated_poses(np.random.default_rng(SEED), true[:, :1], (0, 0)))
     rows: list[Row] = []
-    for error_mm, error_deg in _OFF:
+    for error_mm, error_deg in ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0)):
         row: Row = {"off mm": error_mm, "off deg": error_deg}
         for name, stated in (("stated", (error_mm, error_deg)), ("not stated", USUAL)):
             poses = _off(true, (error_mm, error_deg), stated)

@@ -32,13 +32,11 @@ from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from train.data.presses import load_presses
 from train.data.real_grips import Grip, loaded, neighbours_mean, recorded_grips, recordings_folder, z_of
 from train.data.world import World, solve_pad
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.freeze import SCALE, drawn
 from train.report import Report, Row, bootstrap_interval
 
-_SCAN_NS: Final = 16_750_000
 _TAXELS: Final = USPA44.taxel_count
-_RIDGE: Final = 0.1  # ridge of the operator that leaves the least of z on validation presses
 
 
 class Played(NamedTuple):
@@ -64,7 +62,7 @@ def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | 
     for number, raw in enumerate(grip.counts.astype(np.int32)):
         if hidden is not None:
             raw.reshape(3, -1)[:, hidden] = ABSENT
-        result = runtime.push(series.close(raw, number * _SCAN_NS))
+        result = runtime.push(series.close(raw, number * 16_750_000))
         patterns.append(none if result.pattern is None else result.pattern)
         believed.append(result.trusted is not False)
     zeroed = (grip.counts - grip.free.counts).astype(np.float32)
@@ -102,7 +100,8 @@ def run(bench: Workbench, folder: Path) -> Path:
         readings, truth = drawn(solve_pad(World(count=24, per_pad=24, seed=3), 0), 100)
     else:
         readings, truth = drawn(load_presses(bench.data_folder / "gripped.npz"), 8000)
-    operator = fit_linear_map(truth.reshape(len(truth), -1), z_of(readings), _RIDGE)
+    # The ridge that leaves the least of z on validation presses.
+    operator = fit_linear_map(truth.reshape(len(truth), -1), z_of(readings), 0.1)
 
     played = [(grip, play(grip, model)) for grip in tracked(grips, "whole", "recording")]
     grips, whole = zip(*((grip, one) for grip, one in played if len(one.zeroed)), strict=True)

@@ -15,7 +15,6 @@ Fault = Callable[[np.random.Generator, Counts], Counts]  # readings of one senso
 Field = Callable[[np.random.Generator], Counts]
 """Counts (3, rows, cols) that something near the pad adds to each reading."""
 
-_FIELD_COUNTS: Final = (150.0, 1500.0)
 _MAGNET_MM, _CHIP_MM, _PAD_TOP_MM = 2.5, 0.5, 4.5
 _MOVES: Final = (
     *("turned by 90 degrees", "turned by 180 degrees", "turned by 270 degrees"),
@@ -42,7 +41,7 @@ def steel_field(rng: np.random.Generator) -> NDArray[np.float32]:
     field = 3 * away * away[2] / square**2.5
     field[2] -= square**-1.5
     total = field.sum(axis=2).reshape(USPA44.scan_shape)
-    return (total / np.abs(total).max() * rng.uniform(*_FIELD_COUNTS)).astype(np.float32)
+    return (total / np.abs(total).max() * rng.uniform(150.0, 1500.0)).astype(np.float32)
 
 
 def _added(field: Field) -> Fault:

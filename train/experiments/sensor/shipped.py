@@ -70,9 +70,6 @@ SHIPPED: Final = RuntimeOptions(follow_drift=False)
 """Options of the shipped runtime, but for the rest level, which follows a pad that is free for longer than here."""
 _REST: Final = np.array((16_000, 16_400, 38_600), dtype=np.int32)[:, None, None] * np.ones((1, 4, 4), dtype=np.int32)
 _SENSOR: Final = "4"
-_PERIOD_NS: Final = 10_000_000
-_FREE_SCANS: Final = 2
-_TAP_SCANS: Final = 2  # scans of an earlier tap: one alone may be a flipped bit, and is not remembered
 
 
 class PushedSensor:
@@ -92,7 +89,7 @@ class PushedSensor:
 
     def push(self, counts: NDArray[np.floating], *, infer: bool = True) -> Result:
         """Return the result of the next scan, of zeroed counts (3, rows, cols)."""
-        self._time_ns += _PERIOD_NS
+        self._time_ns += 10_000_000
         raw = np.clip(_REST + np.rint(counts).astype(np.int32), 1, 65_534)
         result = self._runtime.push(self._series.close(raw, self._time_ns), infer=infer)
         for event in result.events:
@@ -101,7 +98,7 @@ class PushedSensor:
 
     def free(self) -> Result:
         """Return the last result of a free pad."""
-        return [self.push(self.noise()) for _ in range(_FREE_SCANS)][-1]
+        return [self.push(self.noise()) for _ in range(2)][-1]
 
     def touch(self, counts: NDArray[np.floating]) -> Result:
         """Return the result of one scan of a contact on a pad that was free before."""
@@ -112,6 +109,6 @@ class PushedSensor:
         """Return the result of the newest of several taps (K, 3, rows, cols), after those that are not inferred."""
         for earlier in reversed(window[1:]):
             self.free()
-            for _ in range(_TAP_SCANS):
+            for _ in range(2):  # one scan alone may be a flipped bit, and is not remembered
                 self.push(earlier + self.noise(), infer=False)
         return self.touch(window[0])

@@ -27,22 +27,17 @@ from train.errors import CheckpointError
 from train.experiments.sensor.real import play
 from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
 from train.experiments.sensor.shipped import ALL, NOTHING, PushedSensor, known_pads
-from train.experiments.support.workbench import Workbench
+from train.experiments.workbench import Workbench
 from train.families.catalogue import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
-from train.report import Report, Row, bootstrap_interval, signed_interval
+from train.report import Report, Row, bootstrap_interval, with_interval
 
 JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0), seed=7_700_103)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
-_TAPS: Final = 4
 
 
 def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `trust-checks`.
-
-    Raises:
-        CheckpointError: a shipped model has no checks.
-    """
+    """Write the report `trust-checks`; CheckpointError if a shipped model has no checks."""
     model = bench.model()
     names = _MODELS[:2] if bench.quick else _MODELS
     models = [bench.model(f"{name}{INT8_SUFFIX}") for name in names]
@@ -137,7 +132,6 @@ _OWN: Final = ("stuck", "unfamiliar", "unexplained", "uncertain", "beyond", "pad
 """Reasons that a scan gives by itself."""
 RIGHT, WRONG, FAR_OFF = 0.3, 0.5, 1.0
 """RMS error over the RMS of the truth: below the first a pattern is right, above the others wrong and far off."""
-_LIGHT: Final = RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,13 +215,13 @@ def verdicts_on(model: Model, sensors: Sequence[NDArray[np.floating]], pads: Seq
 
 def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> Judged:
     """Return the verdicts on the newest taps of presses, each of a sensor of its own, with what its file holds."""
-    truths = presses.patterns()
+    truths, light = presses.patterns(), RuntimeOptions(follow_drift=False, contact_on_counts=OFF_COUNTS)
     rows: list[tuple[int, float, bool, bool]] = []
     for number, (counts, pad) in enumerate(zip(presses.presses.counts[:, 0], pads, strict=True)):
         sum_z = float(counts[2].sum())
         if sum_z < OFF_COUNTS:
             continue
-        result = PushedSensor(model, pad, seed=number, options=_LIGHT).touch(counts)
+        result = PushedSensor(model, pad, seed=number, options=light).touch(counts)
         if result.pattern is None or result.trusted is None:
             continue
         off = float(np.sqrt(np.mean((result.pattern - truths[number]) ** 2) / np.mean(truths[number] ** 2)))
@@ -249,7 +243,7 @@ _GUARDED: Final = (
 
 
 def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: FrozenPresses) -> None:
-    guarding, unguarded = (ModelSession(several, taps=_TAPS) for _ in range(2))
+    guarding, unguarded = (ModelSession(several, taps=4) for _ in range(2))
     unguarded.contract = replace(unguarded.contract, trust={})
     taps, name_of = guarding.contract.taps, guarding.name
     sensors = firm(sensors)
@@ -267,7 +261,7 @@ def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: Fr
         row[single.name] = round(float(alone_db.mean()), 2)
         for how, found_db in (("no guard", off_db), ("guard", on_db)):
             row[f"{name_of}, {how}"] = round(float(found_db.mean()), 2)
-            row[f"{how}, over one tap"] = signed_interval(found_db - alone_db, pads)
+            row[f"{how}, over one tap"] = with_interval(found_db - alone_db, pads, sign="+")
         losses.append(row)
     report.table(dropped, _DROPPED, "taps")
     report.table(losses, _GUARDED, "psnr")

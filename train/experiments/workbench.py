@@ -31,10 +31,7 @@ from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, Split
 
 _TIMED_RUNS: Final = 12
-_QUICK_SURFACES: Final = 2
 _QUICK_PRESSES: Final = 42
-_QUICK_ONE_IN: Final = 12
-_QUICK_OPTIONS: Final = {"channels": 16, "blocks": 1}
 _tapped = cache(paper_taps)  # which takes minutes, and several experiments want the same
 
 Figures = dict[str, NDArray[np.float64]]
@@ -87,7 +84,7 @@ class Workbench:
     def wide_test(self) -> FrozenPresses:
         """Return the wide frozen set."""
         wide = load_frozen_presses(self.use(WIDE_TEST))
-        return wide.pick(np.arange(len(wide)) % _QUICK_ONE_IN == 0) if self.quick else wide
+        return wide.pick(np.arange(len(wide)) % 12 == 0) if self.quick else wide
 
     def fit(self, training: Training, data: PressSet, validation: FrozenSet) -> Path:
         """Return the checkpoint of a network, which is trained unless the same training on these data exists."""
@@ -111,7 +108,7 @@ class Workbench:
         self, split: Split, surfaces: Sequence[str] = SURFACES, angle_step_deg: float = ANGLE_STEP_DEG
     ) -> PaperTaps:
         """Return clean sequences of the paper's protocol at a held-out position."""
-        names = tuple(surfaces[:_QUICK_SURFACES] if self.quick else surfaces)
+        names = tuple(surfaces[:2] if self.quick else surfaces)
         return _tapped(split, names, angle_step_deg=angle_step_deg)
 
     def frozen(
@@ -140,7 +137,7 @@ def median_ms(run: Callable[[], object]) -> float:
 def _quick(training: Training) -> Training:
     """Return the training in miniature, under its own name."""
     recipe = replace(training.recipe, steps=1, batch=2, minutes=None)
-    options = _QUICK_OPTIONS if training.network.startswith("compact") else {}
+    options = {"channels": 16, "blocks": 1} if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
 
