@@ -28,13 +28,11 @@ from edge.errors import (
     WindowError,
 )
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, demo_recording, find_model
-from edge.inference.contract import Contract
-from edge.inference.model_interface import Model
-from edge.inference.timed_loading import unfinished_load
+from edge.inference.contract import Contract, Model
+from edge.inference.onnx_guard import unfinished_load
 from edge.perception.event import Event, Note
-from edge.perception.result import NextTap, Result
+from edge.perception.result import NextTap, Result, Wrench
 from edge.perception.runtime import Runtime
-from edge.perception.wrench import Wrench
 from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import Latest
 from edge.pipeline.pose_queue import PoseQueue
@@ -70,10 +68,10 @@ from firmware_bridge.zeroing.baseline import Baseline, load_baselines, save_base
 if TYPE_CHECKING:
     from edge.doctor.examine import examine
     from edge.mapping.sink import MapSink, ObjectMap
-    from edge.pipeline.array_results import infer
     from edge.pipeline.baseline_capture import take_baselines
     from edge.pipeline.pairing import paired
     from edge.pipeline.replay_setup import open_recording
+    from edge.pipeline.runtime_setup import infer
     from edge.pose_sources.open_poses import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
 
@@ -82,7 +80,7 @@ _ON_USE: Final = {
     "examine": "edge.doctor.examine",
     "MapSink": "edge.mapping.sink",
     "ObjectMap": "edge.mapping.sink",
-    "infer": "edge.pipeline.array_results",
+    "infer": "edge.pipeline.runtime_setup",
     "take_baselines": "edge.pipeline.baseline_capture",
     "paired": "edge.pipeline.pairing",
     "open_recording": "edge.pipeline.replay_setup",

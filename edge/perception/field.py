@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from enum import Flag, auto
 from functools import partial
 from itertools import repeat
-from operator import attrgetter
+from operator import attrgetter, methodcaller
 from typing import Any, Final, NamedTuple
-
-import numpy as np
 
 from edge.perception.result import Result
 
@@ -136,7 +134,7 @@ class Field:
         if self.json is not None:
             return Column(self.attribute, self.json, None)
         if self.kind.shape and self.decimals is not None:
-            return Column(self.attribute, partial(np.round, decimals=self.decimals), None)
+            return Column(self.attribute, methodcaller("round", self.decimals), None)
         return Column(self.attribute, self.make, None, self.decimals)
 
     def in_message(self) -> Column:

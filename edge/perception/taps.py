@@ -8,13 +8,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.contract import Contract
-from edge.inference.pose_input import pose_rows, scheduled_rows
+from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.pattern_check import REPEATS
-from edge.perception.result import NextTap
-from edge.perception.step import Step, Window
+from edge.perception.result import NextTap, Step, Window
 from edge.perception.tap_tracker import TapState, TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.pad_geometry import USPA44

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.event import Note, Report
-from edge.perception.step import Step
+from edge.perception.result import Step
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.errors import BaselineRefusedError
@@ -71,13 +71,8 @@ class Rezeroing:
 class Zeroing:
     """Stage: puts the newest readings over the baseline, takes a new one where it is due, and lets it follow drift.
 
-    Args:
-        taps: of the sensor; a new rest level makes earlier ones worthless.
-        watch: over its taxels.
-        mounting: directions of its axes; None as they are wired.
-        report: takes the outcome of zeroing on demand, and steps in the rest level.
-        unix_time_s: dates the baselines that are taken.
-        notes: why there is no baseline at the start.
+    It reports the outcome of zeroing on demand, and steps in the rest level; `notes` tell why there is no baseline at
+    the start.
 
     Attributes:
         baseline: subtracted from the scans, drift and all; None before there is one.

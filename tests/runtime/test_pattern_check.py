@@ -9,9 +9,8 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, WrongModel, make_trust, make_trusted_contract
 
 from edge.api import Pad
-from edge.inference.contract import ANY_BATCH
+from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from edge.inference.pose_input import scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, foreign_taps
 
@@ -67,7 +66,7 @@ class TestReasons:
         verdict = judge(make_check(), tap, **how)
         assert (verdict.trusted, verdict.reason) == (trusted, reason) and REPEATS == 5
         if trusted:
-            assert verdict.checked and verdict.mismatch == pytest.approx(0, abs=1e-6)
+            assert verdict.mismatch == pytest.approx(0, abs=1e-6)
         if reason == "unexplained":
             assert verdict.mismatch is not None and verdict.mismatch > MOST_MISMATCH
 

@@ -11,8 +11,8 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
 from edge.api import PadPose, UsageError, WindowError
+from edge.inference.contract import pose_rows, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from edge.inference.pose_input import pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 
 POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5)]

@@ -12,7 +12,7 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.pattern_stages import touched, touched_patch
+from edge.perception.pattern_description import touched, touched_patch
 from firmware_bridge.scans.mounting import Mounting
 
 SURE = make_contract(interval_factor=1.6)

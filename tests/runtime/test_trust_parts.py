@@ -13,11 +13,20 @@ from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
 from edge.api import Contract, ModelError
-from edge.inference import small_network as networks
-from edge.inference.forward_model import GRID, KPA, condensed, features
+from edge.inference import trust as networks
 from edge.inference.onnx_session import ModelSession
-from edge.inference.small_network import MOST_INPUTS, MOST_LAYERS, SmallNetwork, packed, small_network
-from edge.inference.trust import contact_features
+from edge.inference.trust import (
+    GRID,
+    KPA,
+    MOST_INPUTS,
+    MOST_LAYERS,
+    SmallNetwork,
+    condensed,
+    contact_features,
+    features,
+    packed,
+    small_network,
+)
 
 GAIN_ERROR = 0.075
 

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
 from edge.api import USPA44, find_model, load_model
-from edge.inference.forward_model import features
-from edge.perception.wrench import LEAST_FORCE_N, Balance, wrench_of
+from edge.inference.trust import features
+from edge.perception.pattern_description import Balance, wrench_of
+from edge.perception.result import LEAST_FORCE_N
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import WRENCH_STAMPED, force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose

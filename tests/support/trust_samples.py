@@ -4,11 +4,8 @@ import numpy as np
 from edge_samples import FakeModel, make_pad_contract
 from pose_samples import make_posed_contract
 
-from edge.inference.contract import Contract
-from edge.inference.forward_model import FEATURES, GRID, KPA, ForwardModel
-from edge.inference.pose_input import POSE_WIDTH
-from edge.inference.small_network import SmallNetwork
-from edge.inference.trust import PLACE_MM, Check, Trust, pair_width
+from edge.inference.contract import POSE_WIDTH, Contract
+from edge.inference.trust import FEATURES, GRID, KPA, PLACE_MM, Check, ForwardModel, SmallNetwork, Trust, pair_width
 
 CONSTANTS = 2
 UNFAMILIAR = 0.5

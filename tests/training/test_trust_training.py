@@ -11,7 +11,7 @@ from edge_samples import write_model
 from press_samples import make_press_set
 from trust_samples import make_trusted_contract
 
-from edge.inference.small_network import small_network
+from edge.inference.trust import small_network
 from train import trust
 from train.data.press_batches import network_input, stated_poses
 from train.errors import CheckpointError, DatasetError
