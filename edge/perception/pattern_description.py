@@ -96,16 +96,15 @@ class Balance:
             self._tap, self._level = tap, (0.0,) * 4
         # Least squares over the contact, whose strong scans count most: of the network's z force, and of what pressing
         # adds to x and y, over the sum of z.
-        newest = (z * z, z * z_n, *(z * (self._pressing @ pattern.ravel())).tolist())
+        pressed_x, pressed_y = (z * (self._pressing @ pattern.ravel())).tolist()
         keep = 1 - 1 / _LEVEL_SCANS
-        squares, by_force, by_x, by_y = self._level = tuple(
-            keep * before + one for before, one in zip(self._level, newest, strict=True)
-        )
+        squares, by_force, by_x, by_y = self._level
+        squares, by_force = keep * squares + z * z, keep * by_force + z * z_n
+        by_x, by_y = keep * by_x + pressed_x, keep * by_y + pressed_y
+        self._level = squares, by_force, by_x, by_y
         # The same over all contacts: of the network's shear, over that by nominal counts per newton.
-        shear_x, shear_y = (
-            (summed - z * by_axis / squares) / per_n
-            for summed, by_axis, per_n in zip((x, y), (by_x, by_y), self._counts_per_n, strict=True)
-        )
+        x_per_n, y_per_n = self._counts_per_n
+        shear_x, shear_y = (x - z * by_x / squares) / x_per_n, (y - z * by_y / squares) / y_per_n
         nominal, found = self._shear
         nominal += shear_x * shear_x + shear_y * shear_y
         found += shear_x * x_n + shear_y * y_n

@@ -35,44 +35,48 @@ MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 """Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 
 
-class LastReading:
-    """Readings, scan number and estimate of a sensor's last pattern; allocates nothing after construction.
+class LastPattern:
+    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
 
-    The estimate is None before the first, and where it must not be used again.
+    Attributes:
+        estimate: None before the first, and where it must not be used again.
     """
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
         self.estimate: Estimate | None = None
-        self.scan_number = -1
+        self._scan_number = -1
         self._counts = np.zeros(scan_shape, dtype=np.float32)
         self._change = np.zeros(scan_shape, dtype=np.float32)
         self._made_by: Hashable = None
         self._poses: NDArray[np.float32] | None = None
 
-    def holds(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> bool:
-        """Return whether readings (3, rows, cols) and poses (taps, 5) have not changed beyond noise, nor the maker.
+    def reuse(self, step: Step, due: Window) -> bool:
+        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
 
-        The maker is what distinguishes the pattern from others, with its number of taps; poses are None for a model
-        without.
+        Nor must the maker have changed, which is what distinguishes the pattern from others.
         """
-        if made_by != self._made_by:
+        if self.estimate is None or due.made_by != self._made_by:
             return False
+        poses = due.poses
         if poses is not None and (
             self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
         ):
             return False
-        np.subtract(counts, self._counts, out=self._change)
+        np.subtract(due.counts[0], self._counts, out=self._change)
         np.abs(self._change, out=self._change)
         # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
         if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
             return False
-        return float(np.vdot(self._change, self._change)) <= (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size
+        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
+            return False
+        step.estimate, step.reused_from = self.estimate, self._scan_number
+        return True
 
-    def keep(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> None:
-        """Keep the readings and poses that a pattern was made from, and its maker; None as the maker keeps nothing."""
-        self._counts[...] = counts
-        self._poses = poses
-        self._made_by = made_by
+    def keep(self, step: Step, due: Window, made: Estimate) -> None:
+        """Keep the estimate of a step's pattern."""
+        self.estimate, self._scan_number = made, step.scan.number
+        self._counts[...] = due.counts[0]
+        self._poses, self._made_by = due.poses, due.made_by
 
 
 class Sensor:
@@ -113,7 +117,7 @@ class Sensor:
         self._taps = Taps(self._tracker, self._watch, contract, options, self.report)
         self._check = Check(check, self._tracker, self._watch, self.report)
         self._describe = Describe(contract, trust, geometry, self.pad)
-        self._last = LastReading(geometry.scan_shape)
+        self._last = LastPattern(geometry.scan_shape)
         self._learn = None if contacts is None else Learn(contacts, measured, pad, self.pad, check, self.report)
         if baseline is not None:
             age_s = baseline.age_s(unix_time_s())
@@ -136,7 +140,7 @@ class Sensor:
         if (zeroed := self._zeroing(step)) is not None:
             self._doubt.begin(zeroed.origin)
         self._health.fill(step)
-        step.notes = (*step.notes, *self._zeroing.notes)
+        step.notes = (*step.notes, *self._zeroing.notes, *self._zeroing.drift_notes)
         if scan.time_ns - scan.not_before_ns > OLD_NS:
             step.notes = (*step.notes, *age_notes(scan))
         if events or self.events:
@@ -169,12 +173,7 @@ class Sensor:
 
     def reuse(self, step: Step, due: Window) -> bool:
         """Give a step the sensor's last pattern if nothing has changed since; return whether it has it."""
-        if self._options.every_scan or self._last.estimate is None:
-            return False
-        if not self._last.holds(due.counts[0], due.made_by, due.poses):
-            return False
-        step.estimate, step.reused_from = self._last.estimate, self._last.scan_number
-        return True
+        return not self._options.every_scan and self._last.reuse(step, due)
 
     def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
         """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
@@ -191,8 +190,7 @@ class Sensor:
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
         """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
         step.estimate = made
-        self._last.keep(due.counts[0], due.made_by, due.poses)
-        self._last.estimate, self._last.scan_number = made, step.scan.number
+        self._last.keep(step, due, made)
         if step.doubted:  # nothing follows from it, and nothing is learned
             made.traction = None
             return

@@ -70,6 +70,8 @@ class TaxelWatch:
         dead: taxels (rows, cols) that are not believed; another array only where they are others than before.
         reasons: dead taxels, row-major from the top left, and one of REASONS for each.
         sound: every taxel is believed, and nothing speaks against one.
+        most_repeats: scans for which a taxel that is believed has repeated itself while a quarter of the others were
+            new.
     """
 
     def __init__(self, grid_shape: tuple[int, int], mounting: Mounting | None = None) -> None:
@@ -92,6 +94,7 @@ class TaxelWatch:
         self._repeats = 0
         self._baseline: Baseline | None = None
         self.sound = False
+        self.most_repeats = 0
         self.reasons: dict[int, str] = {}
 
     @property
@@ -103,11 +106,6 @@ class TaxelWatch:
     def silent_long(self) -> NDArray[np.bool_]:
         """Taxels (rows, cols) that have not arrived for TAXEL_SILENT_SCANS."""
         return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
-
-    @property
-    def most_repeats(self) -> int:
-        """Scans for which a taxel that is believed has repeated itself while a quarter of the others were new."""
-        return 0 if self.sound else int(np.where(self.dead, 0, self._still).max())
 
     @property
     def may_be_estimated(self) -> bool:
@@ -255,6 +253,7 @@ class TaxelWatch:
             self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
         self.sound = not counting and not self.dead.any() and bool(self._arrived.all())
+        self.most_repeats = int(np.where(self.dead, 0, self._still).max())
 
     def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Count scans in which a taxel reads what no contact makes; return the largest of its axes, (rows, cols)."""

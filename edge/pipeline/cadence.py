@@ -73,7 +73,7 @@ class _Gap:
 
 
 class Cadence:
-    """Cadence of one sensor: a pattern is due one period after its scan, and what did not come shows as a gap.
+    """Cadence of one sensor: its period, and what did not come, which shows as a gap.
 
     The wire does not number scans: the number missing between two follows from the sensor's own period, and is only as
     exact as that.
@@ -93,10 +93,6 @@ class Cadence:
         self._gap: _Gap | None = None
         self._paced_from: Scan | None = None
         self._mean_ns: float | None = None
-
-    def late(self, latency_us: float) -> bool:
-        """Return whether a pattern missed its deadline, so long after its scan in [us]; never without a period."""
-        return self.period_ns is not None and latency_us * 1e3 > self.period_ns
 
     def forget(self) -> None:
         """Forget the scans: a recording goes on elsewhere, and none is missing."""
@@ -173,8 +169,10 @@ class Cadences:
     def __len__(self) -> int:
         return len(self._sensors)
 
-    def __getitem__(self, sensor: str) -> Cadence:
-        return self._sensors[sensor]
+    def late(self, sensor: str, latency_us: float) -> bool:
+        """Return whether a pattern was ready later than one period after its scan, in [us]; never without a period."""
+        period_ns = self._sensors[sensor].period_ns
+        return period_ns is not None and latency_us * 1e3 > period_ns
 
     @property
     def shortest_period_s(self) -> float:

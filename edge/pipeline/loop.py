@@ -306,7 +306,7 @@ class Loop:
         scan, statistics = result.scan, self.statistics
         back = self._cadences.follow(scan)
         if result.latency_us is not None:
-            late = self._cadences[scan.sensor].late(result.latency_us)
+            late = self._cadences.late(scan.sensor, result.latency_us)
             statistics.late += late and not self._pace.waited(scan)
         self._pace.follow(result)
         statistics.add(result)
