@@ -4,17 +4,14 @@ import threading
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, make_contract, make_scan
-from mcap_samples import arrays_of
+from edge_samples import BASELINE, PERIOD_NS, REST, FakeLink, make_scan
 from runtime_samples import make_runtime
 
 from edge.api import BaselineRefusedError, DeviceError, LinkLostError, Scan, Source, take_baselines
 from edge.perception.zeroing import GIVE_UP_NS
 from edge.sinks.json_encoding import record
-from edge.sinks.mcap import McapSink
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.links.base import Notice
-from firmware_bridge.zeroing.baseline import deformation
 
 DAY_S = 86_400.0
 
@@ -245,24 +242,6 @@ class TestAge:
 
 
 class TestDrift:
-    def test_the_record_has_what_was_subtracted_and_raw_counts(self, tmp_path):
-        sink = McapSink(tmp_path / "drift.mcap", make_contract())
-        results = Bench().play(1500, 25)
-        for result in results:
-            sink.write(result, {})
-        sink.close()
-        last = results[-1]
-        assert last.baseline.id == BASELINE.id and abs(last.force_counts) < 100
-        told = record(last, {})
-        assert told["drift_counts"]["common"][2] == pytest.approx(25, abs=2) and told["drift_counts"]["step"] == 0
-        assert np.array_equal(told["counts"], last.scan.counts) and told["baseline"] == BASELINE.id
-        kept = arrays_of(tmp_path / "drift.mcap")
-        np.testing.assert_array_equal(kept["counts"][-1], last.scan.counts)
-        np.testing.assert_array_equal(kept["baseline_counts"][0], BASELINE.counts)
-        zeroed = kept["counts"][-1] - kept["baseline_counts"][-1]
-        np.testing.assert_array_equal(zeroed, deformation(last.scan.counts, last.baseline))
-        assert float(zeroed[2].sum()) == pytest.approx(last.force_counts, abs=0.1)
-
     def test_after_a_step_the_record_and_the_live_line_tell_it(self):
         bench = Bench()
         bench.play(300)
