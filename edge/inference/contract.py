@@ -35,10 +35,6 @@ MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
-OUTSIDE: Final = 1.5
-"""Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
-DETERMINED: Final = 0.4
-"""Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")  # of a row; the newest tap has zeros
 POSE_WIDTH: Final = len(POSE_KEYS)
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
@@ -196,9 +192,9 @@ class Contract:
         """
         row = np.zeros(self.pad_width, dtype=np.float32)
         known = {} if pad is None else pad.constants
-        for index, (name, centre, spread) in enumerate(self.pad_inputs):
+        for index, (name, centre, spread) in enumerate(self.pad_inputs):  # of a constant in training
             low, high = (0.0, 0.0) if pad is None else pad.intervals.get(name, (0.0, 0.0))
-            if name in known and (high - low) / 2 / LEVEL_90 <= DETERMINED * spread:
+            if name in known and (high - low) / 2 / LEVEL_90 <= 0.4 * spread:
                 row[index] = (known[name] - centre) / spread
                 row[len(self.pad_inputs) + index] = 1
         if self.takes_gains and pad is not None:
@@ -213,7 +209,7 @@ class Contract:
         for name, centre, spread in self.pad_inputs:
             if pad is not None and name in pad.constants:
                 low, high = pad.intervals.get(name, (pad.constants[name],) * 2)
-                if max(low - centre, centre - high) > OUTSIDE * spread:
+                if max(low - centre, centre - high) > 1.5 * spread:
                     return True
         return False
 

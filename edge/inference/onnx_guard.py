@@ -22,7 +22,6 @@ from firmware_bridge.in_place import read_bounded
 MOST_BYTES: Final = 1 << 28  # largest file: a hundred times the largest bundled model
 MOST_FIELDS: Final = 1 << 20  # most fields, some seconds of walking
 MOST_NODES: Final = 5000  # most operators; onnxruntime goes over all of them repeatedly
-MOST_DIMS: Final = 64
 _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
@@ -35,10 +34,6 @@ Where
 """
 OPERATORS: Final = frozenset(_NAMES.split())
 """Operators that are allowed, as docs/formats.md lists them: no loop, no recurrence, nothing random, no text."""
-ONNX_DOMAINS: Final = ("", "ai.onnx")
-_LONGEST_NAME: Final = 40
-_HIGHEST_TAG: Final = (1 << 32) - 1
-_TAG_BYTES: Final = 5
 _VARINT_BYTES: Final = 10
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
@@ -119,15 +114,15 @@ def check_plain(content: bytes) -> None:
             if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
         # Four bits are the least that an element takes.
-        if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):
+        if dims and (len(dims) > 64 or prod(dims) > 2 * len(content)):
             raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
 
 
 def _check_operator(field: int, name: bytes) -> None:
-    text = name[:_LONGEST_NAME].decode(errors="replace")
+    text = name[:40].decode(errors="replace")
     if field == _OPERATOR and text not in OPERATORS:
         raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
-    if field == _DOMAIN and text not in ONNX_DOMAINS:
+    if field == _DOMAIN and text not in ("", "ai.onnx"):
         raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
 
 
@@ -142,7 +137,7 @@ def _dims(content: bytes, field: _Field) -> Iterator[int]:
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
     while position < end:
-        tag, position = _varint(content, position, end, _TAG_BYTES)
+        tag, position = _varint(content, position, end, 5)
         number, wire = tag >> 3, tag & 7
         value = 0
         if wire == _VARINT:
@@ -156,7 +151,7 @@ def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
             position += _FIXED_BYTES[wire]
         else:
             raise ModelError(_BROKEN)
-        if number == 0 or tag > _HIGHEST_TAG or position > end:
+        if number == 0 or tag >= 1 << 32 or position > end:
             raise ModelError(_BROKEN)
         yield _Field(number, wire, value, start, position)
 

@@ -25,10 +25,7 @@ MOST_UNITS: Final = 256
 
 
 class SmallNetwork:
-    """Layers with a rectifier between them, from a row of features to one number.
-
-    Args:
-        layers: weights (outputs, inputs) and offsets (outputs,) of each layer.
+    """Layers of weights (outputs, inputs) and offsets (outputs,), rectified, from a row of features to one number.
 
     Raises:
         ValueError: layers that do not follow each other, are too large, or do not end in one number.

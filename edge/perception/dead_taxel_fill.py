@@ -15,19 +15,17 @@ from edge.errors import EdgeError
 from firmware_bridge.recording.npz_recording import read_npz
 
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
-"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels: fitted on
-validation presses, the larger of STSR's and MTSR-4's. They may be too small on contacts unlike those of training."""
+"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels of validation
+presses. They may be too small on contacts unlike those of training."""
 MOST_KINDS: Final = 64
 _AXES: Final = 3
 
 
 class TaxelEstimator:
-    """Estimator of dead taxels, fitted on readings of simulated presses.
+    """Estimator of dead taxels of a grid (rows, cols), fitted on readings of simulated presses.
 
-    Args:
-        covariances: (kinds, 3 taxels, 3 taxels) of zeroed counts about zero, of any scale, x of all taxels first,
-            row-major, then y, z.
-        grid_shape: (rows, cols).
+    Covariances (kinds, 3 taxels, 3 taxels) are of zeroed counts about zero, of any scale, x of all taxels first,
+    row-major, then y, z.
 
     Raises:
         EdgeError: the covariances are of another grid, or not positive definite.
@@ -74,10 +72,7 @@ class Filler:
 
 
 class Kinds:
-    """Probabilities of kinds of contact, equally frequent, from readings of any scale.
-
-    Args:
-        covariances: (kinds, n, n) of readings.
+    """Probabilities of kinds of contact, equally frequent, by their covariances (kinds, n, n) of readings of any scale.
 
     Source: Tyler 1987, angular central Gaussian.
     """

@@ -11,18 +11,17 @@ from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
 from firmware_bridge.scans.scan import Scan
 
-ZeroingKind = Literal[
-    "zeroing", "zeroed", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"
+# fmt: off
+EventKind = Literal[
+    NoticeKind, "sink", "reset", "refused", "poses_silent", "poses_back", "poses_trouble",
+    "zeroing", "zeroed", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared",
+    "tap_dropped", "suspected", "cleared", "gains_learned", "tap_without_pose", "tap_out_of_reach",
 ]
-TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
-TapPoseKind = Literal["tap_without_pose", "tap_out_of_reach"]
-PoseSourceKind = Literal["poses_silent", "poses_back", "poses_trouble"]
-EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, TapPoseKind, PoseSourceKind, "sink", "reset", "refused"]
-TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
-ZeroingNoteKind = Literal[
-    "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt"
+NoteKind = Literal[
+    "held", "estimated", "dead", "frozen", "rest_level", "late", "not_checked",
+    "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt",
 ]
-NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "late", "not_checked"]
+# fmt: on
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
 

@@ -78,8 +78,7 @@ class Columns:
         self._get = attrgetter(*(column.attribute for column in columns))
         self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
         # Here and not in `make`: a record rounds a dozen numbers, and a function for each costs more than the rounding.
-        rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
-        self._rounded = rounded
+        self._rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
         self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
         # From the last to the first, so that spreading out a vector does not move those still to come.
         self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))

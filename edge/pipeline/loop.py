@@ -29,7 +29,6 @@ from firmware_bridge.schedule import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
-REFUSED_AGAIN_S: Final = 10.0  # time until another refused command is told, in [s]: a stream of them must not flood
 
 
 class Loop:
@@ -232,8 +231,8 @@ class Loop:
         carry_out(commands, self._runtime, may_come)
         self.statistics.commands_refused = commands.refused
         now_s = self._clock_s()
-        if commands.reason is not None and now_s - self._refused_s >= REFUSED_AGAIN_S:
-            self._refused_s = now_s
+        if commands.reason is not None and now_s - self._refused_s >= 10:
+            self._refused_s = now_s  # a stream of refused ones must not flood
             self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
             commands.reason = None
 

@@ -13,11 +13,10 @@ from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
-BUCKETS_PER_OCTAVE: Final = 32  # resolution of the run-time histogram: a quantile is at most 2.2 % too high
+BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
+OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
-LONGEST_US: Final = 2.0**26
-"""Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
 _COUNTERS: Final = (
     *("dropped", "overruns", "late", "missed"),
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
@@ -31,13 +30,13 @@ class Histogram:
     def __init__(self) -> None:
         self.count = 0
         self.max = 0.0
-        self._buckets = [0] * (math.ceil(math.log2(LONGEST_US) * BUCKETS_PER_OCTAVE) + 1)
+        self._buckets = [0] * (OCTAVES * BUCKETS_PER_OCTAVE + 1)
 
     def add(self, value: float) -> None:
         """Count a value; below 1 counts as 1."""
         self.count += 1
         self.max = max(self.max, value)
-        self._buckets[math.ceil(math.log2(min(max(value, 1.0), LONGEST_US)) * BUCKETS_PER_OCTAVE)] += 1
+        self._buckets[math.ceil(min(math.log2(max(value, 1.0)), OCTAVES) * BUCKETS_PER_OCTAVE)] += 1
 
     def quantile(self, share: float) -> float | None:
         """Return the upper edge of the bucket that holds the `share`-th value; None without values."""

@@ -23,9 +23,6 @@ from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
-UNASKED_S: Final = 0.01
-"""Time between two reads of several links, in [s], until another pace is asked for: while a model loads nobody needs
-their scans at once, and reading frame by frame would slow that down until the kernel had no room for more."""
 
 
 class Reading(Protocol):
@@ -69,14 +66,9 @@ class Source:
         rate_hz: float | None = None,
         force: bool = False,
     ) -> None:
-        """Prepare to read links that are not open yet.
+        """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        Args:
-            links: one or more, opened and closed by this source.
-            capacity_scans: number of scans that may wait.
-            sensor_file: properties of the sensors; empty by default.
-            rate_hz: of each sensor, in [Hz].
-            force: use on a device also properties that the sensor file has from an emulated sensor.
+        With `force` a device also gets properties that the sensor file has from an emulated sensor.
 
         Raises:
             SourceError: some are emulated and some are not: results of both kinds must not be mixed.
@@ -255,8 +247,10 @@ class Source:
         atexit.register(self.close)
 
     def _begin_reading(self) -> None:
+        # Until another pace is asked for, a model loads, and nobody needs the scans at once: reading several links by
+        # frames would slow that down until the kernel had no room for more.
         if len(self._links) > 1:
-            self.pace = Pace(UNASKED_S)
+            self.pace = Pace(0.01)
         for link in self._links:
             reading, thread = _started("scan-reader", partial(self._follow, link))
             self._threads.append(thread)
