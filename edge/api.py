@@ -36,9 +36,9 @@ from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import Latest
 from edge.pipeline.pose_queue import PoseQueue
-from edge.pipeline.result_stream import Stream, pump
+from edge.pipeline.result_stream import Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.runtime_setup import load_model, open_runtime
+from edge.pipeline.runtime_setup import infer, load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import RunFacts, Sink
 from edge.pipeline.source_setup import links_to, sensor_settings, with_recorded
@@ -69,9 +69,7 @@ if TYPE_CHECKING:
     from edge.doctor.examine import examine
     from edge.mapping.sink import MapSink, ObjectMap
     from edge.pipeline.baseline_capture import take_baselines
-    from edge.pipeline.pairing import paired
     from edge.pipeline.replay_setup import open_recording
-    from edge.pipeline.runtime_setup import infer
     from edge.pose_sources.open_poses import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
 
@@ -80,9 +78,7 @@ _ON_USE: Final = {
     "examine": "edge.doctor.examine",
     "MapSink": "edge.mapping.sink",
     "ObjectMap": "edge.mapping.sink",
-    "infer": "edge.pipeline.runtime_setup",
     "take_baselines": "edge.pipeline.baseline_capture",
-    "paired": "edge.pipeline.pairing",
     "open_recording": "edge.pipeline.replay_setup",
     "PoseSource": "edge.pose_sources.open_poses",
     "open_poses": "edge.pose_sources.open_poses",

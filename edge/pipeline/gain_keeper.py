@@ -1,6 +1,6 @@
 """Keeping of learned gains in the sensor file, in a thread of its own: a disk may take longer than a scan."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -26,14 +26,17 @@ class GainKeeper:
         self._path = path
         self._emulated = emulated
         self._writer = ThreadPoolExecutor(1, "gain-keeper")
+        self._written: Future[None] | None = None
 
     def keep(self, sensor: str, learned: Pad) -> None:
         """Begin to write the learned gains of a sensor, which must not wait."""
-        self._writer.submit(self._write, sensor, learned)
+        self._written = self._writer.submit(self._write, sensor, learned)
 
     def close(self) -> None:
         """Wait until all is written."""
         self._writer.shutdown()
+        if self._written is not None:
+            self._written.result()  # raises what is no trouble with the file
 
     def _write(self, sensor: str, learned: Pad) -> None:
         try:

@@ -19,11 +19,10 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines
+from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped
 from edge.validation import check_positive, check_whole
-from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, pad_of
+from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, USPA44, pad_of
 from firmware_bridge.recording.tracks import HIGHEST_COUNT, Recording, Track
-from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.sensor_file.model import SensorEntry
@@ -136,8 +135,7 @@ def infer(
     if not isinstance(baseline, Baseline):
         baseline = Baseline.from_counts("array", _checked("baseline", baseline, lowest=0), 0.0)
     recording = Recording(Path("array"), (Track(baseline.sensor, scans, None),), rate_hz)
-    pad = pad_of(*scans.shape[2:])
-    known = sensor_settings(None, pad.name if pad in PADS else ModelMap(pad.name, pad, {}))
+    known = sensor_settings(None, unmapped(pad_of(*scans.shape[2:])))
     known = replace(known, sensors={baseline.sensor: SensorEntry(baseline=baseline)})
     with Source(ReplayLink([recording], paced=False), sensor_file=known) as source:
         return list(Stream(source, open_runtime(model, source)))
