@@ -53,16 +53,6 @@ class TestResult:
         assert result.deviation is not None and result.interval_mm is result.centroid_mm is None
         assert result.area_mm2 == 0
 
-    def test_input_is_scaled_by_the_contract_newest_tap_first(self):
-        model = FakeModel()
-        pad = Pushed(make_runtime(model))
-        for press in (2000, 5000, 0, 3000):
-            pad.push(press)
-        window = model.windows[-1]
-        assert window.shape == (4, 3, 4, 4) and window.dtype == np.float32
-        assert window[:, 2, 1, 1].tolist() == [3.0, 5.0, 0.0, 0.0]
-        assert not window[:, :2].any()
-
     def test_the_patch_is_weighted_and_leaves_out_what_is_below_the_level(self):
         pattern = np.zeros((40, 40), dtype=np.float32)
         pattern[1, [0, 1, 3]] = 0.49, 0.5, 1.0

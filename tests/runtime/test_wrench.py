@@ -100,13 +100,6 @@ def test_shear_is_never_scaled_beyond_what_pads_differ_by(press, off, most):
     assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
 
 
-def test_each_contact_has_a_level_of_its_own(press):
-    balance, pattern, traction, readings, row, _ = press
-    for tap, off in enumerate([1.0, 0.7, 1.3]):
-        force_n = wrench_of(balance(traction * np.float32(off), pattern, readings, tap, row), PIXEL_MM).force_n
-        assert force_n[2] == pytest.approx(off * wrench_of(traction, PIXEL_MM).force_n[2])
-
-
 def test_where_nothing_presses_the_traction_stays(press):
     balance, pattern, traction, readings, row, _ = press
     assert balance(traction, pattern, -readings, 0, row) is traction
