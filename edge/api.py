@@ -28,19 +28,17 @@ from edge.errors import (
     WindowError,
 )
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, demo_recording, find_model
-from edge.inference.contract import Contract
-from edge.inference.model_interface import Model
-from edge.inference.timed_loading import unfinished_load
+from edge.inference.contract import Contract, Model
+from edge.inference.onnx_guard import unfinished_load
 from edge.perception.event import Event, Note
-from edge.perception.result import NextTap, Result
+from edge.perception.result import NextTap, Result, Wrench
 from edge.perception.runtime import Runtime
-from edge.perception.wrench import Wrench
 from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import Latest
 from edge.pipeline.pose_queue import PoseQueue
-from edge.pipeline.result_stream import Stream, pump
+from edge.pipeline.result_stream import Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.runtime_setup import load_model, open_runtime
+from edge.pipeline.runtime_setup import infer, load_model, open_runtime
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import RunFacts, Sink
 from edge.pipeline.source_setup import links_to, sensor_settings, with_recorded
@@ -71,9 +69,7 @@ if TYPE_CHECKING:
     from edge.doctor.examine import examine
     from edge.mapping.sink import MapSink, ObjectMap
     from edge.perception.patches import Patch, PatchEvent, PatchEvents, patches
-    from edge.pipeline.array_results import infer
     from edge.pipeline.baseline_capture import take_baselines
-    from edge.pipeline.pairing import paired
     from edge.pipeline.replay_setup import open_recording
     from edge.pose_sources.open_poses import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
@@ -87,9 +83,7 @@ _ON_USE: Final = {
     "PatchEvent": "edge.perception.patches",
     "PatchEvents": "edge.perception.patches",
     "patches": "edge.perception.patches",
-    "infer": "edge.pipeline.array_results",
     "take_baselines": "edge.pipeline.baseline_capture",
-    "paired": "edge.pipeline.pairing",
     "open_recording": "edge.pipeline.replay_setup",
     "PoseSource": "edge.pose_sources.open_poses",
     "open_poses": "edge.pose_sources.open_poses",

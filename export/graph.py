@@ -20,10 +20,10 @@ from edge.inference.contract import (
     INPUT_NAME,
     OUTPUT_NAME,
     PAD_NAME,
+    POSE_WIDTH,
     POSES_NAME,
     TRACTION_NAME,
 )
-from edge.inference.pose_input import POSE_WIDTH
 from export.errors import ExportError
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.blocks import PatternNet

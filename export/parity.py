@@ -19,9 +19,9 @@ from edge.inference.contract import (
     POSES_NAME,
     TRACTION_NAME,
     Contract,
+    scheduled_rows,
 )
 from edge.inference.onnx_session import LOG_FATAL_ONLY
-from edge.inference.pose_input import scheduled_rows
 from export.errors import ParityError
 from export.graph import outputs
 from train.networks.blocks import PatternNet

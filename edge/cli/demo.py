@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.metrics import boundary_distance_mm, psnr_db, rmse_percent
 from edge.inference.bundled import demo_recording
-from edge.inference.model_interface import Model
-from edge.inference.pose_input import scheduled_rows
+from edge.inference.contract import Model, scheduled_rows
 from edge.mapping.object_map import ObjectMap
 from edge.mapping.sink import MapSink, MapState
 from edge.perception.event import Event

@@ -42,7 +42,7 @@ from edge.api import (
 from edge.cli.run_help import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
-from edge.pipeline.silence_hint import silence_hint
+from edge.pipeline.run_statistics import silence_hint
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals

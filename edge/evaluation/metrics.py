@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge.perception.pattern_stages import touched
+from edge.perception.pattern_description import touched
 
 _WINDOW_RADIUS_PX: Final = 5
 

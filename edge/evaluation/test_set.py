@@ -19,8 +19,7 @@ from edge.evaluation.metrics import (
     ssim,
     ssim_global,
 )
-from edge.inference.contract import Contract
-from edge.inference.model_interface import Model
+from edge.inference.contract import Contract, Model
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.npz_recording import read_npz

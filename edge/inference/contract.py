@@ -1,20 +1,20 @@
-"""Contract between a trained model and the runtime, kept in the ONNX metadata."""
+"""Contract between a trained model and the runtime, in the ONNX metadata; poses as model input; the model itself."""
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.intervals import is_confidence, is_interval_levels, is_number
-from edge.inference.pose_input import POSE_WIDTH
 from edge.inference.trust import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
+from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
 
 CONTRACT_VERSION: Final = 9
@@ -36,12 +36,10 @@ MOST_PIXELS: Final = 1 << 20
 LONGEST_VALUE: Final = 1 << 20
 """Most characters of a key's JSON; the longest of a bundled model, `trust`, has a quarter of a million."""
 LONGEST_SHOWN: Final = 100
-OUTSIDE: Final = 1.5
-"""Distance of a constant from the middle of its range in training, over half of the range, that is far outside."""
-DETERMINED: Final = 0.4
-"""Largest deviation of a constant that a model takes as available, over the spread of the constant in training."""
 GAINS_CERTAINTY: Final = "gains_certainty"
 _LATER: Final = ("made_for",)  # keys that models of before lack
+POSE_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg", "error_mm", "error_deg")  # of a row; the newest tap has zeros
+POSE_WIDTH: Final = len(POSE_KEYS)
 LEAST_UNIT: Final = 1e-6  # least divisor in counts, newtons or millimetres, so that float32 holds the quotient
 
 Shape = tuple[Any, ...]
@@ -200,11 +198,11 @@ class Contract:
         row = np.zeros(self.pad_width, dtype=np.float32)
         if pad is None:
             return row
-        for index, (name, centre, spread) in enumerate(self.pad_inputs):
+        for index, (name, centre, spread) in enumerate(self.pad_inputs):  # of a constant in training
             if (value := pad.constants.get(name)) is None:
                 continue
             low, high = pad.intervals.get(name, (value, value))
-            if (high - low) / 2 / LEVEL_90 <= DETERMINED * spread:
+            if (high - low) / 2 / LEVEL_90 <= 0.4 * spread:
                 row[index] = (value - centre) / spread
                 row[len(self.pad_inputs) + index] = 1
         if self.takes_gains:
@@ -226,7 +224,7 @@ class Contract:
         for name, centre, spread in self.pad_inputs:
             if pad is not None and name in pad.constants:
                 low, high = pad.intervals.get(name, (pad.constants[name],) * 2)
-                if max(low - centre, centre - high) > OUTSIDE * spread:
+                if max(low - centre, centre - high) > 1.5 * spread:
                     return True
         return False
 
@@ -335,3 +333,56 @@ def _is_pad_input(value: Any) -> bool:
     name, centre, spread = value
     low, high = PAD_RANGES.get(name, (1.0, 0.0)) if isinstance(name, str) else (1.0, 0.0)
     return low <= centre <= high and spread >= LEAST_UNIT
+
+
+def pose_rows(poses: Sequence[PadPose]) -> NDArray[np.float32]:
+    """Return the poses (taps, 5) of taps as model input; the first is the newest."""
+    rows = np.zeros((len(poses), POSE_WIDTH), dtype=np.float32)
+    for row, pose in zip(rows[1:], poses[1:], strict=True):
+        seen = pose.seen_from(poses[0])
+        row[:] = (seen.x_mm, seen.y_mm, seen.turn_deg, seen.error_mm, seen.error_deg)
+    return rows
+
+
+def scheduled_rows(taps: int, angle_step_deg: float) -> NDArray[np.float32]:
+    """Return the poses (taps, 5) of taps by the paper's schedule: tap k before the newest is turned by k steps."""
+    rows = np.zeros((taps, POSE_WIDTH), dtype=np.float32)
+    turn_deg = angle_step_deg * np.arange(1, taps)
+    rows[1:, 2] = (turn_deg + 180) % 360 - 180
+    rows[1:, 3:] = PLACE_ERROR_MM, TURN_ERROR_DEG
+    return rows
+
+
+class Model(Protocol):
+    """Model that is ready to run."""
+
+    name: str
+    contract: Contract
+
+    def run(
+        self,
+        window: NDArray[np.float32],
+        pad: NDArray[np.float32] | None = None,
+        poses: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the pattern (H, W) of a window (taps, 3, rows, cols) in network input units, its pad and its poses."""
+        ...
+
+    def run_together(
+        self,
+        windows: Sequence[NDArray[np.float32]],
+        pads: Sequence[NDArray[np.float32]] | None = None,
+        poses: Sequence[NDArray[np.float32]] | None = None,
+    ) -> NDArray[np.float32]:
+        """Return the patterns (n, H, W) of several windows in one call."""
+        ...
+
+    @property
+    def deviation(self) -> NDArray[np.float32] | None:
+        """Standard deviation of each pixel of the last run's patterns, of their shape; None without."""
+        ...
+
+    @property
+    def traction(self) -> NDArray[np.float32] | None:
+        """Traction (3, h, w) of the last run, (n, 3, h, w) of several windows, in [kPa]; None without."""
+        ...

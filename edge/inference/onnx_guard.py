@@ -1,14 +1,20 @@
-"""Check of a model file before onnxruntime reads it: one plain graph with its own weights, of bounded size.
+"""Guards of loading a model: its file is one plain graph with its own weights, of bounded size, and loads in time.
 
 onnxruntime follows a tensor into a side file, and a graph into graphs within it, which may run for ever. The walk
 covers the fields that lead to them and to the operators, skips all else, and refuses what it does not understand.
 Source: onnx.proto, IR version 10 to 13; Protocol Buffers encoding.
+
+While onnxruntime loads a graph, and during its first run, Python handles no signal on the calling thread. So loading
+has a thread of its own, and the calling one only waits, and gives up in time.
 """
 
-from collections.abc import Iterator, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, wait
 from math import prod
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from edge.errors import ModelError
 from firmware_bridge.in_place import read_bounded
@@ -16,7 +22,6 @@ from firmware_bridge.in_place import read_bounded
 MOST_BYTES: Final = 1 << 28  # largest file: a hundred times the largest bundled model
 MOST_FIELDS: Final = 1 << 20  # most fields, some seconds of walking
 MOST_NODES: Final = 5000  # most operators; onnxruntime goes over all of them repeatedly
-MOST_DIMS: Final = 64
 _NAMES: Final = """
 Abs Add And ArgMax AveragePool BatchNormalization Cast Ceil Clip Concat Constant ConstantOfShape Conv ConvInteger
 ConvTranspose Cos DepthToSpace DequantizeLinear Div DynamicQuantizeLinear Einsum Elu Equal Erf Exp Expand Flatten Floor
@@ -29,10 +34,6 @@ Where
 """
 OPERATORS: Final = frozenset(_NAMES.split())
 """Operators that are allowed, as docs/formats.md lists them: no loop, no recurrence, nothing random, no text."""
-ONNX_DOMAINS: Final = ("", "ai.onnx")
-_LONGEST_NAME: Final = 40
-_HIGHEST_TAG: Final = (1 << 32) - 1
-_TAG_BYTES: Final = 5
 _VARINT_BYTES: Final = 10
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}
@@ -113,15 +114,15 @@ def check_plain(content: bytes) -> None:
             if message is _NODE and field.number in (_OPERATOR, _DOMAIN):
                 _check_operator(field.number, content[field.start : field.end])
         # Four bits are the least that an element takes.
-        if dims and (len(dims) > MOST_DIMS or prod(dims) > 2 * len(content)):
+        if dims and (len(dims) > 64 or prod(dims) > 2 * len(content)):
             raise ModelError(f"has weights of shape {dims[:8]}, more than its {len(content)} bytes can hold")
 
 
 def _check_operator(field: int, name: bytes) -> None:
-    text = name[:_LONGEST_NAME].decode(errors="replace")
+    text = name[:40].decode(errors="replace")
     if field == _OPERATOR and text not in OPERATORS:
         raise ModelError(f"has operator {text!r}, expected only those that docs/formats.md lists")
-    if field == _DOMAIN and text not in ONNX_DOMAINS:
+    if field == _DOMAIN and text not in ("", "ai.onnx"):
         raise ModelError(f"has an operator of domain {text!r}, expected ONNX's own alone")
 
 
@@ -136,7 +137,7 @@ def _dims(content: bytes, field: _Field) -> Iterator[int]:
 
 def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
     while position < end:
-        tag, position = _varint(content, position, end, _TAG_BYTES)
+        tag, position = _varint(content, position, end, 5)
         number, wire = tag >> 3, tag & 7
         value = 0
         if wire == _VARINT:
@@ -150,7 +151,7 @@ def _fields(content: bytes, position: int, end: int) -> Iterator[_Field]:
             position += _FIXED_BYTES[wire]
         else:
             raise ModelError(_BROKEN)
-        if number == 0 or tag > _HIGHEST_TAG or position > end:
+        if number == 0 or tag >= 1 << 32 or position > end:
             raise ModelError(_BROKEN)
         yield _Field(number, wire, value, start, position)
 
@@ -167,3 +168,53 @@ def _varint(content: bytes, position: int, end: int, most_bytes: int) -> tuple[i
         if byte < 0x80:
             return value, position
     raise ModelError(_BROKEN)
+
+
+LOAD_LIMIT_S: Final = 60.0  # longest load: a thousand times that of the bundled models
+STOP_S: Final = 0.5
+"""Time that each part of a load may still take after a stop was requested: two in a row come before an end by force."""
+_POLL_S: Final = 0.1
+_THREAD: Final = "edge: loading a model"
+
+Made = TypeVar("Made")
+
+
+def within_limit(
+    work: Callable[[], Made],
+    path: Path,
+    stop: threading.Event | None = None,
+    give_up: Callable[[], object] = lambda: None,
+) -> Made:
+    """Do a part of loading a model on another thread, and return its value or raise its exception.
+
+    Abandoned work goes on until it ends, `give_up` ends it without waiting for that, or the program ends.
+
+    Raises:
+        ModelError: it was not done within LOAD_LIMIT_S, or STOP_S after `stop`.
+    """
+    made = Future[Made]()
+
+    def run() -> None:
+        try:
+            made.set_result(work())
+        except BaseException as error:  # noqa: BLE001 - raised below, on the thread that waits
+            made.set_exception(error)
+
+    threading.Thread(target=run, name=_THREAD, daemon=True).start()
+    until_s, asked_s = time.monotonic() + LOAD_LIMIT_S, None
+    while not wait([made], _POLL_S).done:
+        now_s = time.monotonic()
+        if asked_s is None and stop is not None and stop.is_set():
+            asked_s = now_s
+        if asked_s is not None and now_s > asked_s + STOP_S:
+            give_up()
+            raise ModelError(f"{path}: stopped before it was loaded")
+        if now_s > until_s:
+            give_up()
+            raise ModelError(f"{path}: not loaded within {LOAD_LIMIT_S:g} s: export a smaller graph")
+    return made.result()
+
+
+def unfinished_load() -> bool:
+    """Return whether an abandoned load goes on; `os._exit` must end the program then, or onnxruntime may crash."""
+    return any(thread.name == _THREAD for thread in threading.enumerate())

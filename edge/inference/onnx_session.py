@@ -21,13 +21,14 @@ from edge.inference.contract import (
     INPUT_NAME,
     OUTPUT_NAME,
     PAD_NAME,
+    POSE_KEYS,
+    POSE_WIDTH,
     POSES_NAME,
     TRACTION_NAME,
     Contract,
+    scheduled_rows,
 )
-from edge.inference.onnx_guard import read_model
-from edge.inference.pose_input import POSE_KEYS, POSE_WIDTH, scheduled_rows
-from edge.inference.timed_loading import within_limit
+from edge.inference.onnx_guard import read_model, within_limit
 from firmware_bridge.errors import harmless
 
 Outputs = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None]
@@ -64,25 +65,13 @@ class BoundRun:
         self.pad = inputs.get(PAD_NAME)
         self.outputs: Outputs = (outputs[OUTPUT_NAME], outputs.get(DEVIATION_NAME), outputs.get(TRACTION_NAME))
 
-    def put(self, index: int, window: NDArray[np.float32], poses: NDArray[np.float32]) -> None:
-        """Put in a window with poses; absent taps are zeros."""
-        if self.poses is None:
-            raise ValueError("the model takes no poses")
-        taps = len(window)
-        self.window[index, :taps], self.window[index, taps:] = window, 0
-        self.poses[index, :taps], self.poses[index, taps:] = poses, 0
-
 
 def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
     bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
 
 
-WARM_UP_RUNS: Final = 10
-MOST_RUNS: Final = 32  # numbers of windows and of taps for which arrays are kept: four sensors with seven taps have 28
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
-NOT_WHILE_LOADING: Final = ["ConstantFolding"]
-"""Optimisers that are off while loading: a stranger's file can make the folding of constants last hours."""
 _PLACE: Final = re.compile(
     r"/\S+\.(?:cc|cpp|h):\d+ [\w:~<>]+(?: [\w:~<>&*]+)*\([^()]*(?:\([^()]*\)[^()]*)*\)(?: const)? "
 )
@@ -120,13 +109,9 @@ class ModelSession:
     def __init__(
         self, path: Path, threads: int = 1, stop: threading.Event | None = None, *, taps: int | None = None
     ) -> None:
-        """Load, check and warm up.
+        """Load, check and warm up; `threads` share the work of one run, and `stop` ends the loading early.
 
-        Args:
-            path: of the model.
-            threads: number of threads that share the work of one run.
-            stop: event that ends the loading early.
-            taps: most taps that are given to a model that takes more, with poses; the name then states them.
+        `taps` are the most that are given to a model that takes more, with poses; the name then states them.
 
         Raises:
             ModelError: the file is no model that is allowed, its graph does not keep its contract, or loading takes
@@ -177,7 +162,7 @@ class ModelSession:
             window: (taps, 3, rows, cols) float32, newest first, in network input units; 1 to K taps of a model that
                 takes poses, else K.
             pad: the contract's `pad_row` of the sensor's pad; by default that of an unknown pad.
-            poses: (taps, 5) float32 as edge.inference.pose_input makes them, for a model that takes poses; by default
+            poses: (taps, 5) float32 as edge.inference.contract makes them, for a model that takes poses; by default
                 those of the paper's schedule, and zeros for taps of zeros.
 
         Returns:
@@ -214,48 +199,44 @@ class ModelSession:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
-        if not self.contract.takes_poses and poses is not None:
+        if self.contract.takes_poses:
+            poses = [self._scheduled(window) for window in windows] if poses is None else poses
+            for window, rows in zip(windows, poses, strict=True):
+                _check_poses(rows, len(window))
+            windows = [window[: _present(window)] for window in windows]
+        elif poses is not None:
             raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
-        if not self.contract.takes_poses:
-            pattern, self.deviation, self.traction = self._called(windows, pads).outputs
-        else:
-            pattern, self.deviation, self.traction = self._with_poses(windows, pads, poses)
+        pattern, deviation, traction = self._outputs_of(windows, pads, poses)
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
-        if self.traction is not None and not np.isfinite(self.traction).all():
+        if traction is not None and not np.isfinite(traction).all():
             raise ModelError(f"model '{self.name}' gave a traction that is not finite: export it again")
-        deviation = self.deviation
         # NaN fails here too, since it is neither above nor below any number.
         if deviation is not None and not 0 < deviation.min() <= deviation.max() < np.inf:
             raise ModelError(f"model '{self.name}' gave a deviation that is not finite and above zero: export it again")
+        self.deviation, self.traction = deviation, traction
         return pattern
 
-    def _with_poses(
+    def _outputs_of(
         self,
         windows: Sequence[NDArray[np.float32]],
         pads: Sequence[NDArray[np.float32]],
         poses: Sequence[NDArray[np.float32]] | None,
     ) -> Outputs:
-        rows = [self._scheduled(window) for window in windows] if poses is None else poses
-        for window, row in zip(windows, rows, strict=True):
-            _check_poses(row, len(window))
-        present = [_present(window) for window in windows]
-        given, stated = ([one[:taps] for one, taps in zip(all_, present, strict=True)] for all_ in (windows, rows))
-        return self._called(given, pads, stated).outputs
-
-    def _called(
-        self,
-        windows: Sequence[NDArray[np.float32]],
-        pads: Sequence[NDArray[np.float32]],
-        poses: Sequence[NDArray[np.float32]] | None = None,
-    ) -> BoundRun:
-        """Return the arrays of a run, in which the outputs of these windows are now."""
-        run = self._run_of(len(windows), max(map(len, windows)))
+        """Return the outputs of a run; absent taps of a window, and their poses, are zeros."""
+        key = len(windows), max(map(len, windows))
+        run = self._runs.get(key)
+        if run is None:
+            if len(self._runs) >= 32:  # of four sensors with seven taps there are 28
+                del self._runs[next(iter(self._runs))]
+            run = self._runs[key] = BoundRun(self._session, self.contract, *key)
         for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
-            if poses is None:
+            if run.poses is None or poses is None:
                 run.window[index] = window.reshape(run.window.shape[1:])
             else:
-                run.put(index, window, poses[index])
+                taps = len(window)
+                run.window[index, :taps], run.window[index, taps:] = window, 0
+                run.poses[index, :taps], run.poses[index, taps:] = poses[index][:taps], 0
             if run.pad is not None:
                 run.pad[index] = pad
         try:
@@ -263,7 +244,7 @@ class ModelSession:
                 self._session.run_with_iobinding(binding, self._options)
         except ORT_ERRORS as error:
             raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        return run
+        return run.outputs
 
     def _check_window(self, window: NDArray[np.float32]) -> None:
         shape, expected = window.shape, str(self._shape)
@@ -282,18 +263,9 @@ class ModelSession:
         rows[~window.any(axis=(1, 2, 3))] = 0
         return rows
 
-    def _run_of(self, count: int, taps: int) -> BoundRun:
-        """Return the arrays for so many windows and taps; those that were made first are given up for new ones."""
-        run = self._runs.get((count, taps))
-        if run is None:
-            if len(self._runs) >= MOST_RUNS:
-                del self._runs[next(iter(self._runs))]
-            run = self._runs[count, taps] = BoundRun(self._session, self.contract, count, taps)
-        return run
-
     def _warm_up(self) -> None:
         for taps in sorted({1 if self.contract.takes_poses else self.contract.taps, self.contract.taps}):
-            for _ in range(WARM_UP_RUNS):
+            for _ in range(10):
                 self.run(np.zeros((taps, *self._shape[1:]), dtype=np.float32))
 
     def _end_run(self) -> None:
@@ -346,13 +318,14 @@ def load_session(path: Path, threads: int = 1, stop: threading.Event | None = No
     options = session_options(threads)
 
     def load() -> onnxruntime.InferenceSession:
-        # The fallback would try the same again, and print on stdout, where records go.
+        # The fallback would try the same again, and print on stdout, where records go. In a stranger's file the folding
+        # of constants can last hours.
         return onnxruntime.InferenceSession(
             content,
             options,
             providers=["CPUExecutionProvider"],
             enable_fallback=0,
-            disabled_optimizers=NOT_WHILE_LOADING,
+            disabled_optimizers=["ConstantFolding"],
         )
 
     try:

@@ -1,18 +1,220 @@
 """Forward model and checks of a model, by which the runtime decides whether a pattern is to be believed.
 
 Two small networks tell whether any contact reads like that, by features that training and runtime make here. They do
-not depend on the force but for its size. Networks and limits travel in a model's contract.
+not depend on the force but for its size. The forward model gives the readings that a pattern makes: it explains a
+contact only in part, because pads, gains and large deformations differ; what it leaves is weighed by that. All of it is
+made by train.trust, in network units, and travels in a model's contract.
 """
 
+import base64
+import binascii
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.forward_model import ForwardModel, forward_model
-from edge.inference.small_network import SmallNetwork, small_network
+from firmware_bridge.pad_geometry import AXES
+
+MOST_INPUTS: Final = 1024
+MOST_LAYERS: Final = 4
+MOST_UNITS: Final = 256
+
+
+class SmallNetwork:
+    """Layers of weights (outputs, inputs) and offsets (outputs,), rectified, from a row of features to one number.
+
+    Raises:
+        ValueError: layers that do not follow each other, are too large, or do not end in one number.
+    """
+
+    def __init__(self, layers: Sequence[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> None:
+        if not 1 <= len(layers) <= MOST_LAYERS:
+            raise ValueError(f"{len(layers)} layers, expected 1 to {MOST_LAYERS}")
+        width = layers[0][0].shape[-1]
+        if not 1 <= width <= MOST_INPUTS:
+            raise ValueError(f"{width} inputs, expected 1 to {MOST_INPUTS}")
+        self.inputs: Final = width
+        self._layers = tuple(
+            (weights.T.astype(np.float32, order="C"), offsets.astype(np.float32)) for weights, offsets in layers
+        )
+        for weights, offsets in self._layers:
+            if weights.ndim != 2 or weights.shape != (width, len(offsets)) or len(offsets) > MOST_UNITS:
+                raise ValueError(f"a layer of {weights.shape[::-1]} after {width} units, of at most {MOST_UNITS}")
+            if not (np.isfinite(weights).all() and np.isfinite(offsets).all()):
+                raise ValueError("a weight is not finite")
+            width = len(offsets)
+        if width != 1:
+            raise ValueError(f"{width} outputs, expected 1")
+
+    def __call__(self, features: NDArray[np.float32]) -> list[float]:
+        """Return the output for each row of features (n, inputs)."""
+        rows = features
+        for weights, offsets in self._layers[:-1]:
+            rows = rows @ weights
+            rows += offsets
+            np.maximum(rows, 0.0, out=rows)
+        weights, offsets = self._layers[-1]
+        return (rows @ weights + offsets).ravel().tolist()
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """Return the layers as JSON, in half precision."""
+        return [{"weights": packed(weights.T), "offsets": packed(offsets)} for weights, offsets in self._layers]
+
+
+def small_network(value: Any) -> SmallNetwork:
+    """Return the network of a value that `SmallNetwork.to_json` has made.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        return SmallNetwork([(unpacked(layer["weights"]), unpacked(layer["offsets"])) for layer in value])
+    except (TypeError, KeyError, IndexError) as error:
+        raise ValueError(f"no list of layers ({error})") from error
+
+
+def packed(values: NDArray[np.floating]) -> dict[str, Any]:
+    """Return an array as JSON: its shape, and its numbers in half precision as base64."""
+    half = np.ascontiguousarray(values, dtype="<f2")
+    return {"shape": list(half.shape), "f2": base64.b64encode(half.tobytes()).decode()}
+
+
+def unpacked(value: Any) -> NDArray[np.float32]:
+    """Return the array of a value that `packed` has made.
+
+    Raises:
+        ValueError: the numbers are not as many as the shape needs, or not finite.
+    """
+    try:
+        shape = [int(length) for length in value["shape"]]
+        if not all(0 < length <= 1 << 16 for length in shape):
+            raise ValueError(f"shape is {shape}")
+        content = base64.b64decode(value["f2"], validate=True)
+    except (TypeError, KeyError, OverflowError, binascii.Error) as error:
+        raise ValueError(f"no packed array ({error})") from error
+    if len(content) != 2 * math.prod(shape):
+        raise ValueError(f"{len(content)} bytes for an array of {shape}")
+    values = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(shape)
+    if not np.isfinite(values).all():
+        raise ValueError("a number is not finite")
+    return values
+
+
+GRID: Final = 8
+"""Cells of the pattern along a side: 2.35 mm. A wave finer than twice that loses 97 % of its amplitude in the layer."""
+_CELLS: Final = GRID**2
+KPA: Final = 30.0  # tangential traction that counts as 1, in [kPa]
+_DRAG_GRID: Final = 4
+"""Cells of the drag along a side in the contract; the traction has twice as many, and four of them share a weight."""
+FEATURES: Final = _CELLS + 2 * _DRAG_GRID**2
+
+
+@dataclass(frozen=True)
+class ForwardModel:
+    """Operator from pattern and traction to the readings of a 4 x 4 sensor, linear in the pad's constants.
+
+    Attributes:
+        operator: (1 + p, 48, FEATURES), of the middle pad, then the change by one spread of each constant.
+        noise: (3,), deviation of a reading of x, y, z from drift, field and noise.
+        model_error: (3,), RMS of what the operator leaves of true patterns' readings, over their amplitude.
+    """
+
+    operator: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    model_error: NDArray[np.float32]
+
+    def of_pad(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the operator of a pad for `features`, by its constants (p,) over their spread, 0 where unknown."""
+        short = np.tensordot(values, self.operator[1:], 1) + self.operator[0]
+        drag = short[:, _CELLS:].reshape(len(short), 2, _DRAG_GRID, 1, _DRAG_GRID, 1)
+        spread = np.broadcast_to(drag / 4, (*drag.shape[:3], 2, _DRAG_GRID, 2)).reshape(len(short), -1)
+        return np.concatenate([short[:, :_CELLS], spread], axis=1, dtype=np.float32)
+
+    def mismatch(
+        self,
+        operator: NDArray[np.float32],
+        tap: NDArray[np.float32],
+        pattern: NDArray[np.float32],
+        traction: NDArray[np.float32],
+        gain_error: float,
+    ) -> float:
+        """Return the share of the energy of a tap's readings that its pattern leaves unexplained.
+
+        Readings (3, rows, cols) in network units count less where noise, drift, the operator of the pad itself, and the
+        standard deviation that remains of the gains make them uncertain. Pattern (H, W) in [mm], traction (3, h, w) in
+        [kPa].
+        """
+        readings, z = tap.reshape(-1), tap[2].reshape(-1)
+        energy = readings * readings
+        weight = energy * np.float32(gain_error**2)
+        noise, model_error = self._variances
+        weight += model_error * np.float32((z @ z) / z.size) + noise
+        np.reciprocal(weight, out=weight)
+        left = operator @ features(pattern, traction)
+        left -= readings
+        left *= left
+        return float(left @ weight) / max(float(energy @ weight), 1e-12)
+
+    @cached_property
+    def _variances(self) -> NDArray[np.float32]:
+        """Variances (2, 48) of noise, and of the operator's error over the square of the amplitude."""
+        return np.repeat(np.square([self.noise, self.model_error]), self.operator.shape[1] // len(AXES), axis=1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the model as JSON."""
+        return {one.name: packed(getattr(self, one.name)) for one in fields(self)}
+
+
+def forward_model(value: Any, constants: int) -> ForwardModel:
+    """Return the forward model of a value that `ForwardModel.to_json` has made, for a model that takes `constants`.
+
+    Raises:
+        ValueError: it is none, or of other constants.
+    """
+    names = [one.name for one in fields(ForwardModel)]
+    if not isinstance(value, dict) or set(value) != set(names):
+        raise ValueError(f"expected {', '.join(names)}")
+    arrays = {name: unpacked(value[name]) for name in names}
+    readings = arrays["operator"].shape[1] if arrays["operator"].ndim > 1 else 0
+    expected = {
+        "operator": (1 + constants, readings, FEATURES),
+        "noise": (len(AXES),),
+        "model_error": (len(AXES),),
+    }
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} is {arrays[name].shape}, expected {shape}")
+    if not ((arrays["noise"] > 0).all() and (arrays["model_error"] > 0).all()):
+        raise ValueError("noise and model_error, expected above 0")
+    return ForwardModel(**arrays)
+
+
+def features(pattern: NDArray[np.float32], traction: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what a pad's operator is applied to: means of the pattern's cells, then the drag x, y in KPA."""
+    inputs = np.empty(3 * _CELLS, dtype=np.float32)
+    np.matmul(pooling(pattern.shape[0]) @ pattern, pooling(pattern.shape[1]).T, out=inputs[:_CELLS].reshape(GRID, GRID))
+    np.multiply(traction[:2].reshape(-1), np.float32(1 / KPA), out=inputs[_CELLS:])
+    return inputs
+
+
+def condensed(inputs: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return features (n, inputs) with the means of four cells of the drag each, (n, FEATURES)."""
+    drag = inputs[:, _CELLS:].reshape(len(inputs), 2, _DRAG_GRID, 2, _DRAG_GRID, 2).mean(axis=(3, 5))
+    return np.concatenate([inputs[:, :_CELLS], drag.reshape(len(inputs), -1)], axis=1)
+
+
+@lru_cache
+def pooling(length: int, cells: int = GRID) -> NDArray[np.float32]:
+    """Return the matrix (cells, length) of means over equal parts of a side."""
+    edges = np.linspace(0, length, cells + 1)
+    places = np.arange(length)
+    share = np.minimum(edges[1:, None], places + 1) - np.maximum(edges[:-1, None], places)
+    return (share.clip(0) / (length / cells)).astype(np.float32)
+
 
 QUIET_UNITS: Final = 0.02
 """Amplitude in network units, added to a scan's own before the division by it: noise stays small."""
@@ -22,7 +224,6 @@ ERROR_UNITS: Final = np.array([1.0, 5.0], dtype=np.float32)
 """Units of the errors of a pose among features, in [mm] and [deg]: five usual errors."""
 MOST_ERROR: Final = 5.0  # largest error of a pose among features, in its unit: beyond it a pose states nothing
 _POSE_FEATURES: Final = 6
-_KEYS: Final = ("forward", "contact", "tap")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +252,6 @@ def check_of(value: Any) -> Check:
     return Check(small_network(value["layers"]), limit)
 
 
-def amplitude(tap: NDArray[np.float32]) -> float:
-    """Return the RMS of z of a tap (3, rows, cols) in network units, and a little more."""
-    z = tap[2].ravel()
-    return math.sqrt(float(z @ z) / z.size) + QUIET_UNITS
-
-
 def contact_features(tap: NDArray[np.float32], pad_row: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the features (1, inputs) of one tap (3, rows, cols) in network units, with the model's pad input."""
     features = np.empty((1, tap.size + 1 + pad_row.size), dtype=np.float32)
@@ -74,11 +269,8 @@ def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -
     """Return the features (K - 1, inputs) of the earlier taps of a window, each beside the newest one.
 
     They are the newest tap, its difference to the earlier one, the sizes of both, and the earlier tap's pose: place,
-    cosine and sine of the turn, and the errors of both.
-
-    Args:
-        window: (K, 3, rows, cols) in network units, newest tap first.
-        poses: (K, 5), as edge.inference.pose_input makes them.
+    cosine and sine of the turn, and the errors of both. The window (K, 3, rows, cols) is in network units, newest tap
+    first, and the poses (K, 5) are as model input.
     """
     readings = window[0].size
     features = np.empty((len(window) - 1, pair_width(readings)), dtype=np.float32)
@@ -98,10 +290,11 @@ def pose_tap_features(window: NDArray[np.float32], poses: NDArray[np.float32]) -
 
 
 def _put_shape(tap: NDArray[np.float32], place: NDArray[np.float32]) -> float:
-    """Put the readings of a tap, over its amplitude, into a row, and return the amplitude."""
-    size = amplitude(tap)
+    """Put the readings of a tap, over its amplitude, into a row, and return the amplitude: the RMS of z, and a bit."""
+    z = tap[2].ravel()
+    size = math.sqrt(float(z @ z) / z.size) + QUIET_UNITS
     np.multiply(tap.reshape(-1), 1 / size, out=place)
-    np.clip(place, -_MOST, _MOST, out=place)
+    np.minimum(np.maximum(place, -_MOST, out=place), _MOST, out=place)  # np.clip takes four times as long on 48 numbers
     return size
 
 
@@ -115,23 +308,19 @@ class Trust:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""
-        return {name: getattr(self, name).to_json() for name in _KEYS}
+        return {"forward": self.forward.to_json(), "contact": self.contact.to_json(), "tap": self.tap.to_json()}
 
 
 def trust_of(value: Any, constants: int) -> Trust | None:
-    """Return what `Trust.to_json` has made of it, for a model that takes so many constants; None if it is empty.
-
-    Args:
-        value: as read from a file.
-        constants: of the pad that the model takes.
+    """Return the checks in a value that `Trust.to_json` made, of a model that takes so many constants; None if empty.
 
     Raises:
         ValueError: it is damaged, or of other constants; the message names the part.
     """
     if value == {}:
         return None
-    if not isinstance(value, dict) or set(value) != set(_KEYS):
-        raise ValueError(f"expected {', '.join(_KEYS)}, or nothing")
+    if not isinstance(value, dict) or set(value) != {"forward", "contact", "tap"}:
+        raise ValueError("expected forward, contact, tap, or nothing")
     forward = forward_model(value["forward"], constants)
     contact, tap = check_of(value["contact"]), check_of(value["tap"])
     readings = forward.operator.shape[1]

@@ -5,7 +5,6 @@ a figure, a face over the whole pad. The living taxels give the probability of e
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -13,37 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.perception.result import Filled
 from firmware_bridge.recording.npz_recording import read_npz
 
-RIDGE: Final = 2e-3
-"""Share of a kind's mean variance that is added to every channel, for the gains and noise of the individual sensor."""
 WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
-"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels: fitted on
-validation presses, the larger of STSR's and MTSR-4's. They may be too small on contacts unlike those of training."""
-_OF_TAXELS: Final = 16
-MOST_BYTES: Final = 1 << 24
+"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels of validation
+presses. They may be too small on contacts unlike those of training."""
 MOST_KINDS: Final = 64
 _AXES: Final = 3
-_Z: Final = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """Readings (3, rows, cols) with estimates in the place of dead taxels, their summed z, and the kind of estimate."""
-
-    counts: NDArray[np.float32]
-    z_counts: float
-    filled: Filled
 
 
 class TaxelEstimator:
-    """Estimator of dead taxels, fitted on readings of simulated presses.
+    """Estimator of dead taxels of a grid (rows, cols), fitted on readings of simulated presses.
 
-    Args:
-        covariances: (kinds, 3 taxels, 3 taxels) of zeroed counts about zero, of any scale, x of all taxels first,
-            row-major, then y, z.
-        grid_shape: (rows, cols).
+    Covariances (kinds, 3 taxels, 3 taxels) are of zeroed counts about zero, of any scale, x of all taxels first,
+    row-major, then y, z.
 
     Raises:
         EdgeError: the covariances are of another grid, or not positive definite.
@@ -81,19 +63,16 @@ class Filler:
         self._kinds = Kinds(living)
         self._maps = np.linalg.solve(living, covariances[:, self._live[:, None], self._dead]).transpose(0, 2, 1)
 
-    def __call__(self, zeroed: NDArray[np.float32]) -> Readings:
-        """Fill in one scan (3, rows, cols) in zeroed counts; readings of dead taxels in it are ignored."""
+    def __call__(self, zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return one scan (3, rows, cols) in zeroed counts with estimates in the place of dead taxels."""
         living = zeroed.ravel()[self._live].astype(np.float64)
         counts = zeroed.copy()
         counts.flat[self._dead] = self._kinds.weigh(living[None])[0] @ (self._maps @ living)
-        return Readings(counts, float(counts[_Z].sum()), "neighbours")
+        return counts
 
 
 class Kinds:
-    """Probabilities of kinds of contact, equally frequent, from readings of any scale.
-
-    Args:
-        covariances: (kinds, n, n) of readings.
+    """Probabilities of kinds of contact, equally frequent, by their covariances (kinds, n, n) of readings of any scale.
 
     Source: Tyler 1987, angular central Gaussian.
     """
@@ -117,13 +96,13 @@ def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ridge_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the ridge in squared counts for each of (kinds, n, n)."""
-    return RIDGE * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
+    """Return the ridge in squared counts for each of (kinds, n, n), for gains and noise of the individual sensor."""
+    return 2e-3 * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
 
 
 def widening(dead_share: float) -> float:
     """Return the factor on deviations where this share of the taxels is dead; at most half of them are."""
-    return WIDENING[min(math.ceil(dead_share * _OF_TAXELS), len(WIDENING) - 1)]
+    return WIDENING[min(math.ceil(dead_share * 16), len(WIDENING) - 1)]
 
 
 def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
@@ -133,7 +112,7 @@ def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
         EdgeError: the file cannot be read, or is of another grid.
     """
     try:
-        covariances = read_npz(path, ["covariances"], MOST_BYTES)["covariances"]
+        covariances = read_npz(path, ["covariances"], 1 << 24)["covariances"]
     except (OSError, ValueError, KeyError) as error:
         raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
     return TaxelEstimator(covariances, grid_shape)

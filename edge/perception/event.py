@@ -11,21 +11,19 @@ from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import Notice, NoticeKind
 from firmware_bridge.scans.scan import Scan
 
-ZeroingKind = Literal[
-    "zeroing", "zeroed", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared"
+# fmt: off
+EventKind = Literal[
+    NoticeKind, "sink", "reset", "refused", "poses_silent", "poses_back", "poses_trouble",
+    "zeroing", "zeroed", "in_contact", "given_up", "rest_level", "baseline_doubted", "baseline_cleared",
+    "tap_dropped", "suspected", "cleared", "gains_learned", "tap_without_pose", "tap_out_of_reach",
 ]
-TrustKind = Literal["tap_dropped", "suspected", "cleared", "gains_learned"]
-TapPoseKind = Literal["tap_without_pose", "tap_out_of_reach"]
-PoseSourceKind = Literal["poses_silent", "poses_back", "poses_trouble"]
-EventKind = Literal[NoticeKind, ZeroingKind, TrustKind, TapPoseKind, PoseSourceKind, "sink", "reset", "refused"]
-TaxelNoteKind = Literal["held", "estimated", "dead", "frozen"]
-ZeroingNoteKind = Literal[
-    "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt"
+NoteKind = Literal[
+    "held", "estimated", "dead", "frozen", "rest_level", "late", "not_checked",
+    "zeroing", "zeroing_restarted", "no_stored_baseline", "not_in_sensor_file", "baseline_in_doubt",
 ]
-NoteKind = Literal[TaxelNoteKind, ZeroingNoteKind, "rest_level", "late", "not_checked"]
+# fmt: on
 KINDS: Final[frozenset[str]] = frozenset(get_args(EventKind))
 NOTE_KINDS: Final[frozenset[str]] = frozenset(get_args(NoteKind))
-_HOW_TO_FORCE: Final = 'Z, or {"cmd": "zero", "force": true}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +32,7 @@ class Event:
 
     Attributes:
         time_ns: monotonic time, in [ns].
-        kind: one of KINDS.
-
-            Kinds of a link, as in `Notice`, or of one sensor while others go on: "lost", "silent", "back", "trouble",
-            "well". Kind of a recording that is played or made: "note". Kind of a sink: "sink", it was given up, or
-            nobody reads it. Kinds of a source of poses: "poses_silent", it stopped; "poses_back"; "poses_trouble",
-            poses are refused, or their times are off.
-
-            Kinds of the runtime: "reset", earlier taps are forgotten; "zeroing", it had begun before it was requested;
-            "zeroed", there is a new baseline; "in_contact", zeroing is refused and may be forced; "given_up", zeroing
-            has ended without a baseline; "refused", another request is not carried out; "rest_level", a step in it, or
-            its end; "baseline_doubted", drift or an old baseline explains the readings as well as a touch, and
-            "baseline_cleared", no longer; "tap_dropped", earlier taps do not belong to the contact; "suspected",
-            contact after contact reads like none, and "cleared", no longer; "gains_learned", gains learned from
-            contacts are in use; "tap_without_pose" and "tap_out_of_reach", a tap is left out.
+        kind: one of KINDS, which docs/formats.md describes.
         sensor: name of the sensor, or None if the event concerns all, or none.
         detail: what the kind leaves open, in a user's words.
         sensors: common prefix of the names of the sensors that an event of a link concerns, as in `Notice`.
@@ -78,7 +63,7 @@ class Event:
             case "zeroed":
                 return f"sensor {self.sensor} zeroed on demand: {self.detail}"
             case "in_contact":
-                remedy = f"free the pad, or force it ({_HOW_TO_FORCE})"
+                remedy = 'free the pad, or force it (Z, or {"cmd": "zero", "force": true})'
                 return f"zeroing refused: sensor {self.sensor} is in contact: {remedy}"
             case "given_up":
                 return f"sensor {self.sensor}: zeroing given up, the old baseline stays: {self.detail}"
@@ -132,18 +117,7 @@ class Note:
     """One remark on a result for its user.
 
     Attributes:
-        kind: one of NOTE_KINDS.
-
-            Of taxels: "held", the last reading of a taxel stands for the present; "estimated", dead taxels are
-            estimated from their neighbours; "dead", taxels are dead and there is no pattern; "frozen", the whole sensor
-            is frozen.
-
-            Of zeroing: "zeroing", it goes on; "zeroing_restarted", with the reason; "no_stored_baseline", so the sensor
-            is zeroed; "not_in_sensor_file"; "baseline_in_doubt", with what was seen and what to do.
-
-            Of the rest level: "rest_level", it has stepped. Of time: "late",
-            the reading was old when it arrived, or the pattern was ready long after that. Of the pattern:
-            "not_checked", since the model has no checks.
+        kind: one of NOTE_KINDS, which docs/formats.md describes.
         text: in a user's words.
 
     Raises:
@@ -192,13 +166,7 @@ def waited_note(waited_ns: int) -> Note:
 
 
 def notes_on_missing(sensor: str, mounted: Collection[str], zeroed: Collection[str]) -> tuple[Note, ...]:
-    """Return notes on what is stored for other sensors, but not for this one.
-
-    Args:
-        sensor: name of this one.
-        mounted: names of the sensors with a mounting.
-        zeroed: names of the sensors with a baseline.
-    """
+    """Return notes on what is stored for other sensors, `mounted` or `zeroed`, but not for this one."""
     notes: list[Note] = []
     if mounted and sensor not in mounted:
         known = ", ".join(sorted(mounted))

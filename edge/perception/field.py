@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from enum import Flag, auto
 from functools import partial
 from itertools import repeat
-from operator import attrgetter
+from operator import attrgetter, methodcaller
 from typing import Any, Final, NamedTuple
-
-import numpy as np
 
 from edge.perception.result import Result
 
@@ -80,8 +78,7 @@ class Columns:
         self._get = attrgetter(*(column.attribute for column in columns))
         self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
         # Here and not in `make`: a record rounds a dozen numbers, and a function for each costs more than the rounding.
-        rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
-        self._rounded = rounded
+        self._rounded = tuple((index, one.decimals) for index, one in enumerate(columns) if one.decimals is not None)
         self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
         # From the last to the first, so that spreading out a vector does not move those still to come.
         self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))
@@ -136,7 +133,7 @@ class Field:
         if self.json is not None:
             return Column(self.attribute, self.json, None)
         if self.kind.shape and self.decimals is not None:
-            return Column(self.attribute, partial(np.round, decimals=self.decimals), None)
+            return Column(self.attribute, methodcaller("round", self.decimals), None)
         return Column(self.attribute, self.make, None, self.decimals)
 
     def in_message(self) -> Column:

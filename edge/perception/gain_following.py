@@ -14,8 +14,7 @@ from edge.inference.contract import Contract
 from edge.perception.event import Report
 from edge.perception.gain_learning import ContactModel, GainLearner
 from edge.perception.pattern_check import PatternCheck
-from edge.perception.result import WrenchOrigin
-from edge.perception.step import Estimate, Step
+from edge.perception.result import Estimate, Step, WrenchOrigin
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import Pad
 
@@ -56,29 +55,34 @@ class SensorPad:
 
 
 HELD_SCANS: Final = 200
-SURER: Final = 0.05  # least rise of certainty that is worth a change of the gains in use
-SHIFTED: Final = 0.01  # least RMS change of the gains in use
-_LEAST_CERTAINTY: Final = 0.1
 CONTRADICTED: Final = 6.0
 """Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
 gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
 CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
 
 
-class GainFollower:
-    """Follower of one sensor's gains.
+class Learn:
+    """Stage: learns the sensor's gains from its contacts, brings them into use, and reports it.
 
     It begins with what was measured. What an earlier run has learned is in use until this run is as sure, but is no
     beginning: counted again with each start, the same errors would come to look certain.
 
     Attributes:
-        waiting: a contact is there to be learned from.
-        contacts: distinct contacts learned from.
+        waiting: a contact is there to be learned from, once the pad is free.
     """
 
-    def __init__(self, model: ContactModel, measured: Pad | None, used: Pad | None = None) -> None:
+    def __init__(
+        self,
+        model: ContactModel,
+        measured: Pad | None,
+        used: Pad | None,
+        pad: SensorPad,
+        check: PatternCheck | None,
+        report: Report,
+    ) -> None:
         """Begin with the pad as measured, and the one in use, also by what was learned before."""
         self.waiting = False
+        self._pad, self._check, self._report = pad, check, report
         self._learner = GainLearner(model, measured)
         self._from_file = measured is not None and measured.gains is not None
         self._used = used or measured or Pad()
@@ -86,89 +90,55 @@ class GainFollower:
         self._strongest = np.zeros(0, dtype=np.float32)
         self._force_counts = 0.0
         self._seen = 0
+        self._learned: Pad | None = None
 
-    @property
-    def contacts(self) -> int:
-        """Number of distinct contacts so far."""
-        return self._learner.contacts
-
-    @property
-    def contradicts_file(self) -> bool:
-        """True if contacts contradict the gains that it began with: they are those of another sensor."""
-        learner = self._learner
-        return self._from_file and learner.contacts >= CONTRADICTED_CONTACTS and learner.disagreement > CONTRADICTED
-
-    @property
-    def learned(self) -> Pad:
-        """Pad by the contacts alone."""
-        return self._learner.pad()
-
-    def see(self, trusted: bool | None, force_counts: float, counts: NDArray[np.float32]) -> bool:
-        """Take note of a contact's pattern and its readings (3, rows, cols); return whether it is time to learn.
+    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32], dead: NDArray[np.bool_]) -> bool:
+        """Take a contact's pattern and its readings (3, rows, cols); return whether another pad is in use since.
 
         A pattern that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
         """
-        if trusted is False:
+        if made.trusted is False:
             self.waiting, self._force_counts = False, 0.0
             return False
         self._seen += 1
+        force_counts = step.force_counts or 0.0
         if force_counts > self._force_counts:
             self._strongest, self._force_counts = counts, force_counts
             self.waiting = True
-        return self._seen >= HELD_SCANS
-
-    def learn(self, dead: NDArray[np.bool_]) -> Pad | None:
-        """Learn from the contact that waits; return the pad with its new gains if they have changed noticeably."""
-        self.waiting, self._force_counts, self._seen = False, 0.0, 0
-        if not self._learner.learn(self._strongest, dead):
-            return None
-        new, used = self._learner.pad(), self._used
-        if new.gains is None or new.gains_certainty < max(_LEAST_CERTAINTY, used.gains_certainty):
-            return None
-        shift = np.log(new.gains) - (0.0 if used.gains is None else np.log(used.gains))
-        surer = new.gains_certainty >= used.gains_certainty + SURER or not set(new.constants) <= set(used.constants)
-        if not surer and np.sqrt(np.square(shift).mean()) < SHIFTED:
-            return None
-        self._used = new.behind(self._by_hand)
-        return self._used
-
-
-class Learn:
-    """Stage: brings what contacts teach of a sensor into use, and reports it.
-
-    Attributes:
-        waiting: a contact is there to be learned from, once the pad is free.
-    """
-
-    def __init__(self, follower: GainFollower, pad: SensorPad, check: PatternCheck | None, report: Report) -> None:
-        self._follower, self._pad, self._check, self._report = follower, pad, check, report
-        self._learned: Pad | None = None
-
-    @property
-    def waiting(self) -> bool:  # noqa: D102 - above
-        return self._follower.waiting
-
-    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32], dead: NDArray[np.bool_]) -> bool:
-        """Take a contact's pattern and readings; return whether another pad is in use since, as `learn` does."""
-        return self._follower.see(made.trusted, step.force_counts or 0.0, counts) and self.learn(dead)
+        return self._seen >= HELD_SCANS and self.learn(dead)
 
     def learn(self, dead: NDArray[np.bool_]) -> bool:
         """Learn from the contact that waits; return whether another pad is in use since."""
-        follower, check = self._follower, self._check
-        pad = follower.learn(dead)
-        if check is not None and follower.contradicts_file:
+        learner, check = self._learner, self._check
+        self.waiting, self._force_counts, self._seen = False, 0.0, 0
+        learned = learner.learn(self._strongest, dead)
+        if (
+            check is not None
+            and self._from_file
+            and learner.contacts >= CONTRADICTED_CONTACTS
+            and learner.disagreement > CONTRADICTED
+        ):
             if not check.suspected:
                 why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
                 self._report("suspected", why)
             check.suspect_file()
             return False
-        if pad is None:
+        if not learned or not self._is_better(new := learner.pad()):
             return False
-        self._learned = follower.learned
-        self._pad.use(pad)
-        percent = 100 * float(np.sqrt(np.square(pad.gain_half_widths or ()).mean()))
-        self._report("gains_learned", f"gains learned from {follower.contacts} contacts, each within {percent:.0f} %")
+        self._learned, self._used = new, new.behind(self._by_hand)
+        self._pad.use(self._used)
+        percent = 100 * float(np.sqrt(np.square(self._used.gain_half_widths or ()).mean()))
+        self._report("gains_learned", f"gains learned from {learner.contacts} contacts, each within {percent:.0f} %")
         return True
+
+    def _is_better(self, new: Pad) -> bool:
+        """Return whether a pad is as sure as the one in use, and noticeably surer or other."""
+        used = self._used
+        if new.gains is None or new.gains_certainty < max(0.1, used.gains_certainty):
+            return False
+        shift = np.log(new.gains) - (0.0 if used.gains is None else np.log(used.gains))
+        surer = new.gains_certainty >= used.gains_certainty + 0.05 or not set(new.constants) <= set(used.constants)
+        return surer or bool(np.sqrt(np.square(shift).mean()) >= 0.01)
 
     def take_learned(self) -> Pad | None:
         """Return the pad by contacts alone if it was learned since the last call."""

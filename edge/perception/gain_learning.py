@@ -25,37 +25,13 @@ TAXELS: Final = USPA44.taxel_count
 LARGEST_COUNTS: Final = (1390.0, 1390.0, 13400.0)
 """Largest readings of x, y and z of a contact that is used; chips are clipped a little above."""
 LEAST_COUNTS: Final = 200.0  # largest z of the weakest contact that is used: in weaker ones drift is over a fifth of it
-APART: Final = 0.1
-"""Least RMS difference of two distinct contacts, over the RMS of their z: five times the effect of noise and drift."""
 REMEMBERED: Final = 64
 """Newest distinct contacts, of which a further one must differ: always the same contact teaches once."""
-SOLVE_EVERY: Final = 7
-"""Distinct contacts between two steps towards the best gains, each of which takes half a millisecond."""
-MOST_CONTACTS: Final = 400.0  # contacts in whose memory older ones fade
-INDEPENDENT: Final = 150.0
-"""Information of endless contacts of one pad, in contacts: they share what the model leaves out."""
 BOUND: Final = 0.25  # largest deviation of a gain from 1
-PLACE_SPREAD: Final = 0.06
-"""Standard deviation of a place's log-gain from the seat and moment of its magnet, common to its three axes."""
-LEFT_BY_CONTACTS: Final = 0.04
-"""Deviation of a gain that contacts cannot reduce, what they share not averaging out. Contacts make measured gains
-no surer where these are surer than that."""
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
-_UNEXPLAINED: Final = 40.0
-"""Squared distance from every component, over its mean on an even sensor, beyond which a contact teaches nothing."""
 _EVEN: Final = 1e-3
 """Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
-_DETERMINED: Final = 0.7  # largest deviation of a constant that counts as determined, over that of its prior
-_LEAST_DEVIATION: Final = 1e-3
-_LEAN: Final = 0.025
-_UNEVEN_COUNTS: Final = 30.0
-_DRIFT_COUNTS: Final = ((2.0, 2.0, 12.0), (18.0, 18.0, 45.0))
-"""Standard deviations of offsets of x, y and z, of a taxel's own and of those common to all."""
-_BIASED: Final = 30.0  # contacts after which half of the mean error is there
-_STEPS: Final = 4
-_LONGEST_STEP: Final = 0.1
-_MOST_BYTES: Final = 1 << 23
 _ARRAYS: Final = (
     *("share", "means", "factors", "widening", "bias"),
     *("names", "middles", "halves", "constant_widening"),
@@ -97,7 +73,7 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         EdgeError: the file cannot be read, or is of another pad.
     """
     try:
-        arrays = read_npz(path, _ARRAYS, _MOST_BYTES)
+        arrays = read_npz(path, _ARRAYS, 1 << 23)
         names, middles, halves = (arrays[name].tolist() for name in ("names", "middles", "halves"))
         constants = tuple(zip(names, middles, halves, strict=True))
         factors = arrays["factors"].astype(np.float64)
@@ -132,12 +108,7 @@ class GainLearner:
     """
 
     def __init__(self, model: ContactModel, start: Pad | None = None) -> None:
-        """Begin.
-
-        Args:
-            model: distribution of contacts.
-            start: pad whose gains are the beginning, with their intervals; None for gains of 1.
-        """
+        """Begin with the gains of a pad, and their intervals; None for gains of 1."""
         self.contacts = 0
         self._model = model
         constants = model.means.shape[1] - 1
@@ -152,9 +123,10 @@ class GainLearner:
             if start.gain_half_widths is None:
                 deviation = np.full(GAINS, (1 - UNMEASURED_CERTAINTY) * GAIN_SPREAD)
             else:
-                deviation = np.maximum(np.asarray(start.gain_half_widths) / LEVEL_90, _LEAST_DEVIATION)
+                deviation = np.maximum(np.asarray(start.gain_half_widths) / LEVEL_90, 1e-3)
             self._prior[:GAINS, :GAINS] = np.diag((deviation / model.widening) ** -2.0) + _even_axes()
-            self._least_deviations = np.minimum(deviation, LEFT_BY_CONTACTS)
+            # What contacts share does not average out, so that they make no measured gain surer than this.
+            self._least_deviations = np.minimum(deviation, 0.04)
         self._best = self._begin.copy()
         before = np.diag(np.linalg.inv(self._prior))
         self._before, self._after = before[:GAINS], before[:GAINS]
@@ -170,7 +142,7 @@ class GainLearner:
     @property
     def gains(self) -> NDArray[np.float64]:
         """Gains (GAINS,) so far, within BOUND of 1."""
-        biased = self._count / (self._count + _BIASED) * self._share_of_contacts
+        biased = self._count / (self._count + 30) * self._share_of_contacts
         return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
 
     def pad(self) -> Pad:
@@ -206,7 +178,7 @@ class GainLearner:
     @property
     def determined(self) -> NDArray[np.bool_]:
         """Constants (p,) that are well within the prior, and not at an end of their range."""
-        return (self.constant_deviations < _DETERMINED * _OPEN) & (np.abs(self.constants) < 1)
+        return (self.constant_deviations < 0.7 * _OPEN) & (np.abs(self.constants) < 1)
 
     def again(self) -> "GainLearner":
         """Return a learner that has learned nothing yet and begins to look from these results: for a further pass."""
@@ -225,11 +197,8 @@ class GainLearner:
     def learn(self, counts: NDArray[np.floating], dead: NDArray[np.bool_] | None = None) -> bool:
         """Learn from one contact, and return whether the gains have changed.
 
-        Weak and clipped contacts, and those that resemble a recent one, are left out.
-
-        Args:
-            counts: (3, rows, cols), zeroed, with estimates for dead taxels.
-            dead: (rows, cols), taxels from which nothing is learned; None if all live.
+        Weak and clipped contacts, and those that resemble a recent one, are left out. Counts (3, rows, cols) are
+        zeroed, with estimates for dead taxels (rows, cols), from which nothing is learned; None if all live.
         """
         read = np.asarray(counts, dtype=np.float64).reshape(GAINS)
         peaks = np.abs(read).reshape(len(AXES), TAXELS).max(axis=1)
@@ -238,13 +207,12 @@ class GainLearner:
         strength = float(np.sqrt(np.square(read[_Z]).mean()))
         contact = read / strength
         away = self._recent - contact.astype(np.float32)
-        if self.contacts and float(np.square(away).mean(axis=1).min()) < APART**2:
+        # Two distinct contacts differ by a tenth of the RMS of their z: five times the effect of noise and drift.
+        if self.contacts and float(np.square(away).mean(axis=1).min()) < 0.1**2:
             return False
         before = self.contacts
         self._add(contact, strength, None if dead is None or not dead.any() else np.tile(dead.ravel(), len(AXES)))
-        if self.contacts == before:
-            return False
-        if self.contacts % SOLVE_EVERY:
+        if self.contacts == before or self.contacts % 7:  # a step takes half a millisecond
             return False
         self._fade()
         self._step()
@@ -252,7 +220,7 @@ class GainLearner:
 
     def solve(self) -> None:
         """Solve for the gains now, as far as a few steps go."""
-        for _ in range(_STEPS):
+        for _ in range(4):
             if not self._step():
                 break
 
@@ -267,7 +235,7 @@ class GainLearner:
         distances = np.einsum("kc,kc->k", pulls, off)
         component = int((self._model.log_shares - 0.5 * distances).argmax())
         distance = float(distances[component])
-        if distance > _UNEXPLAINED * GAINS:
+        if distance > 40 * GAINS:  # GAINS is the mean on an even sensor
             return
         self._recent[self.contacts % REMEMBERED] = contact
         self.contacts += 1
@@ -294,7 +262,7 @@ class GainLearner:
 
     def _fade(self) -> None:
         """Let the oldest contacts fade."""
-        share = min(1.0, MOST_CONTACTS / max(self._count, 1.0))
+        share = min(1.0, 400 / max(self._count, 1.0))
         for sums in (self._square, self._product):
             sums *= share
         self._weight *= share
@@ -302,7 +270,8 @@ class GainLearner:
 
     def _step(self) -> bool:
         """Take one step of Newton towards the best gains; return whether they still move."""
-        share = 1 / (1 + self._count / INDEPENDENT)
+        # Endless contacts tell no more than 150: they share what the model leaves out.
+        share = 1 / (1 + self._count / 150)
         inverse = self._best[:GAINS]
         slope = share * (self._square @ self._best - self._product) + self._prior @ (self._best - self._begin)
         slope[:GAINS] -= share * self._weight / inverse
@@ -311,7 +280,7 @@ class GainLearner:
         covariance = np.linalg.inv(curve)
         step = -(covariance @ slope)
         longest = float(np.abs(step[:GAINS]).max())
-        self._best += step * min(1.0, _LONGEST_STEP / max(longest, 1e-9))
+        self._best += step * min(1.0, 0.1 / max(longest, 1e-9))
         self._best[:GAINS] = self._best[:GAINS].clip(1 / (1 + BOUND), 1 / (1 - BOUND))
         self._best[_LINEAR:] = self._best[_LINEAR:].clip(-1.2, 1.2)
         spread = np.sqrt(np.diag(covariance).clip(1e-12))
@@ -352,14 +321,16 @@ def _prior(constants: int) -> NDArray[np.float64]:
     """Return the prior precision of all parameters of a new sensor."""
     every = np.ones((TAXELS, TAXELS))
     prior = np.zeros((_LINEAR + constants,) * 2)
-    place = np.kron(np.ones((len(AXES), len(AXES))), PLACE_SPREAD**2 * np.eye(TAXELS))
+    # The seat and moment of a magnet change the gains of its three axes together.
+    place = np.kron(np.ones((len(AXES), len(AXES))), 0.06**2 * np.eye(TAXELS))
     prior[:GAINS, :GAINS] = np.linalg.inv(GAIN_SPREAD**2 * np.eye(GAINS) + place)
     prior[:GAINS, :GAINS] += _even_axes()
-    rest = np.concatenate([np.full(2 * TAXELS, _LEAN), np.full(TAXELS, _UNEVEN_COUNTS)])
+    rest = np.concatenate([np.full(2 * TAXELS, 0.025), np.full(TAXELS, 30.0)])  # leans, and unevenness in counts
     part = np.arange(GAINS, _LINEAR - GAINS)
     prior[part, part] = rest**-2.0
     offsets = np.zeros((GAINS, GAINS))
-    for axis, (own, common) in enumerate(zip(*_DRIFT_COUNTS, strict=True)):
+    # Deviations of drift in counts: of each taxel's own, and of what is common to all.
+    for axis, (own, common) in enumerate(((2.0, 18.0), (2.0, 18.0), (12.0, 45.0))):
         part = slice(axis * TAXELS, (axis + 1) * TAXELS)
         offsets[part, part] = own**2 * np.eye(TAXELS) + common**2 * every
     prior[_LINEAR - GAINS : _LINEAR, _LINEAR - GAINS : _LINEAR] = np.linalg.inv(offsets)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.perception.pattern_stages import touched
+from edge.perception.pattern_description import touched
 from edge.perception.result import Result
 
 PatchEventKind = Literal["begin", "move", "slip", "end"]

@@ -7,9 +7,9 @@ so that the same reading gets the same verdict as far as their patterns agree.
 """
 
 import math
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,26 +17,12 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.intervals import doubt
 from edge.inference.trust import Trust, contact_features, pose_tap_features
+from edge.perception.dead_taxel_fill import widening
+from edge.perception.event import Report
+from edge.perception.result import Estimate, Reason, Step, Window
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
-
-Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]
-"""Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
-its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
-error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
-REASONS: Final[tuple[Reason, ...]] = (
-    *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
-)
-REASON_TEXTS: Final[dict[Reason, str]] = {
-    "stuck": "a taxel repeats itself (stuck?)",
-    "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
-    "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
-    "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
-    "uncertain": "the model expects a large error (a light contact? fine detail? press harder, or elsewhere)",
-    "beyond": "a press deeper or stronger than the model was trained on (press less)",
-    "pad": "the sensor file's pad is far outside those that the model was trained on (the file? train for this pad)",
-    "baseline": "the baseline is in doubt (free the pad and zero again)",
-}
-"""Reasons in a user's words, each with what to look for."""
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
 MOST_MISMATCH: Final = 0.8
@@ -46,45 +32,20 @@ MOST_DOUBT: Final = 0.61
 """RMS of the deviations over that of the pattern, at a strongest z of 1000 counts, beyond which the model is not sure.
 
 With the others 3.5 % of simulated contacts less than 30 % off are not believed, and 34 % of those over 50 % off."""
-_DOUBT_POWER: Final = 0.1
-"""Power of the strongest z with which that limit grows: light contacts are wrong more often than they state."""
-_MOST_CHECKERBOARD: Final = 0.9
-"""Share of z's variation over the pad that alternates from taxel to taxel, beyond which no layer transmits it: crossed
-bars of two pitches reach 0.84 in simulation."""
-_DEEPEST: Final = 1.1  # largest depth of a pattern over the declared full scale, which is the deepest press in training
-MOST_Z: Final = 6_500.0
-MOST_SUM: Final = 58_000.0
-"""Largest z of a taxel, and of all, in counts: but for one press in a thousand, those of the training, up to 40 N."""
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
 SAME_STRENGTH: Final = 0.85
 """Strength of a press, over that of an earlier tap, from which the two are compared for good."""
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
-_SUSPICION: Final = 1.5
-_STEP: Final = 4.5
-_LIMIT: Final = 12.0
-_MOST: Final = 20.0
 
 
-@dataclass(slots=True)
-class Verdict:
-    """Outcome of the checks of one pattern.
+class Verdict(NamedTuple):
+    """Outcome of the checks of one pattern."""
 
-    Attributes:
-        mismatch: share of the readings' energy that the pattern does not explain; None without traction.
-        reason: why it is not to be believed; None if it is, or nothing could be checked.
-        checked: False for a contact that is too light to tell.
-    """
-
-    mismatch: float | None = None
-    reason: Reason | None = None
-    checked: bool = True
-
-    @property
-    def trusted(self) -> bool | None:
-        """Whether the pattern is to be believed; None if nothing could be checked."""
-        return self.reason is None if self.checked or self.reason is not None else None
+    trusted: bool | None  # None for a contact that is too light to tell
+    reason: Reason | None = None  # why it is not to be believed
+    mismatch: float | None = None  # share of the readings' energy that it does not explain; None without traction
 
 
 class PatternCheck:
@@ -94,7 +55,7 @@ class PatternCheck:
         self._trust = trust
         self._constants = len(contract.pad_inputs)
         self._unit_counts = contract.counts_per_unit[2]
-        self._deepest = _DEEPEST * contract.output_full_scale
+        self._deepest = 1.1 * contract.output_full_scale  # a little more than the deepest press in training
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
         self._evidence = 0.0
         self._tap: int | None = None
@@ -142,7 +103,7 @@ class PatternCheck:
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
         if z_counts < LEAST_COUNTS:
-            return Verdict(checked=False, reason="stuck" if repeats >= REPEATS else None)
+            return Verdict(False, "stuck") if repeats >= REPEATS else Verdict(None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
         self._weigh(tap, strength, score)
@@ -157,23 +118,23 @@ class PatternCheck:
             reason = "pad"
         elif not score <= trust.contact.limit or _alternates(newest[2]):  # NaN fails here too, as below
             reason = "unfamiliar"
-        elif pattern.max() > self._deepest or z_counts > MOST_Z or newest[2].sum() * self._unit_counts > MOST_SUM:
-            reason = "beyond"
+        elif pattern.max() > self._deepest or z_counts > 6_500 or newest[2].sum() * self._unit_counts > 58_000:
+            reason = "beyond"  # than all presses of the training, up to 40 N, but for one in a thousand
         elif not explained:
             reason = "unexplained"
         elif deviation is not None and not doubt(pattern, deviation)[0] <= most_doubt(z_counts):
             reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
-        return Verdict(mismatch, reason)
+        return Verdict(reason is None, reason, mismatch)
 
     def _weigh(self, tap: int, strength: float, score: float) -> None:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
         if tap != self._tap:
             if self._tap is not None:
-                step = min(max(self._score - _SUSPICION, -_STEP), _STEP)
-                self._evidence = min(max(self._evidence + step, 0.0), _MOST)
-                self.suspected = self._wrong_file or self._evidence > (_LIMIT / 2 if self.suspected else _LIMIT)
+                step = min(max(self._score - 1.5, -4.5), 4.5)
+                self._evidence = min(max(self._evidence + step, 0.0), 20.0)
+                self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
             self._tap, self._strongest = tap, -math.inf
         if strength > self._strongest and math.isfinite(score):
             self._strongest, self._score = strength, score
@@ -192,15 +153,74 @@ def _alternates(z: NDArray[np.float32]) -> bool:
     """Return whether z (rows, cols) is a checkerboard that no layer transmits."""
     change = z - z.mean()
     along = change[::2, ::2].sum() + change[1::2, 1::2].sum() - change[::2, 1::2].sum() - change[1::2, ::2].sum()
-    return float(along) ** 2 > _MOST_CHECKERBOARD * z.size * float(np.vdot(change, change))
+    # Crossed bars of two pitches reach a share of 0.84 in simulation.
+    return float(along) ** 2 > 0.9 * z.size * float(np.vdot(change, change))
 
 
 def most_doubt(z_counts: float) -> float:
-    """Return the largest doubt of a pattern that is believed, by the largest z of its contact."""
-    return MOST_DOUBT * (z_counts / 1e3) ** _DOUBT_POWER
+    """Return the largest doubt of a pattern that is believed, by the largest z of its contact.
+
+    Light contacts are wrong more often than they state.
+    """
+    return MOST_DOUBT * (z_counts / 1e3) ** 0.1
 
 
 def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
     return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+
+
+class Check:
+    """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from."""
+
+    def __init__(self, check: PatternCheck | None, taps: TapTracker, watch: TaxelWatch, report: Report) -> None:
+        self._check, self._taps, self._watch, self._report = check, taps, watch, report
+
+    def belonging(
+        self, step: Step, window: Window, scaled: NDArray[np.float32]
+    ) -> tuple[list[int], tuple[float, ...] | None]:
+        """Return the numbers of the taps of a window that belong to the contact, and the mismatch of each earlier one.
+
+        A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
+        `scaled` is the window in network units, (K, 3, rows, cols).
+        """
+        every = list(range(window.taps))
+        if self._check is None or window.taps < 2 or window.poses is None or step.doubted:
+            return every, None
+        belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
+        posed = step.pose is not None and window.poses is not None
+        dropped = foreign_taps(belonging, posed=posed)
+        if not dropped:
+            return every, belonging
+        settled = [
+            number
+            for number in (dropped if posed else dropped[:1])
+            if scaled[0, 2].sum() >= SAME_STRENGTH * scaled[number, 2].sum()
+        ]
+        for number in settled:
+            self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
+        if settled:
+            slots = window.slots
+            self._taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
+        return [number for number in every if number not in dropped], belonging
+
+    def __call__(self, step: Step, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
+        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units."""
+        if made.deviation is not None and step.dead:
+            made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
+        check = self._check
+        if check is None or made.pattern is None:
+            return
+        suspected = check.suspected
+        made.trusted, made.untrusted_reason, made.mismatch = check.judge(
+            tap, newest, made.pattern, made.deviation, made.traction, self._watch.most_repeats
+        )
+        if check.suspected != suspected:
+            self._report("cleared" if suspected else "suspected")
+
+
+def _which(number: int, *, alone: bool) -> str:
+    if number == 1:
+        return "the tap before does"
+    return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"

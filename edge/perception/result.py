@@ -1,16 +1,18 @@
-"""Result of the runtime for one scan."""
+"""Result of the runtime for one scan, and its draft, which the stages of a sensor fill in turn.
 
-from collections.abc import Mapping
+The draft is frozen once, at the end.
+"""
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.event import Event, Note, joined
-from edge.perception.pattern_check import REASON_TEXTS, Reason
-from edge.perception.wrench import Wrench
+from edge.perception.event import OLD_NS, Event, Note, joined, waited_note
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan
@@ -20,6 +22,48 @@ from firmware_bridge.zeroing.drift_tracker import Drift
 State = Literal["zeroing", "incomplete", "baseline_in_doubt", "idle", "contact", "dropped"]
 Filled = Literal["neighbours"]
 WrenchOrigin = Literal["calibrated", "nominal"]
+Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"]
+"""Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
+its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
+error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
+REASONS: Final[tuple[Reason, ...]] = (
+    *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
+)
+REASON_TEXTS: Final[dict[Reason, str]] = {
+    "stuck": "a taxel repeats itself (stuck?)",
+    "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
+    "unexplained": "the pattern does not explain its readings (an unusual shape? another pad?)",
+    "sensor": "one contact after another reads like none (a magnet or steel near? the id map? the sensor file?)",
+    "uncertain": "the model expects a large error (a light contact? fine detail? press harder, or elsewhere)",
+    "beyond": "a press deeper or stronger than the model was trained on (press less)",
+    "pad": "the sensor file's pad is far outside those that the model was trained on (the file? train for this pad)",
+    "baseline": "the baseline is in doubt (free the pad and zero again)",
+}
+"""Reasons in a user's words, each with what to look for."""
+
+LEAST_FORCE_N: Final = 0.1
+"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
+
+
+class Wrench(NamedTuple):
+    """Total force and torque on a pad.
+
+    Attributes:
+        force_n: x, y, z in [N].
+        torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
+        centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
+            and y, in [mm]; None if hardly anything presses.
+    """
+
+    force_n: tuple[float, float, float]
+    torque_n_mm: tuple[float, float, float]
+    centre_of_pressure_mm: tuple[float, float] | None
+
+    @property
+    def shear_ratio(self) -> float | None:
+        """Tangential over normal force, whatever the sensor's counts per newton; None if hardly anything presses."""
+        x, y, z = self.force_n
+        return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
 
 
 class NextTap(NamedTuple):
@@ -48,7 +92,7 @@ class Result:
         pose: of the pad at this scan, in the object's plane; None where it is not available.
         poses: (taps, 5) float32, poses of the same taps as `window` in the axes of the newest tap's pad: dx and dy in
             [mm], turn in [deg], and their standard deviations; None for a model that takes no poses.
-        wrench: sums of the traction over the pad, see edge.perception.wrench.
+        wrench: sums of the traction over the pad, see edge.perception.pattern_description.
         baseline: subtracted from the scan.
         drift: drift that was followed since the baseline was taken, and the step in rest level that was not.
         dead: dead taxels, row-major from the top left, and the reason of each; empty if all are alive.
@@ -144,3 +188,116 @@ def mask_bits(taxels: NDArray[np.bool_]) -> int:
 @lru_cache(maxsize=256)  # most scans have one of a few masks, and numpy takes ten times as long on sixteen taxels
 def _bits(taxels: bytes) -> int:
     return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")
+
+
+_NONE_DEAD: Final[Mapping[int, str]] = {}
+
+
+class Origin(NamedTuple):
+    """Fields that all results of a run have in common."""
+
+    source: SourceKind
+    model: str
+    pattern_unit: str
+
+
+class Window(NamedTuple):
+    """Taps that a pattern is due of."""
+
+    counts: NDArray[np.float32]  # (K, 3, rows, cols) in zeroed counts, newest tap first, zeros in place of missing ones
+    taps: int  # number of taps in it
+    slots: Sequence[int]  # places of these taps in the window of the sensor's tracker
+    poses: NDArray[np.float32] | None  # (taps, 5) as model input; None for a model that takes no poses
+    tap: int  # number of the newest tap
+    made_by: Hashable  # what distinguishes the pattern from others of the same readings and poses
+
+
+@dataclass
+class Estimate:
+    """Pattern of a window, and everything that follows from it: fields of a result, under their names there."""
+
+    taps_used: int
+    window: NDArray[np.float32]
+    poses: NDArray[np.float32] | None
+    tap_mismatch: tuple[float, ...] | None = None
+    taps_dropped: int | None = None
+    pattern: NDArray[np.float32] | None = None
+    deviation: NDArray[np.float32] | None = None
+    traction: NDArray[np.float32] | None = None
+    mismatch: float | None = None
+    trusted: bool | None = None
+    untrusted_reason: Reason | None = None
+    area_mm2: float | None = None
+    centroid_mm: tuple[float, float] | None = None
+    interval_mm: float | None = None
+    expected_rmse_mm: float | None = None
+    another_tap: bool | None = None
+    wrench: Wrench | None = None
+    wrench_origin: WrenchOrigin | None = None
+
+
+class Step:
+    """Draft of one scan's result: fields of it under their names there, and what the stages tell each other.
+
+    Attributes:
+        readings: (3, rows, cols) in counts over the baseline, with estimates for dead taxels.
+        doubted: drift or an old baseline explains the readings as well as a touch.
+        due: taps of which a pattern is due; None where none is.
+    """
+
+    readings: NDArray[np.float32] | None = None
+    doubted: bool = False
+    due: Window | None = None
+    estimate: Estimate | None = None
+
+    contact: bool | None = None
+    zeroed: NDArray[np.float32] | None = None
+    filled: Filled | None = None
+    force_counts: float | None = None
+    force_n: float | None = None
+    pose: PadPose | None = None
+    reused_from: int | None = None
+    next_tap: NextTap | None = None
+    run_time_us: float | None = None
+    latency_us: float | None = None
+    baseline: Baseline | None = None
+    baseline_age_s: float | None = None
+    drift: Drift | None = None
+    dead: Mapping[int, str] = _NONE_DEAD
+    gains_certainty: float | None = None
+    notes: tuple[Note, ...] = ()
+    events: tuple[Event, ...] = ()
+
+    def __init__(self, scan: Scan, origin: Origin) -> None:
+        self.scan, self._origin = scan, origin
+        self.state: State = "zeroing"
+
+    def overtake(self) -> None:
+        """Leave the step without its pattern, since a newer scan of its sensor has come."""
+        if not self.doubted:
+            self.state = "dropped"
+
+    def ready(self, done_ns: int) -> None:
+        """State when the pattern was ready, on the clock of the scans, in [ns]."""
+        waited_ns = done_ns - self.scan.time_ns
+        self.latency_us = waited_ns / 1e3
+        if waited_ns > OLD_NS:
+            self.notes = (*self.notes, waited_note(waited_ns))
+
+    def freeze(self) -> Result:
+        """Return the result."""
+        # What no stage has set is not in the dictionary, and has its default in the result.
+        values: dict[str, Any] = {name: value for name, value in vars(self).items() if name not in _OF_STAGES}
+        due, made = self.due, self.estimate
+        if made is not None:
+            values |= vars(made)
+            if self.reused_from is not None and due is not None:  # the newest reading is this scan's own
+                values["window"] = np.concatenate([due.counts[:1], made.window[1:]])
+        elif due is not None:
+            values |= {"taps_used": due.taps, "window": due.counts[: due.taps], "poses": due.poses}
+        if self.doubted:
+            values |= {"trusted": False, "untrusted_reason": "baseline"}
+        return Result(**values, **self._origin._asdict())
+
+
+_OF_STAGES: Final = frozenset({"readings", "doubted", "due", "estimate", "_origin"})

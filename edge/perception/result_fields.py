@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
-from edge.perception.pattern_check import REASONS
-from edge.perception.result import NextTap, Result, mask_bits
-from edge.perception.wrench import Wrench
+from edge.perception.result import REASONS, NextTap, Result, Wrench, mask_bits
 from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift

@@ -2,17 +2,17 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Final
 
 from edge.errors import UsageError, WindowError
-from edge.inference.model_interface import Model
+from edge.inference.contract import Model
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import EventKind, Untimed, notes_on_missing
 from edge.perception.gain_learning import ContactModel
-from edge.perception.result import Result
-from edge.perception.sensor import Common, Sensor, Settings
-from edge.perception.step import Origin, Step
+from edge.perception.result import Origin, Result, Step, Window
+from edge.perception.sensor import Sensor
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
@@ -35,6 +35,10 @@ class Runtime:
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
+
+    Attributes:
+        unposed: name of the model if it takes no poses, reported to a user who states some; None if it takes them.
+        waiting: the newest scan of each sensor that waits for its pattern.
 
     Raises:
         ModelError: the model is for another sensor.
@@ -69,13 +73,20 @@ class Runtime:
         if options.taps is not None and options.taps > contract.taps:
             raise UsageError(f"taps is {options.taps}, but model '{model.name}' takes {contract.taps} at most")
         self._model = model
-        self.unposed = None if contract.takes_poses else model.name  # it reports to a user who states poses
+        self.unposed = None if contract.takes_poses else model.name
         self._events: list[Untimed] = []
         self._origin = Origin(source, model.name, contract.output_unit)
         self._scan_shape = geometry.scan_shape
-        learned_by = contacts if options.learn else None
-        trust = contract.read_trust()
-        self._common = Common(contract, trust, geometry, options, estimator, learned_by, unix_time_s)
+        self._new_sensor = partial(
+            Sensor,
+            contract=contract,
+            trust=contract.read_trust(),
+            geometry=geometry,
+            options=options,
+            estimator=estimator,
+            contacts=contacts if options.learn else None,
+            unix_time_s=unix_time_s,
+        )
         self._baselines = dict(baselines or {})
         self._counts_per_newton = counts_per_newton
         self._pad, self._measured = pad, measured
@@ -84,7 +95,7 @@ class Runtime:
         self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
         # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
-        self._waiting: dict[str, tuple[Sensor, Step]] = {}
+        self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
         self._tracks: dict[str | None, PoseTrack] = {}
 
     def __repr__(self) -> str:
@@ -143,11 +154,10 @@ class Runtime:
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""
         sensor, step = self._follow(scan)
-        if step.due is not None:
-            if not infer:
-                step.overtake()
-            elif not sensor.reuse(step, step.due):
-                self._infer([(sensor, step)])
+        if step.due is not None and not infer:
+            step.overtake()
+        elif step.due is not None and not sensor.reuse(step, step.due):
+            self._infer([(sensor, step, step.due)])
         return step.freeze()
 
     def take(self, scan: Scan, clock_ns: Callable[[], int] | None = None) -> list[Result]:
@@ -160,25 +170,20 @@ class Runtime:
             WindowError: the scan is not of this sensor geometry.
         """
         sensor, step = self._follow(scan)
-        overtaken = self._waiting.get(scan.sensor) if self._waiting else None
+        overtaken = self.waiting.get(scan.sensor) if self.waiting else None
         ready: list[Result] = []
         if overtaken is not None:
             overtaken[1].overtake()
             ready.append(overtaken[1].freeze())
         if step.due is not None and not sensor.reuse(step, step.due):
-            self._waiting[scan.sensor] = sensor, step
+            self.waiting[scan.sensor] = sensor, step, step.due
             return ready
         if overtaken is not None:
-            del self._waiting[scan.sensor]
+            del self.waiting[scan.sensor]
         if step.estimate is not None and clock_ns is not None:
             step.ready(clock_ns())
         ready.append(step.freeze())
         return ready
-
-    @property
-    def waiting(self) -> int:
-        """Number of sensors whose newest scan waits for its pattern."""
-        return len(self._waiting)
 
     def infer(self, clock_ns: Callable[[], int] | None = None) -> list[Result]:
         """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call.
@@ -187,31 +192,30 @@ class Runtime:
             ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
                 above zero.
         """
-        due = [self._waiting.pop(sensor) for sensor in list(self._waiting)[:MOST_TOGETHER]]
+        due = [self.waiting.pop(sensor) for sensor in list(self.waiting)[:MOST_TOGETHER]]
         if not due:
             return []
         self._infer(due)
         if clock_ns is not None:
             done_ns = clock_ns()
-            for _, step in due:
+            for _, step, _ in due:
                 step.ready(done_ns)
-        return [step.freeze() for _, step in due]
+        return [step.freeze() for _, step, _ in due]
 
     def _follow(self, scan: Scan) -> tuple[Sensor, Step]:
         """Pass a scan through the stages of its sensor before the model."""
         if scan.counts.shape != self._scan_shape:
             raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
-        sensor = self._sensors.get(scan.sensor) or self._new_sensor(scan)
+        sensor = self._sensors.get(scan.sensor) or self._meet(scan)
         step = Step(scan, self._origin)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = (self._tracks.get(scan.sensor) or self._tracks.get(None) or None) if self._tracks else None
         sensor.follow(step, track, self._events)
         return sensor, step
 
-    def _infer(self, waiting: Sequence[tuple[Sensor, Step]]) -> None:
+    def _infer(self, due: Sequence[tuple[Sensor, Step, Window]]) -> None:
         """Give steps the patterns that are due, inferred in one call."""
         model, start_ns = self._model, self._clock_ns()
-        due = [(sensor, step, step.due) for sensor, step in waiting if step.due is not None]
         begun = [sensor.begin(step, window) for sensor, step, window in due]
         poses = [made.poses for made, _ in begun if made.poses is not None]
         pads = [sensor.pad.row for sensor, _, _ in due]
@@ -224,17 +228,19 @@ class Runtime:
             made.traction = None if tractions is None else tractions[row].copy()
             sensor.finish(step, window, made, given[0])
 
-    def _new_sensor(self, scan: Scan) -> Sensor:
+    def _meet(self, scan: Scan) -> Sensor:
+        """Return a new sensor, with what is stored for it."""
         name = scan.sensor
         per_newton, pad, measured = self._counts_per_newton, self._pad, self._measured
         pad = pad.get(name) if isinstance(pad, Mapping) else pad
-        settings = Settings(
-            self._mountings.get(name),
-            self._baselines.get(name),
-            per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton,
-            pad,
-            pad if measured is None else measured.get(name),
-            notes_on_missing(name, self._mounted, self._baselines),
+        self._sensors[name] = sensor = self._new_sensor(
+            name,
+            scan.time_ns,
+            mounting=self._mountings.get(name),
+            baseline=self._baselines.get(name),
+            counts_per_newton=per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton,
+            pad=pad,
+            measured=pad if measured is None else measured.get(name),
+            notes=notes_on_missing(name, self._mounted, self._baselines),
         )
-        self._sensors[name] = sensor = Sensor(name, self._common, settings, scan.time_ns)
         return sensor

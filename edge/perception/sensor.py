@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -14,11 +13,11 @@ from edge.perception.baseline_doubt import BaselineDoubt
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.dead_taxel_fill import TaxelEstimator
 from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Note, Untimed, age_notes
-from edge.perception.gain_following import GainFollower, Learn, SensorPad
+from edge.perception.gain_following import Learn, SensorPad
 from edge.perception.gain_learning import ContactModel
-from edge.perception.pattern_check import PatternCheck
-from edge.perception.pattern_stages import Check, Describe
-from edge.perception.step import Estimate, Step, Window
+from edge.perception.pattern_check import Check, PatternCheck
+from edge.perception.pattern_description import Describe
+from edge.perception.result import Estimate, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import Taps
 from edge.perception.taxel_health import Health, TaxelWatch
@@ -31,112 +30,100 @@ from firmware_bridge.schedule import TAPS_FORGOTTEN_NS
 from firmware_bridge.zeroing.baseline import Baseline
 
 NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
-CHANGED_RMS_COUNTS: Final = 1.4 * math.sqrt(2) * NOISE_COUNTS
-"""RMS change of all readings that noise, present in both scans, does not reach: four of its deviations away."""
-CHANGED_COUNTS: Final = 5 * math.sqrt(2) * NOISE_COUNTS  # change of one reading that noise does not reach
+_CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
 MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
 """Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
 
 
-class LastReading:
-    """Readings, scan number and estimate of a sensor's last pattern; allocates nothing after construction.
+class LastPattern:
+    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
 
-    The estimate is None before the first, and where it must not be used again.
+    Attributes:
+        estimate: None before the first, and where it must not be used again.
     """
 
     def __init__(self, scan_shape: tuple[int, int, int]) -> None:
         self.estimate: Estimate | None = None
-        self.scan_number = -1
+        self._scan_number = -1
         self._counts = np.zeros(scan_shape, dtype=np.float32)
         self._change = np.zeros(scan_shape, dtype=np.float32)
         self._made_by: Hashable = None
         self._poses: NDArray[np.float32] | None = None
 
-    def holds(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> bool:
-        """Return whether readings (3, rows, cols) and poses (taps, 5) have not changed beyond noise, nor the maker.
+    def reuse(self, step: Step, due: Window) -> bool:
+        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
 
-        The maker is what distinguishes the pattern from others, with its number of taps; poses are None for a model
-        without.
+        Nor must the maker have changed, which is what distinguishes the pattern from others.
         """
-        if made_by != self._made_by:
+        if self.estimate is None or due.made_by != self._made_by:
             return False
+        poses = due.poses
         if poses is not None and (
             self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
         ):
             return False
-        np.subtract(counts, self._counts, out=self._change)
+        np.subtract(due.counts[0], self._counts, out=self._change)
         np.abs(self._change, out=self._change)
-        if self._change.max() > CHANGED_COUNTS:
+        # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
+        if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
             return False
-        return float(np.vdot(self._change, self._change)) <= CHANGED_RMS_COUNTS**2 * self._change.size
+        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
+            return False
+        step.estimate, step.reused_from = self.estimate, self._scan_number
+        return True
 
-    def keep(self, counts: NDArray[np.float32], made_by: Hashable, poses: NDArray[np.float32] | None = None) -> None:
-        """Keep the readings and poses that a pattern was made from, and its maker; None as the maker keeps nothing."""
-        self._counts[...] = counts
-        self._poses = poses
-        self._made_by = made_by
-
-
-@dataclass(frozen=True)
-class Common:
-    """Settings that all sensors of a runtime share."""
-
-    contract: Contract
-    trust: Trust | None
-    geometry: SensorGeometry
-    options: RuntimeOptions
-    estimator: TaxelEstimator | None
-    contacts: ContactModel | None
-    unix_time_s: Callable[[], float]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of one sensor; `measured` is its pad without what was learned."""
-
-    mounting: Mounting | None
-    baseline: Baseline | None
-    counts_per_newton: float | None
-    pad: Pad | None
-    measured: Pad | None
-    notes: tuple[Note, ...]
+    def keep(self, step: Step, due: Window, made: Estimate) -> None:
+        """Keep the estimate of a step's pattern."""
+        self.estimate, self._scan_number = made, step.scan.number
+        self._counts[...] = due.counts[0]
+        self._poses, self._made_by = due.poses, due.made_by
 
 
 class Sensor:
     """Stages of one sensor, in their order: `follow` before the model, `finish` after it."""
 
-    def __init__(self, name: str, common: Common, settings: Settings, time_ns: int) -> None:
-        """Begin with the sensor's first scan, at a time in [ns]."""
-        geometry, contract = common.geometry, common.contract
+    def __init__(
+        self,
+        name: str,
+        time_ns: int,
+        *,
+        contract: Contract,
+        trust: Trust | None,
+        geometry: SensorGeometry,
+        options: RuntimeOptions,
+        estimator: TaxelEstimator | None,
+        contacts: ContactModel | None,
+        unix_time_s: Callable[[], float],
+        mounting: Mounting | None,
+        baseline: Baseline | None,
+        counts_per_newton: float | None,
+        pad: Pad | None,
+        measured: Pad | None,
+        notes: tuple[Note, ...],
+    ) -> None:
+        """Begin with the sensor's first scan, at a time in [ns]; `measured` is its pad without what was learned."""
         grid_shape = (geometry.rows, geometry.cols)
         self.events: list[Untimed] = []
-        self._name, self._contract = name, contract
+        self._name, self._contract, self._options = name, contract, options
         self._received_ns: int | None = None
-        self._follows_drift = common.options.follow_drift
-        self._every_scan = common.options.every_scan
-        self._watch = TaxelWatch(grid_shape, settings.mounting)
-        self._tracker = TapTracker(contract.taps, common.options, grid_shape)
-        check = None if common.trust is None else PatternCheck(common.trust, contract)
+        self._watch = TaxelWatch(grid_shape, mounting)
+        self._tracker = TapTracker(contract.taps, options, grid_shape)
+        check = None if trust is None else PatternCheck(trust, contract)
         self._checked = check is not None
-        self.pad = SensorPad(contract, settings.pad, settings.counts_per_newton, check)
-        self._health = Health(self._watch, common.estimator)
-        self._zeroing = Zeroing(
-            self._tracker, self._watch, settings.mounting, self.report, common.unix_time_s, settings.notes
-        )
-        self._doubt = BaselineDoubt(common.options, geometry.taxel_count, self.report)
-        self._taps = Taps(self._tracker, self._watch, contract, common.options, self.report)
+        self.pad = SensorPad(contract, pad, counts_per_newton, check)
+        self._health = Health(self._watch, estimator)
+        self._zeroing = Zeroing(self._tracker, self._watch, mounting, self.report, unix_time_s, notes)
+        self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
+        self._taps = Taps(self._tracker, self._watch, contract, options, self.report)
         self._check = Check(check, self._tracker, self._watch, self.report)
-        self._describe = Describe(contract, common.trust, geometry, self.pad)
-        self._last = LastReading(geometry.scan_shape)
-        self._learn: Learn | None = None
-        if common.contacts is not None:
-            follower = GainFollower(common.contacts, settings.measured, settings.pad)
-            self._learn = Learn(follower, self.pad, check, self.report)
-        if settings.baseline is not None:
-            age_s = settings.baseline.age_s(common.unix_time_s())
+        self._describe = Describe(contract, trust, geometry, self.pad)
+        self._last = LastPattern(geometry.scan_shape)
+        self._learn = None if contacts is None else Learn(contacts, measured, pad, self.pad, check, self.report)
+        if baseline is not None:
+            age_s = baseline.age_s(unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.
-            self._zeroing.use(settings.baseline, age_s if age_s >= 0 else None, time_ns)
-            self._doubt.begin(settings.baseline.origin)
+            self._zeroing.use(baseline, age_s if age_s >= 0 else None, time_ns)
+            self._doubt.begin(baseline.origin)
 
     def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
         """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
@@ -153,7 +140,7 @@ class Sensor:
         if (zeroed := self._zeroing(step)) is not None:
             self._doubt.begin(zeroed.origin)
         self._health.fill(step)
-        step.notes = (*step.notes, *self._zeroing.notes)
+        step.notes = (*step.notes, *self._zeroing.notes, *self._zeroing.drift_notes)
         if scan.time_ns - scan.not_before_ns > OLD_NS:
             step.notes = (*step.notes, *age_notes(scan))
         if events or self.events:
@@ -169,7 +156,7 @@ class Sensor:
             return
         self._doubt(step)
         self._taps(step, track)
-        if self._follows_drift:
+        if self._options.follow_drift:
             self._zeroing.follow_drift(step)
         if not step.contact and self._learn is not None and self._learn.waiting and self._learn.learn(self._watch.dead):
             self._last.estimate = None
@@ -186,12 +173,7 @@ class Sensor:
 
     def reuse(self, step: Step, due: Window) -> bool:
         """Give a step the sensor's last pattern if nothing has changed since; return whether it has it."""
-        if self._every_scan or self._last.estimate is None:
-            return False
-        if not self._last.holds(due.counts[0], due.made_by, due.poses):
-            return False
-        step.estimate, step.reused_from = self._last.estimate, self._last.scan_number
-        return True
+        return not self._options.every_scan and self._last.reuse(step, due)
 
     def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
         """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
@@ -208,8 +190,7 @@ class Sensor:
     def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
         """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
         step.estimate = made
-        self._last.keep(due.counts[0], due.made_by, due.poses)
-        self._last.estimate, self._last.scan_number = made, step.scan.number
+        self._last.keep(step, due, made)
         if step.doubted:  # nothing follows from it, and nothing is learned
             made.traction = None
             return

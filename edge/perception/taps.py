@@ -8,22 +8,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.contract import Contract
-from edge.inference.pose_input import pose_rows, scheduled_rows
+from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.pattern_check import REPEATS
-from edge.perception.result import NextTap
-from edge.perception.step import Step, Window
+from edge.perception.result import NextTap, Step, Window
 from edge.perception.tap_tracker import TapState, TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
-
-LEAST_APART_MM: Final = 0.5
-"""Least distance between the pads of two taps, in [mm], root mean square over their taxels. The error of a taxel is the
-same in all taps at one place, and the model takes it for seen several times: on real grips such taps made five times as
-many holes as one alone (docs/decisions.md)."""
 
 
 class PosedTaps(NamedTuple):
@@ -81,7 +74,9 @@ class TapPoses:
                 why = f"an earlier tap is {away_mm:.1f} mm away, and the model takes none beyond {self._reach_mm:g} mm"
                 self._leave_out(peak.tap, "tap_out_of_reach", f"{why}: it is left out")
                 continue
-            if any(self._apart_mm(earlier, other) < LEAST_APART_MM for other in poses):
+            # The error of a taxel is the same in all taps at one place, and the model takes it for seen several times:
+            # on real grips such taps made five times as many holes as one alone (docs/decisions.md).
+            if any(self._apart_mm(earlier, other) < 0.5 for other in poses):
                 continue
             slots.append(slot)
             poses.append(earlier)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edge.perception.dead_taxel_fill import Filler, TaxelEstimator
 from edge.perception.event import Note
-from edge.perception.step import Step
+from edge.perception.result import Step
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import TAXEL_SILENT_SCANS
@@ -70,6 +70,8 @@ class TaxelWatch:
         dead: taxels (rows, cols) that are not believed; another array only where they are others than before.
         reasons: dead taxels, row-major from the top left, and one of REASONS for each.
         sound: every taxel is believed, and nothing speaks against one.
+        most_repeats: scans for which a taxel that is believed has repeated itself while a quarter of the others were
+            new.
     """
 
     def __init__(self, grid_shape: tuple[int, int], mounting: Mounting | None = None) -> None:
@@ -92,6 +94,7 @@ class TaxelWatch:
         self._repeats = 0
         self._baseline: Baseline | None = None
         self.sound = False
+        self.most_repeats = 0
         self.reasons: dict[int, str] = {}
 
     @property
@@ -105,11 +108,6 @@ class TaxelWatch:
         return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
 
     @property
-    def most_repeats(self) -> int:
-        """Scans for which a taxel that is believed has repeated itself while a quarter of the others were new."""
-        return 0 if self.sound else int(np.where(self.dead, 0, self._still).max())
-
-    @property
     def may_be_estimated(self) -> bool:
         """True while enough taxels live; half of them silent are not a defect but a wrong id map."""
         silent = sum(reason == "silent" for reason in self.reasons.values())
@@ -121,14 +119,9 @@ class TaxelWatch:
         self.sound = False
 
     def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
-        """Take one scan and return the newest readings over the baseline.
+        """Take one scan and return the newest readings (3, rows, cols) over the baseline; None without a baseline.
 
-        Args:
-            scan: the sensor's next one.
-            baseline: of the sensor, NaN where a taxel was not zeroed; None as long as there is no baseline.
-
-        Returns:
-            The newest readings over the baseline, (3, rows, cols) in counts, NaN where not zeroed; None without one.
+        NaN stands for taxels that were not zeroed, in both.
         """
         if baseline is not self._baseline and baseline is not None:
             unzeroed = np.isnan(baseline.counts).any(axis=0)
@@ -140,11 +133,12 @@ class TaxelWatch:
             if self._mounting is not None:
                 zeroed = self._mounting.correct(zeroed)
             np.abs(zeroed, out=self._size)
-            largest = float(self._size.max())
+            largest = float(np.maximum.reduce(self._size, axis=None))
             # Near rest, without contact, no taxel is far or at an end that is not its rest. In contact every taxel must
             # be inside the range, and not far as one is that has wrapped round.
             if largest <= NEAR_END_COUNTS or (
-                RANGE_ENDS[0] < scan.counts.min() <= scan.counts.max() < RANGE_ENDS[1]
+                RANGE_ENDS[0] < np.minimum.reduce(scan.counts, axis=None)
+                and np.maximum.reduce(scan.counts, axis=None) < RANGE_ENDS[1]
                 and not self._may_be_far(zeroed, largest)
             ):
                 np.copyto(self.held, scan.counts)
@@ -170,11 +164,7 @@ class TaxelWatch:
         return zeroed
 
     def notes(self, filled: str | None) -> tuple[Note, ...]:
-        """Return notes on taxels that are not believed.
-
-        Args:
-            filled: kind of the estimates of dead taxels; None if there is no pattern for them.
-        """
+        """Return notes on taxels that are not believed, of which there are estimates or, with None, no pattern."""
         if self.sound:
             return ()
         notes: list[Note] = []
@@ -222,8 +212,9 @@ class TaxelWatch:
         """Return quickly whether a taxel may be far, if all taxels live; only then the full check is made."""
         if largest <= LONE_COUNTS:
             return False
-        second, first = np.partition(self._size.max(axis=0), -2, axis=None)[-2:]
-        return bool(second < LONE_SHARE * first or (zeroed < _LOW).any() or (zeroed > _HIGH).any())
+        sizes = np.maximum.reduce(self._size).ravel()
+        sizes.partition(-2)
+        return bool(sizes[-2] < LONE_SHARE * sizes[-1] or (zeroed < _LOW).any() or (zeroed > _HIGH).any())
 
     def _judge(self, scan: Scan, read: NDArray[np.bool_], zeroed: NDArray[np.float32] | None) -> None:
         self._age += 1
@@ -262,6 +253,7 @@ class TaxelWatch:
             self.reasons = {int(taxel): REASONS[code.flat[taxel] - 1] for taxel in np.flatnonzero(code)}
         counting = self._age.any() or self._still.any() or self._far.any() or self._old.any()
         self.sound = not counting and not self.dead.any() and bool(self._arrived.all())
+        self.most_repeats = int(np.where(self.dead, 0, self._still).max())
 
     def _follow_far(self, zeroed: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         """Count scans in which a taxel reads what no contact makes; return the largest of its axes, (rows, cols)."""
@@ -286,9 +278,7 @@ def _named(taxels: list[int] | NDArray[np.integer]) -> str:
 class Health:
     """Stage: the newest reading of each taxel over the baseline, and estimates of those of dead taxels.
 
-    Args:
-        watch: over the sensor's taxels.
-        estimator: of dead taxels; None where there is no pattern while a taxel is dead.
+    Without an estimator there is no pattern while a taxel is dead.
     """
 
     def __init__(self, watch: TaxelWatch, estimator: TaxelEstimator | None) -> None:
@@ -310,14 +300,12 @@ class Health:
 
     def fill(self, step: Step) -> None:
         """Set the readings for a pattern; none where a taxel has not arrived yet, or too many are dead."""
-        watch, zeroed = self._watch, step.zeroed
-        if zeroed is not None and self._filler is not None and watch.may_be_estimated:
-            filled = self._filler(zeroed)
-            step.readings, step.force_counts, step.filled = filled.counts, filled.z_counts, filled.filled
+        watch, readings = self._watch, step.zeroed
+        if readings is not None and self._filler is not None and watch.may_be_estimated:
+            readings, step.filled = self._filler(readings), "neighbours"
         if not watch.sound:
             step.notes = (*step.notes, *watch.notes(step.filled))
-            if watch.waiting or (step.dead and step.readings is None):
-                step.readings = step.force_counts = None
+            if watch.waiting or (step.dead and step.filled is None):
                 return
-        if step.readings is None and zeroed is not None:
-            step.readings, step.force_counts = zeroed, float(np.add.reduce(zeroed[2], axis=None))
+        if readings is not None:
+            step.readings, step.force_counts = readings, float(np.add.reduce(readings[2], axis=None))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.event import Note, Report
-from edge.perception.step import Step
+from edge.perception.result import Step
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.errors import BaselineRefusedError
@@ -71,16 +71,13 @@ class Rezeroing:
 class Zeroing:
     """Stage: puts the newest readings over the baseline, takes a new one where it is due, and lets it follow drift.
 
-    Args:
-        taps: of the sensor; a new rest level makes earlier ones worthless.
-        watch: over its taxels.
-        mounting: directions of its axes; None as they are wired.
-        report: takes the outcome of zeroing on demand, and steps in the rest level.
-        unix_time_s: dates the baselines that are taken.
-        notes: why there is no baseline at the start.
+    It reports the outcome of zeroing on demand, and steps in the rest level; `notes` tell why there is no baseline at
+    the start.
 
     Attributes:
         baseline: subtracted from the scans, drift and all; None before there is one.
+        notes: why there is no baseline yet, and how a zeroing on demand stands.
+        drift_notes: what has become of the rest level.
     """
 
     def __init__(
@@ -95,9 +92,9 @@ class Zeroing:
         self.baseline: Baseline | None = None
         self._taps, self._watch, self._mounting = taps, watch, mounting
         self._report, self._unix_time_s = report, unix_time_s
-        self._notes = notes
+        self.notes = notes
         self._drift: Drift | None = None
-        self._drift_notes: tuple[Note, ...] = ()
+        self.drift_notes: tuple[Note, ...] = ()
         self._estimator = BaselineEstimator(clock=unix_time_s)
         self._rezeroing: Rezeroing | None = None
         self._taken: Baseline | None = None
@@ -109,7 +106,7 @@ class Zeroing:
         self.baseline = self._taken = baseline
         self._taken_ns = None if age_s is None else time_ns - int(age_s * 1e9)
         self._tracker = DriftTracker(baseline)
-        self._drift, self._drift_notes = self._tracker.summary, ()
+        self._drift, self.drift_notes = self._tracker.summary, ()
 
     def __call__(self, step: Step) -> Baseline | None:
         """Put the step's readings over the baseline; return a baseline that this very scan has completed."""
@@ -120,18 +117,13 @@ class Zeroing:
             new = self._rezero(step.scan, self._rezeroing)
         if new is not None:
             self.use(new, 0.0, step.scan.time_ns)
-            self._notes = ()
+            self.notes = ()
             step.zeroed = deformation(self._watch.held, new, self._mounting)
         if self.baseline is not None:
             step.baseline, step.drift = self.baseline, self._drift
             if self._taken_ns is not None:
                 step.baseline_age_s = max(step.scan.time_ns - self._taken_ns, 0) / 1e9
         return new
-
-    @property
-    def notes(self) -> tuple[Note, ...]:
-        """Why there is no baseline yet, how a zeroing on demand stands, and what has become of the rest level."""
-        return (*self._notes, *self._drift_notes)
 
     def follow_drift(self, step: Step) -> None:
         """Let the rest level follow the readings of a free pad; it applies from the next scan on."""
@@ -142,7 +134,7 @@ class Zeroing:
             return
         self.baseline = taken.moved(tracker.counts)
         self._drift, note = tracker.summary, tracker.note
-        self._drift_notes = () if note is None else (Note("rest_level", note),)
+        self.drift_notes = () if note is None else (Note("rest_level", note),)
         event = tracker.take_event()
         if event is not None:
             self._report("rest_level", event)
@@ -159,7 +151,7 @@ class Zeroing:
         else:
             old = None if force or doubted else self.baseline
             self._rezeroing = Rezeroing(old, force=force, unix_time_s=self._unix_time_s)
-            self._notes = (self._rezeroing.note,)
+            self.notes = (self._rezeroing.note,)
 
     def lose_touch(self) -> None:
         """Compare the rest level with the earlier one before drift is followed again; a zeroing that goes on ends."""
@@ -167,7 +159,7 @@ class Zeroing:
         if self._tracker is not None:
             self._tracker.forget()
         if self._rezeroing is not None:
-            self._rezeroing, self._notes = None, ()
+            self._rezeroing, self.notes = None, ()
             self._report("given_up", "the sensor was away; request it again")
 
     def _zero(self, scan: Scan) -> Baseline | None:
@@ -175,7 +167,7 @@ class Zeroing:
         try:
             return self._estimator.push(scan, self._silent())
         except BaselineRefusedError as refusal:
-            self._notes = (Note("zeroing_restarted", f"zeroing started over: {refusal}"),)
+            self.notes = (Note("zeroing_restarted", f"zeroing started over: {refusal}"),)
             return None
 
     def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> Baseline | None:
@@ -183,10 +175,10 @@ class Zeroing:
         try:
             new = rezeroing.push(scan, self._taps.contact, self._silent())
         except BaselineRefusedError as refusal:
-            self._rezeroing, self._notes = None, ()
+            self._rezeroing, self.notes = None, ()
             self._report("given_up", str(refusal))
             return None
-        self._notes = (rezeroing.note,)
+        self.notes = (rezeroing.note,)
         if new is None:
             return None
         self._rezeroing = None

@@ -5,8 +5,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from edge.pipeline.run_statistics import silence_hint
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.silence_hint import silence_hint
 from edge.terminal.progress_bar import Progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError

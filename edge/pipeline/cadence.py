@@ -18,11 +18,7 @@ from edge.perception.result import Result
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S, SENSOR_SILENT_NS
 
-REMEMBERED_INTERVALS: Final = 31
 FEWEST_INTERVALS: Final = 5  # fewest intervals that give a period
-BURST_SHARE: Final = 8
-"""Divisor of the period: scans nearer to each other than an eighth of it were held up. Bursts of all sixteen frames,
-16 ms apart, are further apart."""
 LONGEST_BURST: Final = 500
 """Scans of a burst: five seconds of a sensor at 100 Hz; a longer one is the sensor's own pace."""
 GAP_PERIODS: Final = 1.5
@@ -30,13 +26,6 @@ GAP_PERIODS: Final = 1.5
 10 ms."""
 SETTLING_SCANS: Final = 5
 """Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
-PACED_SCANS: Final = 32
-"""Scans without a gap from which on their mean period is more exact than the median of the newest: with that, 1 % off,
-a stall of a second would seem to have swallowed a scan."""
-SMOOTHING: Final = 0.05
-SHORTEST_PERIOD_NS: Final = 500_000
-"""Shortest period of a sensor, half of that of the fastest: scans nearer to each other waited somewhere, and give no
-period."""
 
 
 class _Period:
@@ -55,8 +44,9 @@ class _Period:
         if last_ns is None or time_ns <= last_ns:
             return
         interval_ns = time_ns - last_ns
-        # Held up somewhere, it came right behind the one before; unless all of late did.
-        hurried = self.ns is not None and interval_ns * BURST_SHARE < self.ns
+        # Held up somewhere, it came right behind the one before; unless all of late did. Bursts of all sixteen frames,
+        # 16 ms apart, are further apart.
+        hurried = self.ns is not None and interval_ns * 8 < self.ns
         self._hurried = self._hurried + 1 if hurried else 0
         if self._hurried > LONGEST_BURST:
             self._intervals.clear()
@@ -64,7 +54,7 @@ class _Period:
             self.ns = None
         elif hurried:
             return
-        if len(self._intervals) == REMEMBERED_INTERVALS:
+        if len(self._intervals) == 31:
             del self._sorted[bisect_left(self._sorted, self._intervals.popleft())]
         self._intervals.append(interval_ns)
         insort(self._sorted, interval_ns)
@@ -83,7 +73,7 @@ class _Gap:
 
 
 class Cadence:
-    """Cadence of one sensor: a pattern is due one period after its scan, and what did not come shows as a gap.
+    """Cadence of one sensor: its period, and what did not come, which shows as a gap.
 
     The wire does not number scans: the number missing between two follows from the sensor's own period, and is only as
     exact as that.
@@ -91,27 +81,18 @@ class Cadence:
     Attributes:
         last: newest scan; None before the first.
         missed: scans that did not arrive, as far as gaps show.
+        period_ns: time between scans, in [ns]; None as long as too few have arrived.
     """
 
     def __init__(self, rate_hz: float | None = None) -> None:
         """Begin without a scan; `rate_hz` is the sensor's rate in [Hz], None if unknown."""
         self.last: Scan | None = None
         self.missed = 0
-        self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
+        self.period_ns = self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._arrivals, self._stamps = _Period(), _Period()
         self._gap: _Gap | None = None
         self._paced_from: Scan | None = None
         self._mean_ns: float | None = None
-
-    @property
-    def period_ns(self) -> int | None:
-        """Time between scans, in [ns]; None as long as too few have arrived."""
-        return self._known_ns or self._arrivals.ns
-
-    def late(self, latency_us: float) -> bool:
-        """Return whether a pattern missed its deadline, so long after its scan in [us]; never without a period."""
-        period_ns = self.period_ns
-        return period_ns is not None and latency_us * 1e3 > period_ns
 
     def forget(self) -> None:
         """Forget the scans: a recording goes on elsewhere, and none is missing."""
@@ -121,6 +102,7 @@ class Cadence:
         """Take the next scan."""
         if not scan.unread_ns:  # scans that waited unread came at no pace
             self._arrivals.follow(scan.time_ns)
+            self.period_ns = self._known_ns or self._arrivals.ns
         if scan.device_ns is not None:
             self._stamps.follow(scan.device_ns)
         before, self.last = self.last, scan
@@ -130,7 +112,7 @@ class Cadence:
         period_ns = self.period_ns
         if scan.device_ns is not None:  # else bursts of a busy reader would look like gaps
             period_ns = self._stamps.ns or period_ns
-        if period_ns and period_ns >= SHORTEST_PERIOD_NS:
+        if period_ns and period_ns >= 500_000:  # half of the fastest sensor's: scans that are nearer waited somewhere
             self._follow_gap(before, scan, period_ns)
 
     def _follow_gap(self, before: Scan, scan: Scan, period_ns: int) -> None:
@@ -155,12 +137,13 @@ class Cadence:
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
         """Return the mean period over all scans since the last gap, or before it, if there were enough.
 
-        Over few scans, bursts make the median too small, and hardly the mean.
+        Over few scans, bursts make the median too small, and hardly the mean. Over many the mean is more exact: with a
+        median that is 1 % off, a stall of a second would seem to have swallowed a scan.
         """
         first = self._paced_from or scan
         scans = scan.number - first.number
         mean_ns = (scan.on_bus_ns - first.on_bus_ns) / scans if scans else 0.0
-        if scans >= PACED_SCANS:
+        if scans >= 32:
             self._mean_ns = mean_ns
         return self._mean_ns or max(period_ns, mean_ns)
 
@@ -186,8 +169,10 @@ class Cadences:
     def __len__(self) -> int:
         return len(self._sensors)
 
-    def __getitem__(self, sensor: str) -> Cadence:
-        return self._sensors[sensor]
+    def late(self, sensor: str, latency_us: float) -> bool:
+        """Return whether a pattern was ready later than one period after its scan, in [us]; never without a period."""
+        period_ns = self._sensors[sensor].period_ns
+        return period_ns is not None and latency_us * 1e3 > period_ns
 
     @property
     def shortest_period_s(self) -> float:
@@ -225,9 +210,9 @@ class Cadences:
 
     def look(self) -> list[Event]:
         """Return events of sensors newly silent while another is not; the link reports a silence of all of them."""
-        last_ns = {name: one.last.time_ns for name, one in self._sensors.items() if one.last is not None}
-        if len(last_ns) + len(self._expected) < 2 or self._first_ns is None:
+        if len(self._sensors) + len(self._expected) < 2 or self._first_ns is None:
             return []
+        last_ns = {name: one.last.time_ns for name, one in self._sensors.items() if one.last is not None}
         newest_ns = max(last_ns.values(), default=self._first_ns)
         events: list[Event] = []
         for sensor, time_ns in last_ns.items():
@@ -266,16 +251,12 @@ class Rate:
             period_ns = time_ns - self._last_ns
             if self._period_ns is None:
                 self._period_ns = period_ns
-            self._period_ns += SMOOTHING * (period_ns - self._period_ns)
+            self._period_ns += 0.05 * (period_ns - self._period_ns)
             self.rate_hz = 1e9 / self._period_ns
         self._last_ns = time_ns
 
 
-TOGETHER_SENSORS: Final = 4  # fewest sensors whose scans are read together
-READS_A_PERIOD: Final = 4  # reads of many sensors in a period
-SHORTEST_REST_S: Final = 0.005  # shortest period, in [s], of sensors that rest: faster ones give their scans at once
 LONGEST_PERIOD_S: Final = 0.05  # period from which scans come too seldom to be read together, in [s]
-SAME_SHARE: Final = 0.1  # share by which a measured period may change before links are read at another pace
 RESTLESS_NS: Final = 1_000_000_000  # time after a contact, in [ns], during which every scan is still read at once
 
 
@@ -314,12 +295,12 @@ class PaceSetter:
         """Return the pace for so many sensors of this shortest period in [s]."""
         pace, before = Pace(), self.pace
         rests = self._newest_ns - self._restless_ns > RESTLESS_NS
-        if rests and SHORTEST_REST_S <= period_s < min(LONGEST_PERIOD_S, self._patience_s / 2):
+        if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self._patience_s / 2):  # faster ones never wait
             pace = Pace(period_s, int(self._patience_s / period_s))
-        elif sensors >= TOGETHER_SENSORS and period_s < LONGEST_PERIOD_S:
-            pace = Pace(period_s / READS_A_PERIOD)
-        if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < SAME_SHARE * pace.every_s:
-            return before
+        elif sensors >= 4 and period_s < LONGEST_PERIOD_S:
+            pace = Pace(period_s / 4)
+        if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < 0.1 * pace.every_s:
+            return before  # a measured period jitters
         if pace.reads > 1:
             self._waited_ns = math.inf
         elif before.reads > 1:

@@ -20,7 +20,6 @@ from firmware_bridge.scans.scan import is_sensor_name
 if TYPE_CHECKING:
     from edge.perception.runtime import Runtime
 
-READ_BYTES: Final = 1 << 16  # bytes of one read: all that a pipe holds, some 500 poses
 WAITING: Final = 64  # commands that may wait until the loop takes them
 
 
@@ -146,7 +145,7 @@ class CommandLines:
             if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
                 return
             try:
-                data = os.read(self._descriptor, READ_BYTES)
+                data = os.read(self._descriptor, 1 << 16)  # all that a pipe holds, some 500 poses
             except OSError:  # the other end is gone, which stops commands but not the run
                 data = b""
             self._open = bool(data)

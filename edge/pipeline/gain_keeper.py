@@ -1,6 +1,6 @@
 """Keeping of learned gains in the sensor file, in a thread of its own: a disk may take longer than a scan."""
 
-import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -25,28 +25,25 @@ class GainKeeper:
         self.trouble: str | None = None
         self._path = path
         self._emulated = emulated
-        self._lock = threading.Lock()
-        self._threads: list[threading.Thread] = []
+        self._writer = ThreadPoolExecutor(1, "gain-keeper")
+        self._written: Future[None] | None = None
 
     def keep(self, sensor: str, learned: Pad) -> None:
         """Begin to write the learned gains of a sensor, which must not wait."""
-        self._threads = [one for one in self._threads if one.is_alive()]
-        thread = threading.Thread(target=self._write, args=(sensor, learned), name="gain-keeper")
-        self._threads.append(thread)
-        thread.start()
+        self._written = self._writer.submit(self._write, sensor, learned)
 
     def close(self) -> None:
         """Wait until all is written."""
-        for thread in self._threads:
-            thread.join()
+        self._writer.shutdown()
+        if self._written is not None:
+            self._written.result()  # raises what is no trouble with the file
 
     def _write(self, sensor: str, learned: Pad) -> None:
-        with self._lock:
-            try:
-                self.trouble = None
-                keep_learned(self._path, sensor, learned, emulated=self._emulated)
-            except SensorFileError as error:
-                self.trouble = str(error)
+        try:
+            self.trouble = None
+            keep_learned(self._path, sensor, learned, emulated=self._emulated)
+        except SensorFileError as error:
+            self.trouble = str(error)
 
 
 def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = False) -> None:

@@ -2,20 +2,25 @@
 
 import math
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import Final
 
+from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences, PaceSetter
 from edge.pipeline.commands import Commands, carry_out
 from edge.pipeline.gain_keeper import GainKeeper
+from edge.pipeline.latest import NewestResults
 from edge.pipeline.pose_queue import PoseIntake, PoseQueue
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
+from edge.validation import check_positive
 from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import TimedPose
@@ -24,21 +29,15 @@ from firmware_bridge.schedule import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
-REFUSED_AGAIN_S: Final = 10.0  # time until another refused command is told, in [s]: a stream of them must not flood
 
 
 class Loop:
-    """Maker of results from scans, commands and poses, for a stream; its settings are those of the stream.
+    """Maker of results from the scans, commands and poses of a source, in the thread that asks for a step.
 
     Sinks get each result and event as soon as it is made.
 
     Attributes:
-        made: results and events of the step under way, in their order; the stream takes them at its end.
         statistics: of the results so far.
-        poses: queue of the poses from outside.
-        sinks: get results, events and poses.
-        left: patterns still to be made for scans that waited when one of several calls of inference began.
-        ended: True once there are no more results to make.
     """
 
     def __init__(
@@ -46,32 +45,57 @@ class Loop:
         source: Source,
         runtime: Runtime,
         *,
-        sinks: Sequence[Sink],
-        stop: threading.Event | None,
-        duration_s: float | None,
-        commands: Commands | None,
-        statistics: Statistics | None,
-        patience_s: float,
-        clock_s: Callable[[], float],
-        clock_ns: Callable[[], int],
+        sinks: Sequence[Sink] = (),
+        on_event: Callable[[Event], object] = lambda event: None,
+        stop: threading.Event | None = None,
+        duration_s: float | None = None,
+        commands: Commands | None = None,
+        statistics: Statistics | None = None,
+        patience_s: float = 0.0,
+        clock_s: Callable[[], float] = time.monotonic,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.made: list[Result | Event] = []
+        """Prepare to make results.
+
+        Args:
+            source: open.
+            runtime: makes the results.
+            sinks: open; they get every result and event, and the poses, before anything else does. Their counters are
+                the stream's.
+            on_event: called with each event, in its place between results.
+            stop: ends the stream after the scans that wait.
+            duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
+                results are made, measured in the time of the recording.
+            commands: polled between scans.
+            statistics: filled on the way, so that they are available however the stream ends.
+            patience_s: longest time for which results may wait while all sensors are at rest, in [s].
+            clock_s: monotonic, in [s].
+            clock_ns: clock of the scans, in [ns].
+
+        Raises:
+            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
+        """
+        if duration_s is not None:
+            check_positive("duration_s", duration_s)
         self.statistics = Statistics() if statistics is None else statistics
-        self.poses = PoseQueue() if commands is None else commands.poses
-        self.sinks = tuple(sinks)
-        self.left = 0
-        self.ended = False
         self._source = source
         self._runtime = runtime
+        self._sinks = tuple(sinks)
+        self._on_event = on_event
+        self._poses = PoseQueue() if commands is None else commands.poses
+        self._made: deque[Result | Event] = deque()  # in their order; whoever takes them calls `on_event`
+        self._newest = NewestResults()
+        # Patterns still to be made for scans that waited when one of several calls of inference began.
+        self._left = 0
+        self._error: Exception | None = None
+        self._turn = threading.RLock()
         self._stop = threading.Event() if stop is None else stop
         self._length_s = math.inf if duration_s is None else duration_s
         self._begun_s: float | None = None
         self._first_ns: int | None = None
         self._commands = commands
-        unused_by = None if any(sink.uses_poses for sink in self.sinks) else runtime.unposed
-        self._intake = PoseIntake(
-            runtime, self.poses, recorded=source.patient, unused_by=unused_by, no_sensor=self.no_sensor
-        )
+        unused_by = None if any(sink.uses_poses for sink in self._sinks) else runtime.unposed
+        self._intake = PoseIntake(runtime, self._poses, recorded=source.patient, unused_by=unused_by)
         self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
         self._now_ns = 0
         self._waited_s = self._refused_s = -math.inf
@@ -82,21 +106,58 @@ class Loop:
         self._pace = PaceSetter(patience_s)
         path = None if source.kind == "replay" else source.sensor_file.path
         self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
+        source.reserve(self)
+
+    @property
+    def ended(self) -> bool:
+        """True once there are no more results to make."""
+        return self._newest.ended or self._error is not None
 
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
         if self._received is None:
             self._received = self._source.counters()
+        if self._sinks:
+            self.statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
         return self._received | self.statistics.counters()
 
-    def step(self, wait_s: float) -> None:
+    def close(self) -> None:
+        """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
+        self._sinks = ()
+        with self._turn:  # unless this is a callback of a step
+            self._finish()
+            while self._made:
+                self._next_made()
+            self._error = UsageError(
+                f"the stream of source {self._source.name} is closed: results that were left are old"
+            )
+
+    def _next_made(self) -> Result | None:
+        """Take the next result; None after an event, which is told instead."""
+        made = self._made.popleft()
+        if isinstance(made, Event):
+            self._on_event(made)
+            return None
+        return made
+
+    def _step(self, wait_s: float) -> None:
         """Make the results of all that waits, after waiting at most `wait_s` [s]; of a patient source, of every scan.
 
-        Raises:
-            BridgeError: the source is lost; what was taken before has its results.
-            EdgeError: a sink or the model fails.
+        Where the source is lost, or a sink or the model fails, the error waits until the results before it are taken.
         """
+        with self._turn:
+            if self._error is not None:
+                raise self._error.with_traceback(None)  # else every call would lengthen it
+            try:
+                self._make(wait_s)
+            except Exception as error:
+                self._error = self._error or error
+                self._finish()
+                if not self._made:
+                    raise
+
+    def _make(self, wait_s: float) -> None:
         over = self._over()
         try:
             taken = self._take(0.0 if over or self._runtime.waiting else wait_s, over=over)
@@ -105,12 +166,13 @@ class Loop:
             raise
         if taken is None:
             self._make_patterns()
-            self.finish()
+            self._finish()
+            self._newest.ended = True
             return
         if self._commands is not None:
             self._carry_out(self._commands)
-        self.poses.begun = self.poses.begun or any(isinstance(one, TimedPose) for one in taken)
-        if self.poses.begun:
+        self._poses.begun = self._poses.begun or any(isinstance(one, TimedPose) for one in taken)
+        if self._poses.begun:
             self._take_poses(taken)
         for one in taken:
             if isinstance(one, Scan):
@@ -122,32 +184,33 @@ class Loop:
                 self._make_patterns()
                 self._take_notice(one)
         # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
-        self.left = min(self.left or self._runtime.waiting, self._runtime.waiting)
-        self.left -= self._infer()
+        self._left = min(self._left or len(self._runtime.waiting), len(self._runtime.waiting))
+        self._left -= self._infer()
         if over or self._source.patient:
             self._make_patterns()
-        elif self.left > 0:
+        elif self._left > 0:
             return
         if over:
-            self.finish()
+            self._finish()
+            self._newest.ended = True
             return
-        self.left = 0
+        self._left = 0
         for event in self._cadences.look():
             self._tell(event)
         self._source.pace = self._pace.choose(len(self._cadences), self._cadences.shortest_period_s)
         if not taken:
             self._rest(wait_s)
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         """Keep what was learned; there are no more results."""
-        self.ended, self.left = True, 0
+        self._left = 0
         if self._keeper is not None:
             keeper, self._keeper = self._keeper, None
             keeper.close()
             if keeper.trouble is not None:
                 self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {keeper.trouble}"))
 
-    def no_sensor(self, name: str) -> str | None:
+    def _no_sensor(self, name: str) -> str | None:
         """Return why no sensor has this name; None if one has, or if one that has it may still come.
 
         The sensors of a link send their scans in turn: once one has sent many, all have sent some.
@@ -163,13 +226,13 @@ class Loop:
 
     def _carry_out(self, commands: Commands) -> None:
         def may_come(name: str) -> bool:
-            return name not in self.statistics.scans_of_each() and self.no_sensor(name) is None
+            return name not in self.statistics.scans_of_each() and self._no_sensor(name) is None
 
         carry_out(commands, self._runtime, may_come)
         self.statistics.commands_refused = commands.refused
         now_s = self._clock_s()
-        if commands.reason is not None and now_s - self._refused_s >= REFUSED_AGAIN_S:
-            self._refused_s = now_s
+        if commands.reason is not None and now_s - self._refused_s >= 10:
+            self._refused_s = now_s  # a stream of refused ones must not flood
             self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
             commands.reason = None
 
@@ -178,7 +241,7 @@ class Loop:
         now_s = self._clock_s()
         if wait_s or now_s - self._waited_s >= POLL_S:
             self._waited_s = now_s
-            for sink in self.sinks:
+            for sink in self._sinks:
                 sink.wait()
 
     def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
@@ -191,10 +254,10 @@ class Loop:
         elif first_ns is not None:
             self._now_ns = first_ns
         intake, statistics = self._intake, self.statistics
-        poses = intake.take(recorded, first_ns, self._now_ns)
-        statistics.poses, statistics.poses_refused = intake.used, self.poses.refused
-        statistics.poses_dropped = self.poses.dropped
-        for sink in self.sinks if poses else ():
+        poses = intake.take(recorded, first_ns, self._now_ns, self._no_sensor)
+        statistics.poses, statistics.poses_refused = intake.used, self._poses.refused
+        statistics.poses_dropped = self._poses.dropped
+        for sink in self._sinks if poses else ():
             sink.pose(poses)
         for event in intake.look(self._now_ns):
             self._tell(event)
@@ -242,18 +305,19 @@ class Loop:
         scan, statistics = result.scan, self.statistics
         back = self._cadences.follow(scan)
         if result.latency_us is not None:
-            late = self._cadences[scan.sensor].late(result.latency_us)
+            late = self._cadences.late(scan.sensor, result.latency_us)
             statistics.late += late and not self._pace.waited(scan)
         self._pace.follow(result)
         statistics.add(result)
         statistics.missed = self._cadences.missed
         if back is not None:
             self._tell(back)
-        if self.sinks:
-            counters = self._count()
-            for sink in self.sinks:
+        if self._sinks:
+            counters = self.counters
+            for sink in self._sinks:
                 sink.write(result, counters)
-        self.made.append(result)
+        self._newest.add(result)
+        self._made.append(result)
 
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
@@ -267,13 +331,9 @@ class Loop:
 
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)
-        if self.sinks:
-            counters = self._count()
-            for sink in self.sinks:
+        if self._sinks:
+            counters = self.counters
+            for sink in self._sinks:
                 sink.tell(event, counters)
-        self.made.append(event)
-
-    def _count(self) -> dict[str, int]:
-        """Return the counters, with the records that the sinks left out."""
-        self.statistics.unwritten = sum(map(_UNWRITTEN, self.sinks))
-        return self.counters
+        self._newest.tell(event)
+        self._made.append(event)

@@ -202,27 +202,32 @@ class PoseIntake:
         *,
         recorded: bool = False,
         unused_by: str | None = None,
-        no_sensor: Callable[[str], str | None] = lambda name: None,
     ) -> None:
         """Begin without a pose; to recorded scans no pose of now belongs.
 
-        `unused_by` names the model where neither it nor any sink uses poses; `no_sensor` returns why none has a name.
+        `unused_by` names the model where neither it nor any sink uses poses.
         """
         self.used = 0
         self._runtime = runtime
         self._queue = queue
         self._recorded = recorded
         self._unused_by = unused_by
-        self._no_sensor = no_sensor
         self._played: set[str | None] = set()
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
         self._events: list[Event] = []
 
-    def take(self, recorded: Sequence[TimedPose], first_scan_ns: int | None, now_ns: int) -> list[TimedPose]:
+    def take(
+        self,
+        recorded: Sequence[TimedPose],
+        first_scan_ns: int | None,
+        now_ns: int,
+        no_sensor: Callable[[str], str | None] = lambda name: None,
+    ) -> list[TimedPose]:
         """Pass on the poses that wait and those of the source, and return those that the runtime has taken.
 
-        They hold from the first scan after them, or else from now, the time of a recording's newest scan.
+        They hold from the first scan after them, or else from now, the time of a recording's newest scan. `no_sensor`
+        returns why no sensor has a name.
         """
         waiting = self._queue.take()
         if recorded:
@@ -231,7 +236,7 @@ class PoseIntake:
             waiting = [one for one in waiting if not self._refused_for_recording(one)]
         taken: list[TimedPose] = []
         for timed in (*recorded, *waiting):
-            if timed.sensor is not None and (why := self._no_sensor(timed.sensor)) is not None:
+            if timed.sensor is not None and (why := no_sensor(timed.sensor)) is not None:
                 self._queue.refuse(PoseError("sensor", why))
             elif self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
                 taken.append(replace(timed, used_from_ns=now_ns if first_scan_ns is None else first_scan_ns))

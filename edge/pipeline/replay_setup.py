@@ -9,15 +9,13 @@ from shlex import quote
 from types import MappingProxyType
 
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.source_setup import sensor_settings, with_recorded
+from edge.pipeline.source_setup import sensor_settings, unmapped, with_recorded
 from edge.terminal.progress_bar import Progress
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.replay_player import PlayedReplay, Player
-from firmware_bridge.pad_geometry import PADS, SensorGeometry
 from firmware_bridge.recording.tracks import Recording
-from firmware_bridge.scans.can_id_maps import ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
@@ -61,8 +59,7 @@ def open_recording(
         replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
-    pad = tracks[0].geometry
-    file = sensor_settings(sensor, None if sensor is not None else _named(pad))
+    file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
     known = with_recorded(file, [replay])
     recorded = [_in_its_time(recording, paced=paced) for recording in replay.recordings]
     baselines = {} if zero else {name: one for each in recorded for name, one in each.items()} or known.baselines
@@ -165,11 +162,6 @@ def _remedy(path: Path, rate_hz: float | None) -> str:
         f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {quote(str(path))}{rate} "
         "--baseline zero.json shows patterns, marked as not to be believed"
     )
-
-
-def _named(pad: SensorGeometry) -> str | ModelMap:
-    """Return a replacement for the id map of a recording's sensors, whose ids are no longer needed."""
-    return pad.name if pad in PADS else ModelMap(pad.name, pad, {})
 
 
 class _FollowedReplay(ReplayLink):

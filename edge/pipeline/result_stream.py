@@ -1,31 +1,27 @@
-"""Stream of the results of a source: every one, or the newest; and the loop of a stream into sinks."""
+"""Stream of the results of a source: every one, the newest, or pairs of several sensors; and its loop into sinks."""
 
 import gc
-import threading
-import time
-from collections import deque
-from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
 from edge.errors import NoResultError, UsageError
-from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.commands import Commands
-from edge.pipeline.latest import Latest, NewestResults
-from edge.pipeline.loop import Loop
+from edge.pipeline.latest import Latest
+from edge.pipeline.loop import ALL_HEARD_SCANS, Loop
 from edge.pipeline.pose_queue import PoseError, pose_of_fields
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import Source
+from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.schedule import POLL_S
 
 
-class Stream:
+class Stream(Loop):
     """Results of a source, one for every scan, until it ends, `stop` is set or `duration_s` is over.
 
     A loop over it gets every result in order; `latest` and `read` return the newest, and leave out those before it.
@@ -36,85 +32,13 @@ class Stream:
     Any thread may state poses. A sensor that has a baseline or counts per newton, and of which no scan arrives, is
     reported as an event. A loop that was left may be continued by another, from the next result on. Closing the source
     closes its streams.
-
-    Attributes:
-        statistics: of the results so far.
     """
 
-    def __init__(
-        self,
-        source: Source,
-        runtime: Runtime,
-        *,
-        sinks: Sequence[Sink] = (),
-        on_event: Callable[[Event], object] = lambda event: None,
-        stop: threading.Event | None = None,
-        duration_s: float | None = None,
-        commands: Commands | None = None,
-        statistics: Statistics | None = None,
-        patience_s: float = 0.0,
-        clock_s: Callable[[], float] = time.monotonic,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """Prepare to make results.
-
-        Args:
-            source: open.
-            runtime: makes the results.
-            sinks: open; they get every result and event, and the poses, before anything else does. Their counters are
-                the stream's.
-            on_event: called with each event, in its place between results.
-            stop: ends the stream after the scans that wait.
-            duration_s: longest time to run, from the first step on, in [s]; for a recording that is read as fast as
-                results are made, measured in the time of the recording.
-            commands: polled between scans.
-            statistics: filled on the way, so that they are available however the stream ends.
-            patience_s: longest time for which results may wait while all sensors are at rest, in [s].
-            clock_s: monotonic, in [s].
-            clock_ns: clock of the scans, in [ns].
-
-        Raises:
-            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
-        """
-        if duration_s is not None:
-            check_positive("duration_s", duration_s)
-        self._source = source
-        self._newest = NewestResults()
-        self._made: deque[Result | Event] = deque()
-        self._on_event = on_event
-        self._loop = Loop(
-            source,
-            runtime,
-            sinks=sinks,
-            stop=stop,
-            duration_s=duration_s,
-            commands=commands,
-            statistics=statistics,
-            patience_s=patience_s,
-            clock_s=clock_s,
-            clock_ns=clock_ns,
-        )
-        self.statistics = self._loop.statistics
-        self._error: Exception | None = None
-        self._turn = threading.RLock()
-        self._worker: ThreadPoolExecutor | None = None
-        self._clock_s = clock_s
-        self._clock_ns = clock_ns
-        source.reserve(self)
+    _worker: ThreadPoolExecutor | None = None
 
     def __repr__(self) -> str:
         statistics = self.statistics
         return f"<Stream of {self._source.name}: {statistics.scans} scans, {statistics.patterns} patterns>"
-
-    @property
-    def ended(self) -> bool:
-        """True once there are no more results to make."""
-        return self._newest.ended or self._error is not None
-
-    @property
-    def counters(self) -> dict[str, int]:
-        """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        return self._loop.counters
 
     def pose(
         self,
@@ -152,7 +76,7 @@ class Stream:
         fields = {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg, "error_mm": error_mm, "error_deg": error_deg}
         fields |= {"sensor": sensor, "holds": holds, "time_ns": now_ns if time_ns is None else time_ns}
         try:
-            self._loop.poses.put(pose_of_fields(fields, now_ns))
+            self._poses.put(pose_of_fields(fields, now_ns))
         except PoseError as error:
             raise UsageError(f"a pose: {error}") from error
 
@@ -235,7 +159,7 @@ class Stream:
         Raises:
             UsageError: no sensor has this name; the message lists those that there are.
         """
-        why = None if sensor is None else self._loop.no_sensor(sensor)
+        why = None if sensor is None else self._no_sensor(sensor)
         if why is not None:
             raise UsageError(why)
 
@@ -264,14 +188,6 @@ class Stream:
                 self._newest.see(result)
                 yield result
 
-    def _next_made(self) -> Result | None:
-        """Return the next result; None after an event, which is told instead."""
-        made = self._made.popleft()
-        if isinstance(made, Event):
-            self._on_event(made)
-            return None
-        return made
-
     def _pass_over(self) -> None:
         """Tell what happened, and leave the results out that were made."""
         while self._made:
@@ -285,55 +201,86 @@ class Stream:
                 "one: iterate over the stream, or open it with paced=True"
             )
         self._step(wait_s)
-        while self._loop.left:
+        while self._left:
             self._step(0.0)
-
-    def _step(self, wait_s: float) -> None:
-        """Make the next results, after waiting at most `wait_s` [s] for scans; an error waits until they are taken."""
-        with self._turn:
-            if self._error is not None:
-                raise self._error.with_traceback(None)  # else every call would lengthen it
-            loop = self._loop
-            try:
-                loop.step(wait_s)
-            except Exception as error:
-                self._error = self._error or error
-                loop.finish()
-                if not loop.made:
-                    raise
-            finally:
-                self._take_made()
-                self._newest.ended = loop.ended and self._error is None
-
-    def _take_made(self) -> None:
-        """Take what a step has made: from here on another task, or another thread, may have it."""
-        made, self._loop.made = self._loop.made, []
-        for one in made:
-            self._newest.tell(one) if isinstance(one, Event) else self._newest.add(one)
-        self._made += made
 
     async def _step_beside(self, wait_s: float = POLL_S) -> None:
         """Make the next results in a thread, once scans wait; they stay here if the task is cancelled."""
         import asyncio
 
-        if not (self._loop.left or self._source.patient):
-            await self._source.wait_async(wait_s)
+        def wait_and_step() -> None:
+            if not self._left:
+                self._source.wait(wait_s)  # not within a step, which another task would have to wait for
+            self._step(0.0)
+
         if self._worker is None:
             self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="result-stream")
-        await asyncio.get_running_loop().run_in_executor(self._worker, self._step, 0.0)
+        await asyncio.get_running_loop().run_in_executor(self._worker, wait_and_step)
 
     def close(self) -> None:
         """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
         if self._worker is not None:
             self._worker.shutdown()
-        self._loop.sinks = ()
-        with self._turn:  # unless this is a callback of a step
-            self._loop.finish()
-            self._take_made()
-            self._pass_over()
-            self._error = UsageError(
-                f"the stream of source {self._source.name} is closed: results that were left are old"
-            )
+        super().close()
+
+
+def paired(results: Iterable[Result], sensors: Sequence[str], *, apart_s: float = 0.02) -> Iterator[tuple[Result, ...]]:
+    """Yield the results of several sensors that belong together in time: one of each, in the order of their names.
+
+    Times are those of the scans on the bus, where the device states them. Each result is used once at most; of two that
+    could follow, the nearer one is taken, which is known a period later. Results without a partner are left out. Those
+    of one sensor may come long before those of another, as they do from a loop that was held up. `apart_s` is the
+    longest time from the first to the last result of a pair, in [s]: two periods of a sensor at 100 Hz.
+
+    Raises:
+        UsageError: fewer than two sensors, one twice, or the time is out of range; while pairs are taken, no sensor
+            has one of these names.
+    """
+    check_positive("apart_s", apart_s)
+    if isinstance(sensors, str) or len(sensors) < 2 or len(set(sensors)) < len(sensors):
+        raise UsageError(f"sensors are {sensors!r}, expected two or more different names")
+    waiting: dict[str, deque[Result]] = {name: deque(maxlen=CAPACITY_SCANS) for name in sensors}
+    return _pairs(results, waiting, round(apart_s * 1e9))
+
+
+def _pairs(results: Iterable[Result], waiting: dict[str, deque[Result]], apart_ns: int) -> Iterator[tuple[Result, ...]]:
+    newest_ns = 0
+    missing, heard = set(waiting), Counter[str]()
+    for result in results:
+        sensor = result.scan.sensor
+        if missing:
+            missing.discard(sensor)
+            heard[sensor] += 1
+            if isinstance(results, Stream):
+                for name in missing:
+                    results.check_sensor(name)
+        queue = waiting.get(sensor)
+        if queue is None:
+            continue
+        queue.append(result)
+        newest_ns = max(newest_ns, result.scan.on_bus_ns)
+        yield from _matches(waiting, apart_ns, newest_ns)
+    yield from _matches(waiting, apart_ns, None)
+    if missing and max(heard.values(), default=0) >= ALL_HEARD_SCANS:
+        raise UsageError(f"no result of sensor {min(missing)!r}: there are those of {', '.join(sorted(heard))}")
+
+
+def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | None) -> Iterator[tuple[Result, ...]]:
+    """Yield the pairs that nothing newer can better; `newest_ns` is None where nothing newer will come."""
+    while all(waiting.values()):
+        times_ns = [queue[0].scan.on_bus_ns for queue in waiting.values()]
+        first_ns, last_ns = min(times_ns), max(times_ns)
+        earliest = list(waiting.values())[times_ns.index(first_ns)]
+        spread_ns, better = last_ns - first_ns, False
+        if len(earliest) > 1:
+            times_ns[times_ns.index(first_ns)] = earliest[1].scan.on_bus_ns
+            better = max(times_ns) - min(times_ns) < spread_ns
+        if better or spread_ns > apart_ns:
+            earliest.popleft()
+        elif len(earliest) == 1 and newest_ns is not None and newest_ns - last_ns < spread_ns:
+            return  # its next one may be nearer
+        else:
+            yield tuple(queue.popleft() for queue in waiting.values())
 
 
 @contextmanager

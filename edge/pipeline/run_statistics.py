@@ -1,7 +1,9 @@
-"""Statistics of a run, in memory that does not grow with it."""
+"""Statistics of a run, in memory that does not grow with it; and advice to a person whose source gives no scan."""
 
 import math
+import shlex
 from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from operator import attrgetter
@@ -11,15 +13,10 @@ from edge.perception.event import Event, EventKind
 from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
-BUCKETS_PER_OCTAVE: Final = 32  # resolution of the run-time histogram: a quantile is at most 2.2 % too high
-SHORTEST_NS: Final = 1_000_000_000
-"""Shortest run whose rate is reported: the first scans have waited for the model and come at once, and over less time
-100 Hz looks like 135."""
+BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
+OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
-LONGEST_US: Final = 2.0**26
-"""Longest run time that the histogram resolves, about a minute; longer ones count as this long."""
-NO_CONTACT: Final = "no contact: its readings never reached --contact-on-counts over the baseline"
 _COUNTERS: Final = (
     *("dropped", "overruns", "late", "missed"),
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
@@ -33,13 +30,13 @@ class Histogram:
     def __init__(self) -> None:
         self.count = 0
         self.max = 0.0
-        self._buckets = [0] * (math.ceil(math.log2(LONGEST_US) * BUCKETS_PER_OCTAVE) + 1)
+        self._buckets = [0] * (OCTAVES * BUCKETS_PER_OCTAVE + 1)
 
     def add(self, value: float) -> None:
         """Count a value; below 1 counts as 1."""
         self.count += 1
         self.max = max(self.max, value)
-        self._buckets[math.ceil(math.log2(min(max(value, 1.0), LONGEST_US)) * BUCKETS_PER_OCTAVE)] += 1
+        self._buckets[math.ceil(min(math.log2(max(value, 1.0)), OCTAVES) * BUCKETS_PER_OCTAVE)] += 1
 
     def quantile(self, share: float) -> float | None:
         """Return the upper edge of the bucket that holds the `share`-th value; None without values."""
@@ -48,6 +45,21 @@ class Histogram:
         wanted = max(1, math.ceil(share * self.count))
         index = bisect_left(list(accumulate(self._buckets)), wanted)
         return min(2.0 ** (index / BUCKETS_PER_OCTAVE), self.max)
+
+
+@dataclass(slots=True)
+class _Course:
+    """Course of one sensor: its scans, and the newest results that were zeroed, and that came nearest to a pattern."""
+
+    first_ns: int
+    farthest: Result
+    zeroed: Result | None = None
+    last_ns: int = 0
+    scans: int = 0
+
+    @property
+    def duration_ns(self) -> int:
+        return self.last_ns - self.first_ns
 
 
 @dataclass
@@ -75,9 +87,7 @@ class Statistics:
     model_patterns: dict[str, int] = field(default_factory=dict)
     run_time_us: Histogram = field(default_factory=Histogram)
     latency_us: Histogram = field(default_factory=Histogram)
-    _spans: "dict[str, _Span]" = field(default_factory=dict)
-    _zeroed: dict[str, Result] = field(default_factory=dict)
-    _farthest: dict[str, Result] = field(default_factory=dict)
+    _sensors: dict[str, _Course] = field(default_factory=dict)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
@@ -100,16 +110,15 @@ class Statistics:
             self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
         if result.latency_us is not None:
             self.latency_us.add(result.latency_us)
+        course = self._sensors.get(scan.sensor)
+        if course is None:
+            course = self._sensors[scan.sensor] = _Course(scan.time_ns, result)
+        course.scans += 1
+        course.last_ns = scan.time_ns
         if result.baseline is not None:
-            self._zeroed[scan.sensor] = result
-        before = self._farthest.get(scan.sensor)
-        if before is None or STAGES.index(result.state) >= STAGES.index(before.state):
-            self._farthest[scan.sensor] = result
-        span = self._spans.get(scan.sensor)
-        if span is None:
-            span = self._spans[scan.sensor] = _Span(scan.time_ns)
-        span.last_ns = scan.time_ns
-        span.scans += 1
+            course.zeroed = result
+        if STAGES.index(result.state) >= STAGES.index(course.farthest.state):
+            course.farthest = result
 
     def tell(self, event: Event) -> None:
         """Count one event."""
@@ -117,15 +126,19 @@ class Statistics:
 
     def scans_of_each(self) -> dict[str, int]:
         """Return the number of scans of each sensor; any thread may call it."""
-        return {name: span.scans for name, span in list(self._spans.items())}
+        return {name: course.scans for name, course in list(self._sensors.items())}
 
     def rate_hz(self) -> dict[str, float]:
         """Return the scans a second of each sensor over the whole run, for sensors with two or more."""
-        return {name: rate_hz for name, span in self._spans.items() if (rate_hz := span.rate_hz()) is not None}
+        return {
+            name: (course.scans - 1) * 1e9 / course.duration_ns
+            for name, course in self._sensors.items()
+            if course.duration_ns > 0
+        }
 
     def duration_s(self) -> float:
         """Return the longest time from the first scan to the last of any sensor, in [s]."""
-        return max((span.duration_ns for span in self._spans.values()), default=0) / 1e9
+        return max((course.duration_ns for course in self._sensors.values()), default=0) / 1e9
 
     def summary(self, *, source: str, wanted_rate_hz: float | None = None) -> str:
         """Return the run in a few lines, with the source as the user names it, and the requested rate."""
@@ -143,15 +156,16 @@ class Statistics:
         rates = [
             f"{rate_hz:.1f} Hz (sensor {name})"
             for name, rate_hz in sorted(self.rate_hz().items())
-            if self._spans[name].duration_ns >= SHORTEST_NS
+            # The first scans have waited for the model and come at once: over less time 100 Hz looks like 135.
+            if self._sensors[name].duration_ns >= 1e9
         ]
         if rates:
             wanted = f", {wanted_rate_hz:g} Hz asked for" if wanted_rate_hz is not None else ""
             lines.append(f"rate held: {', '.join(rates)}{wanted}")
         lines += [
             f"sensor {name}: {result.baseline_text()}, from {result.baseline.origin}{_drift_text(result.drift)}"
-            for name, result in sorted(self._zeroed.items())
-            if result.baseline is not None
+            for name, course in sorted(self._sensors.items())
+            if (result := course.zeroed) is not None and result.baseline is not None
         ]
         received = self.poses + self.poses_refused + self.poses_dropped
         if received:
@@ -173,12 +187,15 @@ class Statistics:
     def _without_pattern(self) -> list[str]:
         """Return why sensors had no pattern; one without contact is listed only if no sensor had a pattern."""
         lines: list[str] = []
-        for name, result in sorted(self._farthest.items()):
+        for name, course in sorted(self._sensors.items()):
+            result = course.farthest
             why = {
                 "zeroing": f"not zeroed, {result.note or 'too few scans'}; or pass --baseline, of the free pad",
                 "incomplete": result.note or "a taxel was not received",
                 "baseline_in_doubt": result.note,
-                "idle": None if self.patterns else NO_CONTACT,
+                "idle": None
+                if self.patterns
+                else "no contact: its readings never reached --contact-on-counts over the baseline",
                 "dropped": "newer scans overtook all that were in contact",
             }.get(result.state)
             believed = " to be believed" if result.state == "baseline_in_doubt" else ""
@@ -194,16 +211,54 @@ def _drift_text(drift: Drift | None) -> str:
     return f"; drifted since by x {x:.0f}, y {y:.0f}, z {z:.0f} counts"
 
 
-class _Span:
-    """Time from a sensor's first scan to its last, and how many there were."""
+_MESSAGES: Final = {
+    "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
+    "foreign_sensor": "their sensors are of another pad: --id-map",
+    "bad_sensor": "the counts of their sensors are not those of a pad",
+    "bad_json": "they are no JSON: another server answers at this address",
+    "bad_sequence": "they have no number: another server answers at this address",
+    "too_long": "they are too long: another server answers at this address",
+    "duplicate_keys": "their keys are not unique: another server answers at this address",
+    "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
+}
+"""Reasons why messages of a server gave no reading, by their counters."""
 
-    def __init__(self, first_ns: int) -> None:
-        self._first_ns = self.last_ns = first_ns
-        self.scans = 0
 
-    @property
-    def duration_ns(self) -> int:
-        return self.last_ns - self._first_ns
-
-    def rate_hz(self) -> float | None:
-        return (self.scans - 1) * 1e9 / self.duration_ns if self.duration_ns > 0 else None
+def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int]]) -> str:
+    """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
+    source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
+    doctor = f"edge-sr doctor{source} shows what is wrong"
+    arrived = counters()
+    frames, received, messages = (arrived.get(name, 0) for name in ("frames", "received_bytes", "messages"))
+    if messages:
+        why = max(_MESSAGES, key=lambda name: arrived.get(name, 0))
+        if arrived.get(why, 0):
+            return f"{messages} messages came from the server, and no reading in them: {_MESSAGES[why]}; {doctor}"
+        return f"{messages} messages came from the server, and no whole scan in them; {doctor}"
+    if frames:
+        came = "none of a taxel: another kind of pad (--id-map), or another bus"
+        if arrived.get("readings", 0):
+            came = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
+        return f"{frames} CAN frames came, and {came}; {doctor}"
+    bad, binary = arrived.get("bad_lines", 0), arrived.get("non_ascii_lines", 0)
+    # An adapter that was reset may send one line without a CAN frame; bytes of no line are those of four long ones.
+    if bad + binary >= 4 or arrived.get("skipped_bytes", 0) >= 120:
+        what = "text of another device (a modem, a GPS receiver)"
+        if not bad + binary:
+            what = "no line that ends as an adapter's: another device, such as one whose lines end with LF alone"
+        elif binary > bad:
+            what = "no text: another line speed than the adapter's, or another device"
+        return (
+            f"{received} bytes came, and no CAN frame in them: {what}; edge-sr devices lists what is plugged in, and "
+            "@BAUD after the port sets a speed"
+        )
+    errors = sum(arrived.get(name, 0) for name in ("error_frames", "fd_frames"))
+    if errors:
+        return (
+            f"{errors} error frames or frames of CAN FD came, and no reading: the bus runs at another bitrate than "
+            f"1 Mbit/s, or lacks its termination; {doctor}"
+        )
+    if arrived.get("refusals", 0):
+        return f"the adapter refused {arrived['refusals']} commands, and sent no CAN frame; {doctor}"
+    came = f"{received} bytes came, the adapter's answers alone" if received else "nothing came"
+    return f"{came}: is the sensor powered and its cable in? {doctor}"

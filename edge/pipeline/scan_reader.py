@@ -6,7 +6,7 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Final, Protocol, Self
@@ -23,9 +23,6 @@ from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
-UNASKED_S: Final = 0.01
-"""Time between two reads of several links, in [s], until another pace is asked for: while a model loads nobody needs
-their scans at once, and reading frame by frame would slow that down until the kernel had no room for more."""
 
 
 class Reading(Protocol):
@@ -69,14 +66,9 @@ class Source:
         rate_hz: float | None = None,
         force: bool = False,
     ) -> None:
-        """Prepare to read links that are not open yet.
+        """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        Args:
-            links: one or more, opened and closed by this source.
-            capacity_scans: number of scans that may wait.
-            sensor_file: properties of the sensors; empty by default.
-            rate_hz: of each sensor, in [Hz].
-            force: use on a device also properties that the sensor file has from an emulated sensor.
+        With `force` a device also gets properties that the sensor file has from an emulated sensor.
 
         Raises:
             SourceError: some are emulated and some are not: results of both kinds must not be mixed.
@@ -101,7 +93,6 @@ class Source:
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
-        self._sleepers: dict[object, Callable[[], None]] = {}
         self._capacity_scans = capacity_scans
         self._through = False
         self._stop = threading.Event()
@@ -236,29 +227,13 @@ class Source:
             self._failed.result()
         return None
 
-    async def wait_async(self, timeout_s: float) -> None:
-        """Return once something waits, or no more will come, or after `timeout_s`; other tasks run meanwhile."""
-        import asyncio
-
-        loop, woken = asyncio.get_running_loop(), asyncio.Event()
-
-        def wake() -> None:
-            try:
-                loop.call_soon_threadsafe(woken.set)
-            except RuntimeError:  # the loop was closed, and its task will never go on
-                self._sleepers.pop(woken, None)
-
-        with self._lock:
-            if self._through or not self._bell.empty():
-                return
-            self._sleepers[woken] = wake
-        try:
-            async with asyncio.timeout(timeout_s):
-                await woken.wait()
-        except TimeoutError:
-            pass
-        finally:  # without the lock: a forgotten task ends wherever it is collected, also in a thread that holds it
-            self._sleepers.pop(woken, None)
+    def wait(self, timeout_s: float) -> None:
+        """Return once something waits, or no more will come, or after `timeout_s`."""
+        if self.patient or self._through:
+            return
+        with suppress(Empty):
+            self._bell.get(timeout=timeout_s)
+            self._bell.put(None)
 
     def _open_links(self) -> None:
         with ExitStack() as opening:
@@ -272,8 +247,10 @@ class Source:
         atexit.register(self.close)
 
     def _begin_reading(self) -> None:
+        # Until another pace is asked for, a model loads, and nobody needs the scans at once: reading several links by
+        # frames would slow that down until the kernel had no room for more.
         if len(self._links) > 1:
-            self.pace = Pace(UNASKED_S)
+            self.pace = Pace(0.01)
         for link in self._links:
             reading, thread = _started("scan-reader", partial(self._follow, link))
             self._threads.append(thread)
@@ -322,7 +299,7 @@ class Source:
     def _put(self, notices: Sequence[Notice | TimedPose], scans: Sequence[Scan]) -> None:
         with self._lock:
             if not self._waiting:
-                self._ring()
+                self._bell.put(None)
             self._waiting += notices
             for scan in scans:
                 if len(self._waiting) >= self._capacity_scans:
@@ -337,12 +314,7 @@ class Source:
         with self._lock:
             self._reading -= 1
             if not self._reading:
-                self._ring()
-
-    def _ring(self) -> None:
-        self._bell.put(None)
-        for wake in tuple(self._sleepers.values()):
-            wake()
+                self._bell.put(None)
 
     def _make_room(self) -> None:
         """Discard the oldest scan; notices keep their place, since they part the scans before from those after."""

@@ -10,9 +10,15 @@ from edge.inference.bundled import demo_recording
 from firmware_bridge.errors import SensorFileError, harmless
 from firmware_bridge.links.base import Link, SourceKind
 from firmware_bridge.links.registry import DEMO_LOOP, open_sources
+from firmware_bridge.pad_geometry import PADS, SensorGeometry
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, ModelMap
 from firmware_bridge.sensor_file.model import PARTS, SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, load_baselines
+
+
+def unmapped(pad: SensorGeometry) -> str | ModelMap:
+    """Return the id map of a pad whose ids are not needed, as in a recording."""
+    return pad.name if pad in PADS else ModelMap(pad.name, pad, {})
 
 
 def sensor_settings(sensor: str | Path | None, id_map: str | ModelMap | None) -> SensorFile:

@@ -1,6 +1,7 @@
 """Wire of an slcan adapter besides frames: time stamps and status."""
 
 import os
+import time
 
 import pytest
 from bridge_samples import make_recording, read_scans

@@ -76,22 +76,6 @@ class TestSession:
             assert (session.deviation is None) == (factor is None)
 
     @pytest.mark.parametrize(
-        ("graph", "message"),
-        [
-            ({"pad_name": "gel"}, r"window .*, gel tensor\(float\) \[1, 5\], but .* pad tensor\(float\) \[1, 5\]"),
-            ({"pad_width": 4}, r"pad tensor\(float\) \[1, 4\], but .* pad tensor\(float\) \[1, 5\]"),
-            ({"pad_width": 0}, r"input is window tensor\(float\) \[1, 12, 4, 4\], but .* pad tensor"),
-            ({"with_traction": False}, r"pattern [^,]*, 40, 40\], but .* traction tensor\(float\) \[1, 3, 8, 8\]"),
-            ({"contract": make_contract(), "pad_width": 5}, r"pad tensor\(float\) \[1, 5\], .* states window [^p]*$"),
-            ({"contract": make_contract(), "with_traction": True}, r"traction tensor\(float\) \[1, 3, 4, 4\], but"),
-            ({"metadata": make_pad_contract(traction_scale=3).to_metadata()}, r"3, 8, 8\], but .*\[1, 3, 12, 12\]"),
-        ],
-    )
-    def test_a_graph_that_breaks_its_contract_is_refused(self, tmp_path, graph, message):
-        with pytest.raises(ModelError, match=message):
-            ModelSession(write_model(tmp_path / "graph.onnx", **({"contract": make_pad_contract()} | graph)))
-
-    @pytest.mark.parametrize(
         "pad", [row(0, 0, 0, 0), np.zeros(5), np.full(5, np.nan, np.float32), np.zeros((1, 5), np.float32)]
     )
     def test_a_pad_that_no_contract_gave_is_refused(self, tmp_path, pad):

@@ -15,7 +15,7 @@ from edge_samples import BASELINE, ROOT
 from edge.cli import main as cli
 from edge.inference.bundled import demo_recording, find_model
 from edge.inference.contract import KEY_PREFIX, Contract
-from edge.perception.pattern_check import REASONS
+from edge.perception.result import REASONS
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import GAINS, PAD_RANGES, Pad

@@ -12,9 +12,8 @@ from onnx import numpy_helper
 from edge.errors import ModelError
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
-from edge.inference.contract import Contract
+from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from edge.inference.pose_input import scheduled_rows
 from export.errors import ParityError
 from export.parity import (
     LEVELS,

@@ -13,7 +13,7 @@ import pytest
 
 from edge.cli import main as cli
 from edge.cli.listings import NOTHING, SERVER_HINT
-from edge.pipeline.silence_hint import silence_hint
+from edge.pipeline.run_statistics import silence_hint
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices
 from firmware_bridge.links import gs_usb_devices

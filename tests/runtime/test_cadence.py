@@ -46,8 +46,10 @@ def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
 
 
 def test_a_pattern_is_late_after_one_period_and_not_before():
-    cadence = followed([10] * 9)
-    assert not cadence.late(10_000) and cadence.late(10_000.001) and not Cadence().late(1e9)
+    cadences = Cadences()
+    for number in range(9):
+        cadences.follow(scan(number, 10 * number))
+        assert cadences.late("4", 10_000.001) == (number >= FEWEST_INTERVALS) and not cadences.late("4", 10_000)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from edge.api import USPA44, EdgeError, SensorFileError, Source, Stream
 from edge.cli import main as cli
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, GainFollower, Learn, SensorPad
+from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, Learn, SensorPad
 from edge.perception.gain_learning import BOUND, ContactModel, GainLearner, load_contact_model
 from edge.perception.pattern_check import PatternCheck
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
@@ -142,45 +142,50 @@ class TestLearner:
             load_contact_model(tmp_path / "c.npz")
 
 
-class TestFollower:
+def learning_of(measured, used=None, check=None):
+    """Return the stage of a sensor that learns, the pad in use, and the events that it reports."""
+    pad, events = SensorPad(make_pad_contract(), used or measured, None, check), []
+    return Learn(MODEL, measured, used, pad, check, lambda kind, detail="": events.append((kind, detail))), pad, events
+
+
+def held(learn, contact, trusted=None):
+    """Return whether another pad is in use after a scan of a contact."""
+    step, made = SimpleNamespace(force_counts=5000.0), SimpleNamespace(trusted=trusted)
+    return learn(step, made, contact, ALL_ALIVE)
+
+
+class TestStage:
     @pytest.mark.parametrize(
         ("seed_in_file", "count", "contradicted"),
         [(9, 60, True), (2, 60, False), (9, CONTRADICTED_CONTACTS - 1, False)],
     )
     def test_gains_of_another_sensor_are_contradicted_once(self, seed_in_file, count, contradicted):
         file = Pad(gains=tuple(draw_gains(seed_in_file)), gain_half_widths=(0.03,) * GAINS)
-        contract, events = make_pad_contract(), []
-        check = PatternCheck(make_trust(), contract)
-        pad = SensorPad(contract, file, None, check)
-        learn = Learn(GainFollower(MODEL, file), pad, check, lambda kind, detail="": events.append((kind, detail)))
-        step, made = SimpleNamespace(force_counts=5000.0), SimpleNamespace(trusted=None)
+        check = PatternCheck(make_trust(), make_pad_contract())
+        learn, _, events = learning_of(file, file, check)
         for contact in draw_contacts(count, draw_gains()):
-            learn(step, made, contact, ALL_ALIVE)
+            held(learn, contact)
             learn.learn(ALL_ALIVE)
         suspected = [text for kind, text in events if kind == "suspected"]
         assert check.suspected == contradicted == len(suspected)
         assert not contradicted or ("another sensor's file" in suspected[0] and events[-1][0] == "suspected")
 
-    def test_what_was_learned_before_is_used_at_first(self):
-        true = draw_gains()
-        learned = taught(draw_contacts(120, true)).pad()
-        follower = GainFollower(MODEL, None, learned)
-        for contact in draw_contacts(60, true, seed=5):
-            follower.see(None, 5000.0, contact)
-            pad = follower.learn(ALL_ALIVE)
-            assert pad is None or pad.gains_certainty >= learned.gains_certainty
-        fresh = GainFollower(MODEL, None)
-        assert follower.learned.gains_certainty < learned.gains_certainty, "it is no beginning"
-        assert np.allclose(fresh.learned.gains, 1)
+    def test_what_was_learned_before_is_used_at_first_and_is_no_beginning(self):
+        learned = taught(draw_contacts(120, draw_gains())).pad()
+        learn, pad, _ = learning_of(None, learned)
+        for contact in draw_contacts(60, draw_gains(), seed=5):
+            held(learn, contact)
+            assert not learn.learn(ALL_ALIVE), "half as many contacts are less certain"
+        assert pad.gains_certainty == learned.gains_certainty and learn.take_learned() is None
 
     def test_an_untrusted_scan_teaches_nothing(self):
-        follower, contact = GainFollower(MODEL, None), draw_contacts(1)[0]
+        (learn, _, _), contact = learning_of(None), draw_contacts(1)[0]
         for _ in range(2 * HELD_SCANS):
-            assert not follower.see(False, 5000.0, contact)
-        assert not follower.waiting
+            assert not held(learn, contact, trusted=False)
+        assert not learn.waiting
         for trusted in (None, False):
-            assert not follower.see(trusted, 5000.0, contact)
-            assert follower.waiting == (trusted is None)
+            held(learn, contact, trusted)
+            assert learn.waiting == (trusted is None)
 
 
 def scans_of(contacts, noise=0.0, holds=1):

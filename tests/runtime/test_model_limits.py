@@ -16,8 +16,8 @@ from onnx import helper, numpy_helper
 
 from edge.api import ModelError, bundled_models, save_baselines
 from edge.cli import main as cli
+from edge.inference import onnx_guard as loading
 from edge.inference import onnx_session as session
-from edge.inference import timed_loading as loading
 from edge.inference.onnx_guard import OPERATORS, check_plain
 from edge.inference.onnx_session import ModelSession, load_session
 

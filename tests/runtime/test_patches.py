@@ -8,7 +8,7 @@ from edge_samples import make_contract, make_scan
 from scipy import ndimage
 
 from edge.api import Patch, PatchEvents, Result, patches
-from edge.perception.wrench import wrench_of
+from edge.perception.pattern_description import wrench_of
 
 CONTRACT = make_contract(scale=10, contact_level=0.5)
 PIXEL_MM = 0.47

@@ -1,19 +1,19 @@
-"""Model that takes poses, in the runtime and alone: which taps a pattern is made from, and with which poses."""
+"""Model that takes poses, in the runtime and alone: which taps a pattern is made from, and where to touch next."""
 
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, inferred, write_model
+from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, inferred
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
 
-from edge.api import PadPose, UsageError, WindowError
+from edge.api import USPA44, PadPose, UsageError
+from edge.inference.contract import pose_rows, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from edge.inference.pose_input import pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
+from edge.perception.taps import next_shift_mm
 
 POSES = [PadPose(0, 0, 0), PadPose(2, 1, 5, 0.1, 2), PadPose(3, -1, 90, 0.3, 0.5)]
 
@@ -224,90 +224,70 @@ class TestChecks:
         assert settled.poses[:, 0].tolist() == [0, 2, 1] and settled.taps_dropped == 0
         assert pad.kinds == ["tap_dropped"]
 
-    def test_taps_of_the_schedule_go_with_a_later_stranger(self):
-        # Without poses every tap lies at 0 mm, so that a limit below that drops them all.
-        pad = make_pad(make_checked_contract(make_posed_trust(-1.0)), taps=3)
-        for _ in range(5):
-            pad.tap()
-        result = pad.push(PRESS)
-        assert (result.taps_used, result.taps_dropped, len(result.window)) == (1, 1, 1)
-        assert pad.push(PRESS).tap_mismatch is None, "they are forgotten for good"
+
+HALF_MM = USPA44.pitch_mm / 2
+REACH_MM = 6.0
+SURE = make_posed_contract(interval_factor=1.6)
 
 
-def random_taps(taps, seed=0):
-    """Return a window and its poses."""
-    rng = np.random.default_rng(seed)
-    poses = rng.normal(size=(taps, 5)).astype(np.float32)
-    poses[0] = 0
-    return rng.normal(size=(taps, 3, 4, 4)).astype(np.float32), poses
+def test_an_earlier_tap_is_not_touched_again_and_in_reach():
+    assert next_shift_mm(np.array([[0.0, 0.0], [HALF_MM + 0.3, -0.2]]), REACH_MM) not in (None, (HALF_MM, 0.0))
+    shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
+    assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
+    assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
 
 
-class TestSession:
-    def test_any_number_of_taps_runs_in_any_order(self, session):
-        for taps in range(1, 8):
-            window, poses = random_taps(taps)
-            np.testing.assert_allclose(session.run(window, poses=poses), posed_pattern(window, poses), atol=1e-5)
-            for count in range(1, 8):  # and of any number of pads, more shapes than arrays are kept for
-                windows, rows = zip(*[random_taps(taps, seed) for seed in range(count)], strict=True)
-                made = session.run_together(windows, None, rows)
-                np.testing.assert_allclose(made[-1], posed_pattern(windows[-1], rows[-1]), atol=1e-5)
-        window, poses = random_taps(4)
-        expected = session.run(window, poses=poses).copy()
-        for order in permutations((1, 2, 3)):
-            again = [0, *order]
-            np.testing.assert_allclose(session.run(window[again], poses=poses[again]), expected, atol=1e-5)
+def test_a_robot_that_follows_touches_no_place_twice():
+    pad, places = make_pad(SURE, idle_reset_s=0.2), set()
+    pose = begun = PadPose(5, -3, 30)
+    for _ in range(4):
+        assert pad.tap(pose).next_tap is None
+        proposed = pad.results[-1].next_tap
+        seen = pose.seen_from(begun)
+        places.add((round(seen.x_mm / HALF_MM, 6), round(seen.y_mm / HALF_MM, 6)))
+        seen = proposed.target.seen_from(pose)
+        assert (seen.x_mm, seen.y_mm, seen.turn_deg) == pytest.approx((proposed.dx_mm, proposed.dy_mm, 0), abs=1e-9)
+        pose = proposed.target
+    assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
 
-    @pytest.mark.parametrize("batch", ["any", 1])
-    def test_windows_of_several_lengths_run_together(self, tmp_path, batch):
-        contract = make_posed_contract(batch=batch, interval_factor=1.6)
-        session = ModelSession(write_posed_model(tmp_path / "several.onnx", contract))
-        for lengths in ((4, 1, 7), (1, 3, 2), (4, 7, 1)):  # the last ones are where others lay before
-            taps = [random_taps(length, seed) for seed, length in enumerate(lengths)]
-            windows, poses = zip(*taps, strict=True)
-            together = session.run_together(windows, None, poses).copy()
-            deviations = session.deviation.copy()
-            for index, (window, rows) in enumerate(taps):
-                np.testing.assert_allclose(together[index], posed_pattern(window, rows), atol=1e-5)
-                session.run(window, poses=rows)
-                np.testing.assert_allclose(deviations[index], session.deviation, atol=1e-6)
 
-    def test_without_poses_taps_follow_the_schedule(self, session):
-        window, _ = random_taps(4)
-        poses = scheduled_rows(4, 5.0)
-        assert poses[:, 2].tolist() == [0, 5, 10, 15]
-        np.testing.assert_allclose(poses[1:, 3:], [[0.2, 1.0]] * 3)
-        for present in (4, 2):
-            window[present:] = poses[present:] = 0
-            np.testing.assert_array_equal(session.run(window).copy(), session.run(window, poses=poses))
-        assert scheduled_rows(5, 100.0)[:, 2].tolist() == [0, 100, -160, -60, 40], "within half a turn"
+def test_it_stays_until_the_next_tap_or_an_idle_time():
+    pad = make_pad(SURE, idle_reset_s=0.2)
+    pad.tap(PadPose(0, 0))
+    proposed = pad.results[-1].next_tap
+    assert pad.push().next_tap is proposed is not None
+    assert pad.push(PRESS).next_tap is None
+    pad.tap(PadPose(1, 0))
+    assert pad.push().next_tap is not None
+    assert [pad.push().next_tap for _ in range(30)][-1] is None
 
-    def test_poses_become_the_newest_taps_view_with_both_errors(self):
-        rows = pose_rows([PadPose(10, 5, 90, 0.3, 3), PadPose(10, 7, 85, 0.4, 4)])
-        assert not rows[0].any() and rows.dtype == np.float32
-        np.testing.assert_allclose(rows[1], [2, 0, -5, 0.5, 5], atol=1e-6)
 
-    @pytest.mark.parametrize(
-        ("window", "poses", "match"),
-        [
-            ((8, 3, 4, 4), (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
-            ((0, 3, 4, 4), (0, 5), r"window is \(0, 3, 4, 4\)"),
-            ((2, 3, 4, 5), (2, 5), r"window is \(2, 3, 4, 5\)"),
-            ((2, 3, 4, 4), (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
-            ((2, 3, 4, 4), (2, 3), r"poses are \(2, 3\) float32, expected \(2, 5\)"),
-        ],
-    )
-    def test_shapes_that_do_not_fit_are_refused_with_both(self, session, window, poses, match):
-        with pytest.raises(WindowError, match=match):
-            session.run(np.zeros(window, dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
+def test_it_is_from_the_strongest_scan_since_a_reset():
+    pad = make_pad(SURE, idle_reset_s=0.2)
+    for press, x_mm in ((0.6 * PRESS, 1), (PRESS, 2), (0.8 * PRESS, 3)):
+        pad.place(PadPose(x_mm, 0))
+        pad.push(press)
+    proposed = pad.push().next_tap
+    assert proposed.target.x_mm - proposed.dx_mm == pytest.approx(2)
+    pad.push(PRESS)
+    pad.runtime.reset()
+    pad.place(PadPose(5, 0))
+    assert [pad.push(share * PRESS).taps_used for share in (0.8, 0.7)] == [1, 1]
+    proposed = pad.push().next_tap
+    assert proposed is not None and proposed.target.x_mm - proposed.dx_mm == pytest.approx(5)
 
-    def test_poses_that_mean_nothing_are_refused(self, session, tmp_path):
-        window, poses = random_taps(2)
-        with pytest.raises(WindowError, match=r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"):
-            session.run(window, poses=poses + 1)
-        with pytest.raises(WindowError, match="poses have values that are not finite"):
-            session.run(window, poses=np.where(poses == 0, poses, np.float32(np.nan)))
-        with pytest.raises(WindowError, match=r"poses are \(2, 5\) float64"):
-            session.run(window, poses=poses.astype(float))
-        session = ModelSession(write_model(tmp_path / "tiny.onnx"))
-        with pytest.raises(WindowError, match="poses are given, but model 'tiny' takes none: leave them out"):
-            session.run(np.zeros((4, 3, 4, 4), np.float32), poses=np.zeros((4, 5), np.float32))
+
+@pytest.mark.parametrize("lacking", ["a pose", "trust", "a further tap"])
+def test_nothing_is_proposed_without_what_it_needs(lacking):
+    checked = make_checked_contract(make_posed_trust(2.5))
+    pad = make_pad(checked if lacking == "trust" else SURE, taps=1 if lacking == "a further tap" else None)
+    if lacking != "a pose":
+        pad.place(PadPose(0, 0))
+    pressed = REST.copy()
+    pressed[2, 1, 1] += PRESS
+    pressed[0, 0, 0] += PRESS  # which is unfamiliar to the checks
+    for counts in (pressed, pressed, REST):
+        scan = pad.scan()
+        scan.counts[...] = counts
+        result = pad.runtime.push(scan)
+    assert result.state == "idle" and result.next_tap is None

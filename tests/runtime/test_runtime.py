@@ -12,7 +12,7 @@ from runtime_samples import PRESS, Pushed, make_runtime
 from edge.api import Baseline, UsageError, WindowError
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.pattern_stages import touched, touched_patch
+from edge.perception.pattern_description import touched, touched_patch
 from firmware_bridge.scans.mounting import Mounting
 
 SURE = make_contract(interval_factor=1.6)
@@ -53,25 +53,6 @@ class TestResult:
         assert result.deviation is not None and result.interval_mm is result.centroid_mm is None
         assert result.area_mm2 == 0
 
-    def test_without_contact_nothing_is_inferred_or_dropped(self):
-        model = FakeModel(SURE)
-        for infer in (True, False):
-            result = make_runtime(model).push(make_scan(), infer=infer)
-            assert (result.state, result.contact, result.taps_used, result.force_counts) == ("idle", False, 0, 0.0)
-        for name in ("pattern", "deviation", "area_mm2", "centroid_mm", "run_time_us", "force_n"):
-            assert getattr(result, name) is None
-        assert model.windows == []
-
-    def test_input_is_scaled_by_the_contract_newest_tap_first(self):
-        model = FakeModel()
-        pad = Pushed(make_runtime(model))
-        for press in (2000, 5000, 0, 3000):
-            pad.push(press)
-        window = model.windows[-1]
-        assert window.shape == (4, 3, 4, 4) and window.dtype == np.float32
-        assert window[:, 2, 1, 1].tolist() == [3.0, 5.0, 0.0, 0.0]
-        assert not window[:, :2].any()
-
     def test_the_patch_is_weighted_and_leaves_out_what_is_below_the_level(self):
         pattern = np.zeros((40, 40), dtype=np.float32)
         pattern[1, [0, 1, 3]] = 0.49, 0.5, 1.0
@@ -98,18 +79,6 @@ class TestRefusals:
 
 
 class TestZeroing:
-    def test_a_hundred_whole_scans_give_a_baseline(self):
-        pad = Pushed(make_runtime(baselines=None), noise=4)
-        first = pad.push(PRESS, noise=0, absent=(3,))
-        assert first.state == "zeroing" and first.taps_used == 0
-        for name in ("contact", "pattern", "force_counts", "baseline", "baseline_age_s"):
-            assert getattr(first, name) is None
-        torn = [pad.push(absent=(3,) if number % 3 == 0 else ()).state for number in range(150)]
-        assert torn == ["zeroing"] * 149 + ["idle"], "torn ones do not count"
-        assert pad.results[-1].baseline.origin == "start-up"
-        result = pad.push(PRESS)
-        assert result.state == "contact" and result.force_counts == pytest.approx(PRESS, abs=20)
-
     def test_a_refused_baseline_is_noted_and_zeroing_starts_over(self):
         pad = Pushed(make_runtime(baselines=None), noise=4)
         notes = [pad.push(200 if number > 50 else 0).note for number in range(100)]

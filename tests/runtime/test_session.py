@@ -1,15 +1,18 @@
 """Session of a model: what it computes, which inputs and outputs it refuses, and which files are no model."""
 
+from itertools import permutations
+
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from edge_samples import make_contract, tiny_deviation, tiny_pattern, write_model
+from edge_samples import make_contract, make_pad_contract, tiny_deviation, tiny_pattern, write_model
 from onnx import TensorProto
-from pose_samples import make_posed_contract
+from pose_samples import make_posed_contract, posed_pattern, write_posed_model
 
+from edge.api import PadPose
 from edge.errors import ModelError, WindowError
-from edge.inference.contract import ANY_BATCH
+from edge.inference.contract import ANY_BATCH, pose_rows, scheduled_rows
 from edge.inference.onnx_session import ModelSession, session_options
 
 SURE = make_contract(interval_factor=1.6)
@@ -111,41 +114,54 @@ def test_one_thread_sequential_without_spinning():
     assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
 
 
+PAD = make_pad_contract()
+
+
 @pytest.mark.parametrize(
-    ("graph", "message"),
+    ("graph", "stated", "message"),
     [
-        ({"input_name": "input"}, r"graph input is input tensor\(float\) \[1, 12, 4, 4\], .* window tensor"),
-        ({"output_name": "out"}, r"graph output is out tensor\(float\) \[1, 40, 40\], .* pattern tensor"),
+        (make_contract(), make_contract(taps=2), r"input is window.*12, 4, 4.*contract states.*6, 4, 4"),
+        (make_contract(), make_contract(scale=5), r"output is pattern.*1, 40, 40.*contract states.*1, 20, 20"),
+        (make_contract(batch=ANY_BATCH), make_contract(), r"graph input is window tensor\(float\) \['any', 12, 4, 4\]"),
+        (make_contract(batch=2), make_contract(), r"graph input is window tensor\(float\) \[2, 12, 4, 4\]"),
+        (make_contract(batch=3), make_contract(batch=3), r"'batch' is 3, .*: export it again"),
+        (SURE, make_contract(), r", deviation tensor\(float\) \[1, 40, 40\], but .* states pattern [^,]*, 40, 40\]$"),
+        (make_contract(), SURE, r"output is pattern [^,]*, 40, 40\], but its contract states .*, deviation tensor"),
         (
-            {"with_deviation": True},
-            r"output is pattern .*, deviation tensor\(float\) \[1, 40, 40\], but .* states pattern [^,]*, 40, 40\]$",
-        ),
-        (
-            {"with_deviation": False, "contract": SURE},
-            r"output is pattern tensor\(float\) \[1, 40, 40\], but its contract states pattern .*, deviation tensor",
-        ),
-        ({"element_type": TensorProto.DOUBLE}, r"graph input is window tensor\(double\)"),
-        ({"input_shape": ["n", 12, 4, 4]}, r"graph input is window tensor\(float\) \['n', 12, 4, 4\]"),
-        ({"input_shape": [2, 12, 4, 4]}, r"graph input is window tensor\(float\) \[2, 12, 4, 4\]"),
-        (
-            {"metadata": make_contract(taps=2).to_metadata()},
-            r"input is window.*12, 4, 4.*contract states.*6, 4, 4",
-        ),
-        (
-            {"metadata": make_contract(scale=5).to_metadata()},
-            r"output is pattern.*1, 40, 40.*contract states.*1, 20, 20",
-        ),
-        (
-            {"metadata": make_posed_contract(taps=4, batch=1).to_metadata()},
+            make_contract(),
+            make_posed_contract(taps=4, batch=1),
             r"states window .*\[1, 'taps', 3, 4, 4\], poses tensor\(float\) \[1, 'taps', 5\]",
         ),
-        ({"contract": make_contract(batch=3)}, r"'batch' is 3, .*: export it again"),
-        ({"metadata": {}}, r"graph\.onnx: contract key 'version' is missing"),
+        (make_contract(), PAD, r"input is window tensor\(float\) \[1, 12, 4, 4\], but .* pad tensor\(float\) \[1, 5\]"),
+        (PAD, make_contract(), r"pad tensor\(float\) \[1, 5\], but .* states window [^p]*$"),
+        (
+            PAD,
+            make_pad_contract(takes_gains=False),
+            r"pad tensor\(float\) \[1, 5\], but .* pad tensor\(float\) \[1, 4\]",
+        ),
+        (PAD, make_pad_contract(traction_scale=None), r"traction tensor\(float\) \[1, 3, 8, 8\], but .*, 40, 40\]$"),
+        (PAD, make_pad_contract(traction_scale=3), r"3, 8, 8\], but .*\[1, 3, 12, 12\]"),
     ],
 )
-def test_a_graph_that_breaks_its_contract_is_refused_naming_what(tmp_path, graph, message):
+def test_a_graph_that_breaks_its_contract_is_refused_naming_what(tmp_path, graph, stated, message):
     with pytest.raises(ModelError, match=message):
-        ModelSession(write_model(tmp_path / "graph.onnx", **graph))
+        ModelSession(write_model(tmp_path / "graph.onnx", graph, metadata=stated.to_metadata()))
+
+
+def test_another_name_or_type_and_a_lack_of_a_contract_are_refused(tmp_path):
+    path = tmp_path / "graph.onnx"
+    with pytest.raises(ModelError, match=r"graph\.onnx: contract key 'version' is missing"):
+        ModelSession(write_model(path, metadata={}))
+    model = onnx.load(write_model(path))
+    window = model.graph.input[0]
+    window.type.tensor_type.elem_type = TensorProto.DOUBLE
+    onnx.save(model, path)
+    with pytest.raises(ModelError, match=r"graph input is window tensor\(double\)"):
+        ModelSession(path)
+    window.type.tensor_type.elem_type, window.name, model.graph.node[0].input[0] = TensorProto.FLOAT, "input", "input"
+    onnx.save(model, path)
+    with pytest.raises(ModelError, match=r"graph input is input tensor\(float\) \[1, 12, 4, 4\], .* window tensor"):
+        ModelSession(path)
 
 
 def test_no_file_a_directory_and_what_is_no_onnx_are_refused(tmp_path):
@@ -169,3 +185,86 @@ def test_a_model_of_a_newer_onnx_is_refused_with_what_to_do(tmp_path, ir, opset,
     remedy = rf"of a newer ONNX, {version}, than onnxruntime [\d.]+ reads: export it again .* or install a newer"
     with pytest.raises(ModelError, match=remedy):
         ModelSession(tmp_path / "new.onnx")
+
+
+def random_taps(taps, seed=0):
+    """Return a window and its poses."""
+    rng = np.random.default_rng(seed)
+    poses = rng.normal(size=(taps, 5)).astype(np.float32)
+    poses[0] = 0
+    return rng.normal(size=(taps, 3, 4, 4)).astype(np.float32), poses
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    return ModelSession(write_posed_model(tmp_path_factory.mktemp("posed") / "posed.onnx"))
+
+
+class TestPoses:
+    def test_any_number_of_taps_runs_in_any_order(self, posed):
+        for taps in range(1, 8):
+            window, poses = random_taps(taps)
+            np.testing.assert_allclose(posed.run(window, poses=poses), posed_pattern(window, poses), atol=1e-5)
+            for count in range(1, 8):  # and of any number of pads, more shapes than arrays are kept for
+                windows, rows = zip(*[random_taps(taps, seed) for seed in range(count)], strict=True)
+                made = posed.run_together(windows, None, rows)
+                np.testing.assert_allclose(made[-1], posed_pattern(windows[-1], rows[-1]), atol=1e-5)
+        window, poses = random_taps(4)
+        expected = posed.run(window, poses=poses).copy()
+        for order in permutations((1, 2, 3)):
+            again = [0, *order]
+            np.testing.assert_allclose(posed.run(window[again], poses=poses[again]), expected, atol=1e-5)
+
+    @pytest.mark.parametrize("batch", ["any", 1])
+    def test_windows_of_several_lengths_run_together(self, tmp_path, batch):
+        contract = make_posed_contract(batch=batch, interval_factor=1.6)
+        session = ModelSession(write_posed_model(tmp_path / "several.onnx", contract))
+        for lengths in ((4, 1, 7), (1, 3, 2), (4, 7, 1)):  # the last ones are where others lay before
+            taps = [random_taps(length, seed) for seed, length in enumerate(lengths)]
+            windows, poses = zip(*taps, strict=True)
+            together = session.run_together(windows, None, poses).copy()
+            deviations = session.deviation.copy()
+            for index, (window, rows) in enumerate(taps):
+                np.testing.assert_allclose(together[index], posed_pattern(window, rows), atol=1e-5)
+                session.run(window, poses=rows)
+                np.testing.assert_allclose(deviations[index], session.deviation, atol=1e-6)
+
+    def test_without_poses_taps_follow_the_schedule(self, posed):
+        window, _ = random_taps(4)
+        poses = scheduled_rows(4, 5.0)
+        assert poses[:, 2].tolist() == [0, 5, 10, 15]
+        np.testing.assert_allclose(poses[1:, 3:], [[0.2, 1.0]] * 3)
+        for present in (4, 2):
+            window[present:] = poses[present:] = 0
+            np.testing.assert_array_equal(posed.run(window).copy(), posed.run(window, poses=poses))
+        assert scheduled_rows(5, 100.0)[:, 2].tolist() == [0, 100, -160, -60, 40], "within half a turn"
+
+    def test_poses_become_the_newest_taps_view_with_both_errors(self):
+        rows = pose_rows([PadPose(10, 5, 90, 0.3, 3), PadPose(10, 7, 85, 0.4, 4)])
+        assert not rows[0].any() and rows.dtype == np.float32
+        np.testing.assert_allclose(rows[1], [2, 0, -5, 0.5, 5], atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("window", "poses", "match"),
+        [
+            ((8, 3, 4, 4), (8, 5), r"window is \(8, 3, 4, 4\) float32, expected \(1 to 7, 3, 4, 4\) float32"),
+            ((0, 3, 4, 4), (0, 5), r"window is \(0, 3, 4, 4\)"),
+            ((2, 3, 4, 5), (2, 5), r"window is \(2, 3, 4, 5\)"),
+            ((2, 3, 4, 4), (3, 5), r"poses are \(3, 5\) float32, expected \(2, 5\) float32: dx_mm, .* of each tap"),
+            ((2, 3, 4, 4), (2, 3), r"poses are \(2, 3\) float32, expected \(2, 5\)"),
+        ],
+    )
+    def test_shapes_that_do_not_fit_are_refused_with_both(self, posed, window, poses, match):
+        with pytest.raises(WindowError, match=match):
+            posed.run(np.zeros(window, dtype=np.float32), poses=np.zeros(poses, dtype=np.float32))
+
+    def test_poses_that_mean_nothing_are_refused(self, posed, session):
+        window, poses = random_taps(2)
+        with pytest.raises(WindowError, match=r"newest tap's pose is \[1.0, .*expected zeros: give poses as that tap"):
+            posed.run(window, poses=poses + 1)
+        with pytest.raises(WindowError, match="poses have values that are not finite"):
+            posed.run(window, poses=np.where(poses == 0, poses, np.float32(np.nan)))
+        with pytest.raises(WindowError, match=r"poses are \(2, 5\) float64"):
+            posed.run(window, poses=poses.astype(float))
+        with pytest.raises(WindowError, match="poses are given, but model 'tiny' takes none: leave them out"):
+            session.run(np.zeros((4, 3, 4, 4), np.float32), poses=np.zeros((4, 5), np.float32))

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
 from edge.api import USPA44, find_model, load_model
-from edge.inference.forward_model import features
-from edge.perception.wrench import LEAST_FORCE_N, Balance, wrench_of
+from edge.inference.trust import features
+from edge.perception.pattern_description import Balance, wrench_of
+from edge.perception.result import LEAST_FORCE_N
 from edge.sinks.mcap import McapSink
 from edge.sinks.ros2.cdr_messages import WRENCH_STAMPED, force_and_torque
 from edge.sinks.ros2.diagnostics import diagnose
@@ -97,13 +98,6 @@ def test_shear_is_never_scaled_beyond_what_pads_differ_by(press, off, most):
     for _ in range(300):
         force_n = wrench_of(balance(found, pattern, readings, 9, row), PIXEL_MM).force_n
     assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
-
-
-def test_each_contact_has_a_level_of_its_own(press):
-    balance, pattern, traction, readings, row, _ = press
-    for tap, off in enumerate([1.0, 0.7, 1.3]):
-        force_n = wrench_of(balance(traction * np.float32(off), pattern, readings, tap, row), PIXEL_MM).force_n
-        assert force_n[2] == pytest.approx(off * wrench_of(traction, PIXEL_MM).force_n[2])
 
 
 def test_where_nothing_presses_the_traction_stays(press):

@@ -15,7 +15,7 @@ from bridge_samples import write_npz
 from edge_samples import BASELINE, ROOT, make_contract, make_scan, wait_for, write_model
 
 from edge.cli import main as cli
-from edge.inference.timed_loading import unfinished_load
+from edge.inference.onnx_guard import unfinished_load
 from firmware_bridge.zeroing.baseline import save_baselines
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]

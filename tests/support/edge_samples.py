@@ -82,69 +82,49 @@ def write_model(
     contract: Contract | None = None,
     *,
     metadata: dict[str, str] | None = None,
-    input_name: str = INPUT_NAME,
-    output_name: str = OUTPUT_NAME,
-    with_deviation: bool | None = None,
     doubt: float = TINY_DOUBT,
-    input_shape: list | None = None,
-    element_type: int = TensorProto.FLOAT,
     gain: float = 1.0,
-    pad_name: str | None = None,
-    pad_width: int | None = None,
-    with_traction: bool | None = None,
 ) -> Path:
     """Write a real graph: every taxel's z becomes a square of pixels, a tenth as strong for each earlier tap.
 
-    The deviation, there if the contract has a factor for it unless asked otherwise, is `tiny_deviation`. A pad,
-    likewise, makes all stronger by `tiny_stiffness`; a traction, likewise, is the newest tap's x, y, z in squares.
+    The deviation, there if the contract has a factor for it, is `tiny_deviation`. A pad, likewise, makes all stronger
+    by `tiny_stiffness`; a traction, likewise, is the newest tap's x, y, z in squares.
     """
     contract = contract or make_contract()
-    with_deviation = contract.interval_factor is not None if with_deviation is None else with_deviation
-    with_traction = contract.traction_scale is not None if with_traction is None else with_traction
-    pad_width = contract.pad_width if pad_width is None else pad_width
-    pad_name = pad_name or PAD_NAME
-    taps, scale, traction_scale = contract.taps, contract.scale, contract.traction_scale or 1
+    pad_width, taps, scale, traction_scale = contract.pad_width, contract.taps, contract.scale, contract.traction_scale
     weights = np.zeros((3 * taps, 1, scale, scale), dtype=np.float32)
     for tap in range(taps):
         weights[3 * tap + 2] = gain * 10.0**-tap
-    newest = np.zeros((3 * taps, 3, traction_scale, traction_scale), dtype=np.float32)
-    newest[[0, 1, 2], [0, 1, 2]] = gain
-    batch = (input_shape or [contract.batch])[0]
-    shape = [batch, *contract.pattern_shape]
-    traction_shape = contract.traction_shape or (3, contract.rows, contract.cols)
     nodes = [
-        helper.make_node("Cast", [input_name], ["floats"], to=TensorProto.FLOAT),
+        helper.make_node("Cast", [INPUT_NAME], ["floats"], to=TensorProto.FLOAT),
         helper.make_node("ConvTranspose", ["floats", "weights"], ["soft"], strides=[scale, scale]),
         helper.make_node("Mul", ["soft", "stiffness"], ["squares"]),
-        helper.make_node("Squeeze", ["squares", "axis"], [output_name]),
+        helper.make_node("Squeeze", ["squares", "axis"], [OUTPUT_NAME]),
     ]
-    inputs = {input_name: (element_type, input_shape or list(contract.window_shape))}
-    outputs = {output_name: shape}
     if pad_width:
-        inputs[pad_name] = (TensorProto.FLOAT, [batch, pad_width])
         nodes[:0] = [
-            helper.make_node("Mul", [pad_name, "pad_weights"], ["weighed"]),
+            helper.make_node("Mul", [PAD_NAME, "pad_weights"], ["weighed"]),
             helper.make_node("ReduceSum", ["weighed", "axis"], ["stiffer"], keepdims=1),
             helper.make_node("Add", ["stiffer", "one"], ["stiff"]),
             helper.make_node("Unsqueeze", ["stiff", "last"], ["stiffness"]),
         ]
-    if with_deviation:
-        outputs[DEVIATION_NAME] = shape
+    if contract.interval_factor is not None:
         nodes += [
-            helper.make_node("Abs", [output_name], ["size"]),
+            helper.make_node("Abs", [OUTPUT_NAME], ["size"]),
             helper.make_node("Mul", ["size", "doubt"], ["doubted"]),
             helper.make_node("Add", ["doubted", "doubt"], [DEVIATION_NAME]),
         ]
-    if with_traction:
-        outputs[TRACTION_NAME] = [batch, *traction_shape]
+    constants = {}
+    if traction_scale is not None:
         strides = [traction_scale, traction_scale]
         nodes += [
             helper.make_node("ConvTranspose", ["floats", "newest"], ["forces"], strides=strides),
             helper.make_node("Mul", ["forces", "stiffness"], [TRACTION_NAME]),
         ]
-    constants = {
+        constants["newest"] = np.zeros((3 * taps, 3, *strides), dtype=np.float32)
+        constants["newest"][[0, 1, 2], [0, 1, 2]] = gain
+    constants |= {
         "weights": weights,
-        "newest": newest,
         "axis": np.array([1]),
         "last": np.array([2, 3]),
         "one": np.array([[1]], dtype=np.float32),
@@ -152,18 +132,17 @@ def write_model(
         "doubt": np.array(doubt, dtype=np.float32),
         **({} if pad_width else {"stiffness": np.ones((1, 1, 1, 1), dtype=np.float32)}),
     }
-    return save_graph(path, nodes, inputs, outputs, constants, contract.to_metadata() if metadata is None else metadata)
+    return save_graph(path, nodes, contract, constants, contract.to_metadata() if metadata is None else metadata)
 
 
-def save_graph(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict, metadata: dict) -> Path:
-    """Write a graph of nodes: inputs by name as type and shape, outputs as shape, constants as array."""
-    graph = helper.make_graph(
-        nodes,
-        "tiny",
-        [helper.make_tensor_value_info(name, kind, list(of)) for name, (kind, of) in inputs.items()],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, of) for name, of in outputs.items()],
-        [numpy_helper.from_array(values, name) for name, values in constants.items()],
+def save_graph(path: Path, nodes: list, contract: Contract, constants: dict, metadata: dict) -> Path:
+    """Write a graph of nodes with the inputs and outputs of a contract; constants are arrays by name."""
+    inputs, outputs = (
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, list(shape)) for name, shape in shapes.items()]
+        for shapes in (contract.input_shapes, contract.output_shapes)
     )
+    weights = [numpy_helper.from_array(values, name) for name, values in constants.items()]
+    graph = helper.make_graph(nodes, "tiny", inputs, outputs, weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
     helper.set_model_props(model, metadata)
     onnx.save(model, path)

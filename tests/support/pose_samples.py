@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from edge_samples import FakeModel, make_contract, save_graph, tiny_deviation, tiny_traction
-from onnx import TensorProto, helper
+from onnx import helper
 
 from edge.inference.contract import (
     ANY_BATCH,
@@ -33,7 +33,7 @@ def posed_pattern(window: np.ndarray, poses: np.ndarray, scale: int = 10) -> np.
 def write_posed_model(path: Path, contract: Contract | None = None, **properties: str) -> Path:
     """Write the graph; `properties` replace keys of its metadata."""
     contract = contract or make_posed_contract()
-    scale, shape = contract.scale, [contract.batch, *contract.pattern_shape]
+    scale = contract.scale
     nodes = [
         helper.make_node("Mul", [POSES_NAME, "weights"], ["weighed"]),
         helper.make_node("ReduceSum", ["weighed", "numbers"], ["sum"], keepdims=0),
@@ -45,9 +45,7 @@ def write_posed_model(path: Path, contract: Contract | None = None, **properties
         helper.make_node("ConvTranspose", ["whole", "square"], ["squares"], strides=[scale, scale]),
         helper.make_node("Squeeze", ["squares", "taps"], [OUTPUT_NAME]),
     ]
-    outputs = {OUTPUT_NAME: shape}
     if contract.interval_factor is not None:
-        outputs[DEVIATION_NAME] = shape
         nodes += [
             helper.make_node("Abs", [OUTPUT_NAME], ["size"]),
             helper.make_node("Add", ["size", "one"], ["doubted"]),
@@ -63,8 +61,7 @@ def write_posed_model(path: Path, contract: Contract | None = None, **properties
         "square": np.ones((1, 1, scale, scale), dtype=np.float32),
         "doubt": np.array(0.01, dtype=np.float32),
     }
-    inputs = {name: (TensorProto.FLOAT, of) for name, of in contract.input_shapes.items()}
-    return save_graph(path, nodes, inputs, outputs, constants, contract.to_metadata() | properties)
+    return save_graph(path, nodes, contract, constants, contract.to_metadata() | properties)
 
 
 class PosedModel(FakeModel):

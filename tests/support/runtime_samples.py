@@ -2,6 +2,7 @@
 
 import threading
 
+import numpy as np
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_scan
 
 from edge.perception.runtime import Runtime
@@ -22,18 +23,26 @@ class Pushed:
     """Sensor whose scans come one by one into a runtime; `settings` are those of each scan, `results` are kept."""
 
     def __init__(self, runtime=None, sensor="4", **settings):
-        self.runtime, self.sensor = runtime or make_runtime(), sensor
+        self.runtime = runtime or make_runtime()
         self.number, self.results = 0, []
-        self._settings = settings
+        self._settings = {"sensor": sensor, **settings}
 
     def scan(self, press=0.0, **changes):
-        scan = make_scan(self.number, press_counts=press, sensor=self.sensor, **self._settings | changes)
+        scan = make_scan(self.number, press_counts=press, **self._settings | changes)
         self.number += 1
         return scan
 
     def push(self, press=0.0, **changes):
         self.results.append(self.runtime.push(self.scan(press, **changes)))
         return self.results[-1]
+
+    def play(self, count, offset=0.0, **changes):
+        """Return the results of so many scans whose z is off by some counts, which may be a function of the number."""
+        for number in range(count):
+            scan = self.scan(**changes)
+            scan.counts[2] += np.rint(offset(number) if callable(offset) else offset).astype(np.int32)
+            self.results.append(self.runtime.push(scan))
+        return self.results[-count:]
 
     def place(self, pose, **settings):
         """Hold the pad at a pose from now on, shortly before the next scan."""

@@ -1,14 +1,11 @@
 """Checks with closed forms for the fake model: its patterns explain their readings, and what is foreign is plain."""
 
 import numpy as np
-from edge_samples import FakeModel, make_pad_contract
+from edge_samples import make_pad_contract
 from pose_samples import make_posed_contract
 
-from edge.inference.contract import Contract
-from edge.inference.forward_model import FEATURES, GRID, KPA, ForwardModel
-from edge.inference.pose_input import POSE_WIDTH
-from edge.inference.small_network import SmallNetwork
-from edge.inference.trust import PLACE_MM, Check, Trust, pair_width
+from edge.inference.contract import POSE_WIDTH, Contract
+from edge.inference.trust import FEATURES, GRID, KPA, PLACE_MM, Check, ForwardModel, SmallNetwork, Trust, pair_width
 
 CONSTANTS = 2
 UNFAMILIAR = 0.5
@@ -63,14 +60,3 @@ def make_checked_contract(trust: Trust) -> Contract:
     """Return the contract of a model that takes a pad and poses, with such checks."""
     pad_inputs = (("thickness_mm", 4.5, 0.5), ("counts_per_newton", 1000.0, 500.0))
     return make_posed_contract(pad_inputs=pad_inputs, takes_gains=True, traction_scale=2, trust=trust.to_json())
-
-
-class WrongModel(FakeModel):
-    """Fake model whose patterns are `factor` times those that explain the readings."""
-
-    def __init__(self, contract: Contract, factor: float) -> None:
-        super().__init__(contract)
-        self.factor = factor
-
-    def run(self, window, pad=None, poses=None):
-        return super().run(window, pad) * np.float32(self.factor)

@@ -10,7 +10,7 @@ from edge_samples import write_model
 from press_samples import make_press_set
 from trust_samples import make_trusted_contract
 
-from edge.inference.small_network import small_network
+from edge.inference.trust import small_network
 from train import trust
 from train.errors import CheckpointError
 from train.learning.checks import (

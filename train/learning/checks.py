@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional as F
 
-from edge.inference.small_network import SmallNetwork, small_network
-from edge.inference.trust import Check, contact_features, pair_width, pose_tap_features
+from edge.inference.trust import Check, SmallNetwork, contact_features, pair_width, pose_tap_features, small_network
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.pattern_check import LEAST_COUNTS
 from firmware_bridge.pad_geometry import USPA44

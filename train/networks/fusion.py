@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from edge.inference.pose_input import scheduled_rows
+from edge.inference.contract import scheduled_rows
 from firmware_bridge.pad_geometry import USPA44
 from train.networks.blocks import PatternNet
 from train.networks.compact import QUIET_UNITS, CompactNet, Seen, tap_amplitude

@@ -1,22 +1,23 @@
-"""Force and torque on a pad from the traction on its face. No I/O.
+"""Stage that adds what follows from a pattern: area, interval, expected error, and the wrench.
 
 The frame is that of the whole project: x to the right, y down the rows, and so, to be right-handed, z into the pad; its
 origin is the middle of the face. Forces and torques act on the pad: pressing is a positive z force, and a twist, torque
 about z, is positive if it turns x to y, clockwise for a viewer who looks at the pad from above.
 """
 
-import math
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.inference.forward_model import GRID, KPA, ForwardModel, pooling
+from edge.inference.contract import Contract
+from edge.inference.intervals import expect
+from edge.inference.trust import GRID, KPA, ForwardModel, Trust, pooling
+from edge.perception.gain_following import SensorPad
+from edge.perception.result import LEAST_FORCE_N, Estimate, Wrench
 from firmware_bridge.pad_geometry import SensorGeometry
 
-LEAST_FORCE_N: Final = 0.1
-"""Least z force for a centre of pressure, which noise would move about below it; a tap begins at ten times as much."""
 _N_OF_KPA_MM2: Final = 1e-3
 _LEVEL_SCANS: Final = 200
 """Scans over which the level of a contact is taken, two seconds at 100 Hz: one that rolls on gets a new one."""
@@ -27,34 +28,10 @@ _SHEAR_PRIOR_N2: Final = 5.0
 """Sum of squared shear, in [N^2], by which a sensor's contacts outweigh the nominal counts per newton of x and y."""
 
 
-class Wrench(NamedTuple):
-    """Total force and torque on a pad.
-
-    Attributes:
-        force_n: x, y, z in [N].
-        torque_n_mm: about x, y, z through the middle of the face, in [N mm]; the last is the twist.
-        centre_of_pressure_mm: x, y from the middle of the point where the z force alone would give the torques about x
-            and y, in [mm]; None if hardly anything presses.
-    """
-
-    force_n: tuple[float, float, float]
-    torque_n_mm: tuple[float, float, float]
-    centre_of_pressure_mm: tuple[float, float] | None
-
-    @property
-    def shear_ratio(self) -> float | None:
-        """Tangential over normal force, whatever the sensor's counts per newton; None if hardly anything presses."""
-        x, y, z = self.force_n
-        return math.hypot(x, y) / z if z >= LEAST_FORCE_N else None
-
-
 def wrench_of(traction_kpa: NDArray[np.floating], pixel_mm: float) -> Wrench:
-    """Sum a traction over the face to force and torque.
+    """Sum a traction (3, h, w) of x, y, z over the face to force and torque, constant within each pixel of this side.
 
-    Args:
-        traction_kpa: (3, h, w) of x, y, z, constant within each pixel, the middle of the grid over that of the face,
-            in [kPa].
-        pixel_mm: side of a pixel, in [mm].
+    The middle of the grid lies over that of the face.
     """
     height, width = traction_kpa.shape[1:]
     fx, fy, fz, tx, ty, tz = (_sums(height, width, pixel_mm) @ traction_kpa.ravel()).tolist()
@@ -83,10 +60,6 @@ class Balance:
     where their plain sums agree. So changes of a force are those of the sums, and the network tells what the sums mean:
     newtons for a count of z and counts of x and y that pressing alone makes, by the contact so far, and newtons for a
     count of shear, by all contacts of the sensor.
-
-    Args:
-        forward: linear model of the readings.
-        geometry: of the sensor.
     """
 
     def __init__(self, forward: ForwardModel, geometry: SensorGeometry) -> None:
@@ -107,14 +80,9 @@ class Balance:
         tap: int,
         pad_row: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Return the traction whose force is that of the readings.
+        """Return the network's traction (3, h, w) with the force of the readings (3, rows, cols) that it was made from.
 
-        Args:
-            traction_kpa: (3, h, w), the network's.
-            pattern: (H, W) in [mm].
-            readings: (3, rows, cols) in network units, which both were made from.
-            tap: number of the contact.
-            pad_row: constants of the pad as model input.
+        The pattern (H, W) is in [mm], readings in network units, the pad as model input; `tap` numbers the contact.
         """
         if pad_row is not self._pad_row:
             self._use_pad(pad_row, pattern.shape)
@@ -128,16 +96,15 @@ class Balance:
             self._tap, self._level = tap, (0.0,) * 4
         # Least squares over the contact, whose strong scans count most: of the network's z force, and of what pressing
         # adds to x and y, over the sum of z.
-        newest = (z * z, z * z_n, *(z * (self._pressing @ pattern.ravel())).tolist())
+        pressed_x, pressed_y = (z * (self._pressing @ pattern.ravel())).tolist()
         keep = 1 - 1 / _LEVEL_SCANS
-        squares, by_force, by_x, by_y = self._level = tuple(
-            keep * before + one for before, one in zip(self._level, newest, strict=True)
-        )
+        squares, by_force, by_x, by_y = self._level
+        squares, by_force = keep * squares + z * z, keep * by_force + z * z_n
+        by_x, by_y = keep * by_x + pressed_x, keep * by_y + pressed_y
+        self._level = squares, by_force, by_x, by_y
         # The same over all contacts: of the network's shear, over that by nominal counts per newton.
-        shear_x, shear_y = (
-            (summed - z * by_axis / squares) / per_n
-            for summed, by_axis, per_n in zip((x, y), (by_x, by_y), self._counts_per_n, strict=True)
-        )
+        x_per_n, y_per_n = self._counts_per_n
+        shear_x, shear_y = (x - z * by_x / squares) / x_per_n, (y - z * by_y / squares) / y_per_n
         nominal, found = self._shear
         nominal += shear_x * shear_x + shear_y * shear_y
         found += shear_x * x_n + shear_y * y_n
@@ -159,3 +126,55 @@ class Balance:
         self._counts_per_n = (float(drag[0, 0].sum()) / dragged_n, float(drag[1, 1].sum()) / dragged_n)
         self._shear = _SHEAR_PRIOR_N2, _SHEAR_PRIOR_N2
         self._pad_row = pad_row
+
+
+def touched(pattern: NDArray[np.floating], level: float) -> NDArray[np.bool_]:
+    """Return the pixels that reach `level` of the pattern's maximum, (..., H, W) bool; none if that is not positive."""
+    peak = pattern.max(axis=(-2, -1), keepdims=True)
+    return (pattern >= level * peak) & (peak > 0)
+
+
+def touched_patch(
+    pattern: NDArray[np.float32], touching: NDArray[np.bool_], pixel_pitch_mm: float
+) -> tuple[float, tuple[float, float] | None]:
+    """Return area in [mm2] and pattern-weighted centroid of the touched pixels of a pattern (H, W), above zero there.
+
+    The centroid is x, y in [mm] from the pattern's centre, x to the right and y down; None if no pixel is touched.
+    """
+    rows, cols = np.nonzero(touching)
+    if rows.size == 0:
+        return 0.0, None
+    weights = pattern[rows, cols].astype(np.float64)
+    weights /= weights.sum()
+    height, width = pattern.shape
+    x_mm = (float(weights @ cols) - (width - 1) / 2) * pixel_pitch_mm
+    y_mm = (float(weights @ rows) - (height - 1) / 2) * pixel_pitch_mm
+    return rows.size * pixel_pitch_mm**2, (x_mm, y_mm)
+
+
+class Describe:
+    """Stage: everything that follows from a pattern: area, interval, expected error, wrench."""
+
+    def __init__(self, contract: Contract, trust: Trust | None, geometry: SensorGeometry, pad: SensorPad) -> None:
+        self._contract, self._geometry, self._pad = contract, geometry, pad
+        self._balance = None if trust is None else Balance(trust.forward, geometry)
+        self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
+
+    def __call__(self, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
+        """Add to an estimate what follows from its pattern; tap and newest readings as `Check` takes them."""
+        contract, pattern, deviation = self._contract, made.pattern, made.deviation
+        if pattern is None:
+            raise ValueError("the estimate has no pattern")
+        touching = touched(pattern, contract.contact_level)
+        made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
+        if deviation is not None:
+            expected = expect(contract.confidence, made.taps_used, pattern, deviation)
+            if expected is not None:
+                made.expected_rmse_mm, made.another_tap = expected.rmse, expected.another_tap
+            if contract.interval_factor is not None and touching.any():
+                made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
+        if (traction := made.traction) is not None:
+            if self._balance is not None:
+                made.traction = traction = self._balance(traction, pattern, newest, tap, self._pad.row)
+            made.wrench = wrench_of(traction, self._geometry.rows * self._geometry.pitch_mm / traction.shape[1])
+            made.wrench_origin = self._pad.wrench_origin
