@@ -312,14 +312,16 @@ COMPARED: Final = 480  # presses of each set that nothing is trained on
 
 
 def _exported(work: Path, name: str, bundled: Path) -> Path:
-    """Return the model of a checkpoint in 8-bit integers, or in float32 where they would cost too much."""
+    """Return the model of a checkpoint, in 8-bit integers: what they cost is part of the comparison."""
     # A command of its own: the export is the floor above, and needs the memory that training leaves.
     command = [sys.executable, "-m", "export.to_onnx", work / f"{name}.pt", "--out", work, "--trust", bundled]
-    command += ["--validation", work / "validation.npz", "--test", work / "test.npz"]
-    for suffix, more in ((INT8_SUFFIX, ["--int8", work / "presses.npz"]), ("", [])):
-        if subprocess.run([*map(str, [*command, *more])], check=False).returncode == 0:
-            return work / f"{name}{suffix}.onnx"
-    raise TrainError("the export has failed; see the lines above")
+    command += ["--validation", work / "validation.npz", "--test", work / "test.npz", "--int8", work / "presses.npz"]
+    path = work / f"{name}{INT8_SUFFIX}.onnx"
+    path.unlink(missing_ok=True)
+    subprocess.run([*map(str, command)], check=False)
+    if not path.is_file():
+        raise TrainError("the export has failed; see the lines above")
+    return path
 
 
 def _plan(options: argparse.Namespace, world: World, work: Path) -> Plan:

@@ -73,7 +73,7 @@ LEFT_OUT = {
     r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_lerobot runs it",
     r"python examples/train_and_deploy\.py .*": "trains for minutes; test_examples runs it, shortened",
     r"tensorboard .*": "serves until it is ended, and is not ours",
-    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_recordings takes one",
+    r"python docs/live_pictures\.py": "pictures a browser for half a minute; test_view_page_sensors takes one",
     r"mkdocs build .*": "test_site builds the site",
     r"python tests/docs/field_tables\.py": "writes the pages themselves; test_written_figures compares them",
 }
@@ -161,7 +161,8 @@ def world(emulated, press, tmp_path, plugged, monkeypatch):
     save_baselines("zero.json", [BASELINE.of("4", healthy_counts(1)[0], 1000.0, 100, "file")])
     save_sensor_file("sensor.toml", SensorFile(sensors={"4": SensorEntry(assumed=frozenset({"mounting"}))}))
     (tmp_path / "mine").mkdir()
-    shutil.copy(find_model("stsr"), "mine/stsr.onnx")
+    for name in ("stsr", "mine"):
+        shutil.copy(find_model("stsr"), f"mine/{name}.onnx")
 
     def prepare(command: str) -> list[str]:
         plugged.append(Port(left.port, (0x0403, 0x6015), "D30BL366", "VScom USB-CAN Plus"))

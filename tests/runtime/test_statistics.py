@@ -148,7 +148,7 @@ def test_each_kind_has_a_text_and_a_place_in_the_docs():
 
 def test_the_page_goes_by_kinds_that_there_are():
     page = "".join(path.read_text() for path in PAGE)
-    lists = re.findall(r"COUNTED = \[(.*?)\]|\[([^\]]*)\]\.includes\(event\)|event === (\"\w+\")", page)
+    lists = re.findall(r"byNumbers = \[(.*?)\]|\[([^\]]*)\]\.includes\(event\)|event === (\"\w+\")", page)
     named = set(re.findall(r'"(\w+)"', str(lists)))
     assert {"refused", "in_contact", "rest_level", "lost"} <= named <= KINDS
     notes = set(re.findall(r"\(kind\) => kind !== \"(\w+)\"", page))
