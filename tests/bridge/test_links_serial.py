@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 import serial
-from bridge_samples import read_scans
-from serial_samples import SilentDevice
+from bridge_samples import SilentDevice, read_scans
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.xela_controller import FRAME_S

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS, make_recording, read_scans, read_until_lost, stacked
 from edge_samples import wait_for
-from server_samples import looping, lose, read_notices
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection
-from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer
+from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer, looping, lose, read_notices
 
 from edge.cli import main as cli
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError

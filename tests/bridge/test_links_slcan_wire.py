@@ -4,9 +4,8 @@ import os
 import time
 
 import pytest
-from bridge_samples import make_recording, read_scans
+from bridge_samples import SilentDevice, make_recording, read_scans
 from edge_samples import wait_for
-from serial_samples import SilentDevice
 
 from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CanFrame, encode_frame

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 from bridge_samples import REST_COUNTS, make_recording
-from server_samples import MS, UNIX_S, message, sensor_entry
-from xela_server_emulator import VendorServer
+from xela_server_emulator import MS, UNIX_S, VendorServer, message, sensor_entry
 
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS
 from firmware_bridge.scans.xela_server_scans import FARTHEST_BACK as FAR

@@ -7,7 +7,7 @@ import pytest
 from bridge_samples import REST_COUNTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from server_samples import UNIX_S, message, sensor_entry
+from xela_server_emulator import UNIX_S, message, sensor_entry
 
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, MOST_SENSORS, ServerDecoder
 

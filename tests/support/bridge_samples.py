@@ -1,9 +1,11 @@
-"""Helpers of the bridge's tests: recordings, and reading a link to its end."""
+"""Helpers of the bridge's tests: recordings, reading a link to its end, and a dead adapter."""
 
 import csv
 import os
 import random
+import select
 import time
+import tty
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +93,24 @@ def read_scans(link: Link, count: int, timeout_s: float = 60.0) -> list[Scan]:
 def stacked(scans: list[Scan], sensor: str = "4") -> np.ndarray:
     """Return the counts of one sensor's scans, (n, 3, 4, 4)."""
     return np.stack([scan.counts for scan in scans if scan.sensor == sensor])
+
+
+class SilentDevice:
+    """Far end of a pseudo-terminal that takes nothing: a dead adapter, its cable in."""
+
+    def __enter__(self):
+        self.device_fd, self.client_fd = os.openpty()
+        tty.setraw(self.client_fd)
+        self.port = os.ttyname(self.client_fd)
+        return self
+
+    def received(self, count: int) -> bytes:
+        """Return the first bytes that came, and any that came with them."""
+        data = b""
+        while len(data) < count and select.select([self.device_fd], [], [], 5)[0]:
+            data += os.read(self.device_fd, 1000)
+        return data
+
+    def __exit__(self, *exc_info):
+        os.close(self.device_fd)
+        os.close(self.client_fd)

@@ -11,8 +11,7 @@ import can
 from bridge_samples import frames_of, make_counts, read_scans, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
-from server_samples import looping
-from xela_server_emulator import ServerEmulator
+from xela_server_emulator import ServerEmulator, looping
 
 from firmware_bridge.can.slcan import CanFrame, SlcanDecoder, encode_frame
 from firmware_bridge.emulation.pty_port import PseudoPort, listen

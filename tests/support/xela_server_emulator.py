@@ -1,7 +1,7 @@
 """Emulator of the vendor's xela_server on this machine, with sensors that play recordings.
 
 It is as strict as the real one: it sends its readings at its own pace, old or new, queues messages for a slow client
-until they are old, and restarts its count after a restart.
+until they are old, and restarts its count after a restart. Messages made by hand are here as well.
 """
 
 import asyncio
@@ -17,16 +17,20 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from bridge_samples import REST_COUNTS, make_recording
 from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 
 from firmware_bridge.emulation.xela_controller import playing_rate_hz
+from firmware_bridge.errors import LinkLostError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.scans.xela_server_messages import PRETENDED_VERSION, WELCOME
 
+UNIX_S: Final = 1_768_365_606.25
+MS: Final = 1_000_000
 VERSIONS: Final = ("1.7.6", "1.7.7", "1.8.0")
 
 
@@ -265,3 +269,53 @@ class ServerEmulator:
             behind = math.floor((time.monotonic() - start_s) * self._message_hz) - ticks
             ticks += 1 + (behind if behind > self._message_hz else 0)  # after a freeze it leaves messages out
         await self._close(1001, "")
+
+
+def sensor_entry(counts: np.ndarray = REST_COUNTS, *, ups=100.0, time_s=UNIX_S, **changes) -> dict:
+    """Return the entry of a server 1.8.0 about one sensor; a change to None leaves the key out."""
+    values = np.asarray(counts).reshape(3, 16).T.ravel().tolist()
+    entry = {
+        "time": time_s,
+        "sensor": "1",
+        "data": ",".join(f"{value:04X}" for value in values),
+        "model": "uSPa44",
+        "taxels": 16,
+        "calibrated": [0.125] * 48,
+        "integer": values,
+        "temp": [301.5] * 16,
+        "ups": [ups] * 16 if isinstance(ups, float) else ups,
+        "extradots": [["1.0", "1.42", "21.62"]],
+    }
+    return {key: value for key, value in (entry | changes).items() if value is not None}
+
+
+def message(sequence: object, *entries: dict, time_s: object = UNIX_S, **more) -> str:
+    """Return a message about sensors 1, 2, ..."""
+    sensors = {str(number): entry for number, entry in enumerate(entries, 1)}
+    return json.dumps({"message": sequence, "time": time_s, "version": "1.8.0b_208601", **sensors, **more})
+
+
+def looping(**options) -> VendorServer:
+    return VendorServer([make_recording(50)], loop=True, **options)
+
+
+def lose(link):
+    """Read until the link is lost, and return its error's text."""
+    end_s = time.monotonic() + 60
+    while time.monotonic() < end_s:
+        try:
+            link.read(0.05)
+        except LinkLostError as lost:
+            return str(lost)
+    raise AssertionError("the link was never lost")
+
+
+def read_notices(link, count):
+    """Return the first notices, at least `count`."""
+    notices = []
+    end_s = time.monotonic() + 60
+    while len(notices) < count:
+        assert time.monotonic() < end_s, notices
+        link.read(0.05)
+        notices += link.notices()
+    return notices
