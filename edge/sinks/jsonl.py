@@ -95,8 +95,6 @@ def has_room(descriptor: int, wanted_bytes: int) -> bool:
     events = poll.poll(0)
     if not events or events[0][1] & (select.POLLERR | select.POLLNVAL) or not _is_pipe(descriptor):
         return bool(events)
-    if sys.platform != "linux":
-        return True
     waiting_bytes = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))[0]
     if waiting_bytes == 0:
         return True  # the pipe may be too small for a record, and a reader that has taken everything is not slow
@@ -106,7 +104,7 @@ def has_room(descriptor: int, wanted_bytes: int) -> bool:
 
 def _widen(descriptor: int) -> None:
     """Enlarge a pipe to PIPE_BYTES if that is allowed; anything else stays as it is."""
-    if sys.platform == "linux" and _is_pipe(descriptor):
+    if _is_pipe(descriptor):
         with suppress(OSError):  # other pipes have taken the pages that a user may have
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 

@@ -35,9 +35,8 @@ from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.pipeline.sink import Sink
 from edge.view.access import SOCKET, Access, grant, is_everything, own_addresses
-from edge.view.frames import Frames, Run, hello, refused, state
+from edge.view.frames import Frames, Run, RunSnapshot, hello, refused, state
 from edge.view.recorder import FORM, Recorder
-from edge.view.run_snapshot import RunSnapshot
 from edge.view.viewers import MOST_VIEWERS, AttendedViewer, Connection, Connections, execute
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.links.replay_player import Player

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ros2_samples import ENVIRONMENT, Listener, Speaker, contact, keep_published, sink, without_pattern
+from ros2_samples import ENVIRONMENT, TAG, Listener, Speaker, contact, keep_published, sink, without_pattern
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
@@ -279,14 +279,13 @@ def test_commands_are_taken_only_where_that_was_asked_for(text, listens, monkeyp
     assert bool(asked) is listens
 
 
-def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_dds_is(limits):
+def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_dds_is():
     """Cyclone DDS compares descriptions, and those of Fast DDS differ; here another Cyclone DDS stands for it."""
-    fast_dds, cyclone_dds = ">1.15<", ">1.16<"  # vendor ids of the protocol
+    fast_dds = "<IgnoreTypeInformation>1.15</IgnoreTypeInformation>"  # by the vendor's id in the protocol
     assert fast_dds in ros2_domain.configuration({})
-    here = ros2_domain._FAST_DDS.replace(fast_dds, cyclone_dds)
-    limits(ros2_domain, _FAST_DDS=here)
-    there = f",<CycloneDDS><Domain>{here}</Domain></CycloneDDS>"
-    sink = Ros2Sink("skin", ENVIRONMENT)
+    cyclone_dds = f"<Compatibility>{fast_dds.replace('1.15', '1.16')}</Compatibility>"
+    there = f",<CycloneDDS><Domain>{cyclone_dds}</Domain></CycloneDDS>"
+    sink = Ros2Sink("skin", ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there})
     try:
         talker = Talker(sink)
         with Listener({"skin/s4/pattern": IMAGE}, "signed-bytes", more=there) as listener:

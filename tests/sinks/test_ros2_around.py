@@ -19,7 +19,7 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import BASELINE, ROOT, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
@@ -29,7 +29,7 @@ from edge.api import Event, Note, Result, SinkError, UsageError
 from edge.cli.run_help import parser
 from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import record
-from edge.sinks.registry import check_sink, open_sink
+from edge.sinks.registry import check_sink
 from edge.sinks.ros2 import cdr_messages, map_messages
 from edge.sinks.ros2.cdr_messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
@@ -103,11 +103,8 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     """Recorded on a machine that was up for three days more than this one."""
     recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
     published, later_ns = [], time.monotonic_ns() + 60 * 10**9
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ENVIRONMENT.items():
-            patch.setenv(name, value)
-        sink = open_sink("ros2:skin", make_contract(), RunFacts(unix_offset_ns=offset_ns, source="replay"))
-    sink._clock_ns = lambda: later_ns
+    run = RunFacts(unix_offset_ns=offset_ns, source="replay")
+    sink = Ros2Sink("skin", ENVIRONMENT, run, clock_ns=lambda: later_ns)
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)
     sink.write(replace(result, scan=replace(result.scan, time_ns=recorded_ns)), {})

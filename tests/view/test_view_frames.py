@@ -11,8 +11,18 @@ from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
 from edge.sinks.json_encoding import event_record, record, unpack
-from edge.view.frames import Frames, Run, hello, state
-from edge.view.run_snapshot import EVENTS, MAX_FPS, RECENT_SCANS, TRACE_POINTS, TRACE_S, RunSnapshot
+from edge.view.frames import (
+    EVENTS,
+    MAX_FPS,
+    RECENT_SCANS,
+    TRACE_POINTS,
+    TRACE_S,
+    Frames,
+    Run,
+    RunSnapshot,
+    hello,
+    state,
+)
 from edge.view.viewers import Viewer
 from firmware_bridge.links.replay_player import PlayerState
 

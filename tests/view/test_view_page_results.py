@@ -247,7 +247,8 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
             client.close()
             return
         if host is not None:
-            rest = re.sub(rb"\r\nHost: [^\r]*", b"\r\nHost: " + host.encode(), rest, flags=re.IGNORECASE)
+            named = b"\r\nHost: " + host.format(port=port).encode()
+            rest = re.sub(rb"\r\nHost: [^\r]*", named, rest, flags=re.IGNORECASE)
         if not sockets:
             rest = re.sub(rb"\r\n(Upgrade|Connection): [^\r]*", b"", rest, flags=re.IGNORECASE)
         upstream = socket.create_connection(("127.0.0.1", port))
@@ -267,41 +268,31 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
 
 
 @pytest.mark.parametrize(
-    ("below", "host", "token"),
+    ("settings", "token", "query", "words"),
     [
-        ("/edge/", None, None),
-        ("/", "127.0.0.1:{port}", None),
-        ("/edge/", "edge_up", browser_samples.TOKEN),
+        ({}, None, "", None),
+        ({"below": "/", "host": "127.0.0.1:{port}"}, None, "", None),
+        ({"host": "edge_up"}, browser_samples.TOKEN, f"?token={browser_samples.TOKEN}", None),
+        ({}, browser_samples.TOKEN, "", "the token is missing or wrong"),
+        ({"sockets": False}, None, "", "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
+        ({"sockets": None}, None, "", "answers 502 for /edge/ws, and not edge-sr"),
     ],
 )
-def test_through_a_proxy_the_page_finds_its_socket(tmp_path, open_page, below, host, token):
-    with (
-        live_page(tmp_path, token=token) as view,
-        proxy(view.port, below=below, host=host and host.format(port=view.port)) as url,
-    ):
-        page = open_page(url + (f"?token={token}" if token else ""))
+def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(tmp_path, open_page, settings, token, query, words):
+    with live_page(tmp_path, token=token) as view, proxy(view.port, **settings) as url:
+        page = open_page(url + query)
+        if words is not None:
+            playwright.expect(page.locator("#trouble")).to_contain_text(words)
+            return
         playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.reload()
         playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.close()  # before what it is connected to
 
 
-@pytest.mark.parametrize(
-    ("settings", "token", "words"),
-    [
-        ({}, browser_samples.TOKEN, "the token is missing or wrong"),
-        ({"sockets": False}, None, "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
-        ({"sockets": None}, None, "answers 502 for /edge/ws, and not edge-sr"),
-    ],
-)
-def test_a_page_that_a_proxy_cuts_off_shows_why(tmp_path, open_page, settings, token, words):
-    with live_page(tmp_path, token=token) as view, proxy(view.port, **settings) as url:
-        playwright.expect(open_page(url).locator("#trouble")).to_contain_text(words)
-
-
 def test_a_page_of_another_name_shows_that_it_needs_the_token(tmp_path, open_page):
     """Chromium resolves every name that ends in .localhost to this machine, as a stranger's server may."""
-    with live_page(tmp_path) as view, proxy(view.port, host=f"127.0.0.1:{view.port}") as url:
+    with live_page(tmp_path) as view, proxy(view.port, host="127.0.0.1:{port}") as url:
         trouble = open_page(url.replace("127.0.0.1", "robot.localhost")).locator("#trouble")
         playwright.expect(trouble).to_contain_text("may not send requests to this server")
         playwright.expect(trouble).to_contain_text("--view-token")
