@@ -273,15 +273,13 @@ def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(tmp_path):
     assert np.isnan(arrays["poses"][-1, 2:]).all()
 
 
-def test_the_command_line_takes_the_most_taps(tmp_path):
+def test_the_command_line_takes_the_most_taps(files, tmp_path):
     write_posed_model(tmp_path / "posed.onnx")
-    api.save_baselines(tmp_path / "zero.json", [BASELINE])
-    write_recording(tmp_path / "taps.npz", ([0] * 5 + [3000] * 5) * 4)
-    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", tmp_path / "zero.json")
+    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", files / "zero.json")
     for options, most in (((), 1), (("--taps", "3"), 3)):
-        done = run("replay", tmp_path / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
+        done = run("replay", files / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
         said = [json.loads(line) for line in done.stdout.splitlines()]
         assert max(one["taps_used"] for one in said) == most, done.stderr
     assert said[-1]["poses"] == [[0] * 5, [0, 0, 5, 0.2, 1], [0, 0, 10, 0.2, 1]]
-    done = run("replay", tmp_path / "taps.npz", *fixed, "--taps", "8")
+    done = run("replay", files / "taps.npz", *fixed, "--taps", "8")
     assert done.returncode == 2 and "taps is 8, but model 'posed' takes 7 at most" in done.stderr
