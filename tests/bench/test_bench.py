@@ -17,7 +17,7 @@ from edge_samples import ROOT, make_contract, write_model
 from edge.bench import command, system
 from edge.bench import provenance as reports
 from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
-from edge.bench.contenders import Subject, subjects
+from edge.bench.contenders import Subject
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
 from edge.bench.system import BenchError, measured
 from edge.cli.main import main
@@ -100,11 +100,6 @@ def test_a_model_of_another_scale_is_refused():
         list(error_rows(MTSR, coarse))
 
 
-def test_all_that_is_bundled_is_measured():
-    names = [subject.name for subject in subjects(10, None, print)]
-    assert names[:3] == ["bilinear", "linear map", "bicubic"] and {"stsr", "mtsr", "stsr-int8"} <= set(names)
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -167,11 +162,6 @@ def test_a_record_is_later_than_the_last_byte_of_its_scan(brief):
             assert cost.p99_us >= cost.p50_us > 50
             return
     pytest.skip("the machine is too busy: frames were lost in five rounds")
-
-
-def test_a_commit_that_is_not_here_is_named(tmp_path):
-    with pytest.raises(BenchError, match="no-such-commit: fatal"):
-        system.tree_of("no-such-commit", tmp_path)
 
 
 SOURCE = "edge/bench/contenders.py"

@@ -31,19 +31,13 @@ WEIGHT_COUNTS = 2400.0
 
 
 class Person:
-    """Holds a sensor and does what is asked of them; gives what the pad sends, scan by scan, as long as it goes on.
-
-    Args:
-        mounting: how the sensor sits; the person sees the pad as it is.
-        resting: counts that lie on every taxel from the start.
-    """
+    """Holds a sensor, mounted somehow, and does what is asked; gives what the pad sends, scan by scan, without end."""
 
     shape = (1, 3, 4, 4)
 
-    def __init__(self, mounting: Mounting | None = None, resting: float = 0.0) -> None:
+    def __init__(self, mounting: Mounting | None = None) -> None:
         self._mounting = mounting or Mounting()
         self._free = np.zeros((3, 4, 4))
-        self._free[2] = resting
         self._felt = self._free
         self._place = 0
         self._rng = np.random.default_rng(7)

@@ -12,8 +12,8 @@ from typing import get_type_hints
 
 import numpy as np
 import pytest
-from cli_samples import records, run, write_recording
-from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_contract, make_scan, write_model
+from cli_samples import files, records, run, write_recording
+from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan
 from mcap_samples import arrays_of
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 
@@ -23,6 +23,7 @@ from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import PadPose
 
+__all__ = ["files"]
 NAN = float("nan")
 OF_THE_MOMENT = ("counters", "time_ns", "run_time_us", "latency_us", "baseline_age_s", "device_time_ns")
 
@@ -41,16 +42,6 @@ def test_the_page_tells_of_everything_that_a_result_has():
     assert {field.name for field in fields(api.Result)} <= set(re.findall(r"`(\w+)`", "".join(tables)))
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_model(folder / "tiny.onnx", make_contract(interval_factor=1.6))
-    api.save_baselines(folder / "zero.json", [BASELINE])
-    write_recording(folder / "taps.npz", ([0] * 5 + [3000] * 5) * 3)
-    write_recording(folder / "rest.npz", [0] * 150)
-    return folder
-
-
 def timeless(record):
     """Return the parts of a record without its time; a reader, with its counters, may be ahead of the scan."""
     return {name: value for name, value in record.items() if name not in OF_THE_MOMENT}
@@ -58,7 +49,7 @@ def timeless(record):
 
 def played(files, **settings):
     """Records of the API, written by its own sink."""
-    out, model = files / "api.jsonl", load_model(files / "tiny.onnx")
+    out, model = files / "api.jsonl", load_model(files / "sure.onnx")
     with open_recording(files / "taps.npz") as source:
         runtime = open_runtime(model, source, baselines=files / "zero.json", **settings)
         sink, stream = open_sink(f"jsonl:{out}", model.contract, source), Stream(source, runtime)
@@ -81,10 +72,10 @@ def played(files, **settings):
     ],
 )
 def test_records_of_the_command_line_are_those_of_the_api(files, options, settings):
-    fixed = ["replay", files / "taps.npz", "--model", files / "tiny.onnx", "--baseline", files / "zero.json"]
+    fixed = ["replay", files / "taps.npz", "--model", files / "sure.onnx", "--baseline", files / "zero.json"]
     made = played(files, **settings)
     said = records(run(*fixed, "--sink", "jsonl:-", *options.split()).stdout)
-    assert len(said) == 30 and {one["state"] for one in said} == {"idle", "contact"}
+    assert len(said) == 40 and {one["state"] for one in said} == {"idle", "contact"}
     assert [timeless(one) for one in made] == [timeless(one) for one in said]
 
 
@@ -199,7 +190,7 @@ def test_of_a_recording_the_duration_is_of_its_own_time(files):
     whole = made(1e6)
     half_s = (whole[-1] - whole[0]) / 2e9
     first = made(half_s, clock_s=lambda: 10.0 * next(ticks))  # on the slowest of machines
-    assert first == [time_ns for time_ns in whole if time_ns - whole[0] < half_s * 1e9] and len(whole) == 150
+    assert first == [time_ns for time_ns in whole if time_ns - whole[0] < half_s * 1e9] and len(whole) == 120
 
 
 def test_the_doctors_findings_are_those_of_the_api(files):
@@ -282,15 +273,13 @@ def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(tmp_path):
     assert np.isnan(arrays["poses"][-1, 2:]).all()
 
 
-def test_the_command_line_takes_the_most_taps(tmp_path):
+def test_the_command_line_takes_the_most_taps(files, tmp_path):
     write_posed_model(tmp_path / "posed.onnx")
-    api.save_baselines(tmp_path / "zero.json", [BASELINE])
-    write_recording(tmp_path / "taps.npz", ([0] * 5 + [3000] * 5) * 4)
-    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", tmp_path / "zero.json")
+    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", files / "zero.json")
     for options, most in (((), 1), (("--taps", "3"), 3)):
-        done = run("replay", tmp_path / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
+        done = run("replay", files / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
         said = [json.loads(line) for line in done.stdout.splitlines()]
         assert max(one["taps_used"] for one in said) == most, done.stderr
     assert said[-1]["poses"] == [[0] * 5, [0, 0, 5, 0.2, 1], [0, 0, 10, 0.2, 1]]
-    done = run("replay", tmp_path / "taps.npz", *fixed, "--taps", "8")
+    done = run("replay", files / "taps.npz", *fixed, "--taps", "8")
     assert done.returncode == 2 and "taps is 8, but model 'posed' takes 7 at most" in done.stderr

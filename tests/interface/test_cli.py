@@ -89,7 +89,7 @@ def test_a_demo_that_ends_before_its_first_tap_says_so(files, capsys):
 
 
 @pytest.fixture
-def there(files, tmp_path):
+def there(tmp_path):
     """Folder with what the refused commands name."""
     write_model(tmp_path / "other.onnx", make_contract(pitch_mm=5.0))
     (tmp_path / "kept.npz").write_text("old")
@@ -177,7 +177,7 @@ def test_a_full_disk_is_5_after_the_summary(files):
         assert "cannot write records to stdout: No space left" in process.communicate()[1] and process.returncode == 5
 
 
-def test_of_a_recording_a_few_free_scans_are_enough(files, tmp_path):
+def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
     begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
     done = run(
         "baseline", "--source", f"replay:{begins_in_contact}", "--rate-hz", "1000", "--out", tmp_path / "zero.json",

@@ -210,17 +210,12 @@ class Tap:
     proposed: tuple[float, ...] | None = None  # x, y in [mm] of the proposal after it
 
 
-STOPPED_NS = 500_000_000
-SCENES_TURN_DEG = -20
-"""Turn of the first tap after those of the figure."""
-
-
 def taps_of(results):
     """Return the taps of the demo's figure; of a pause between two, a busy machine may lose every scan."""
     taps: list[Tap] = []
     breaks, last = 0, results[0]
     for one in results:
-        breaks += one["dead"] != last["dead"] or one["time_ns"] - last["time_ns"] > STOPPED_NS
+        breaks += one["dead"] != last["dead"] or one["time_ns"] - last["time_ns"] > 500_000_000
         last = one
         if one["contact"] and one["pose"] is not None:
             place = tuple(one["pose"][axis] for axis in ("x_mm", "y_mm", "turn_deg"))
@@ -231,7 +226,7 @@ def taps_of(results):
                 taps[-1].used.append(one["taps_used"])
         elif taps and one["contact"] is False and one["next_tap"] is not None:
             taps[-1].proposed = tuple(one["next_tap"]["target"][axis] for axis in ("x_mm", "y_mm"))
-    return [*takewhile(lambda tap: tap.place[2] > SCENES_TURN_DEG, taps)]
+    return [*takewhile(lambda tap: tap.place[2] > -20, taps)]  # the turn of the first one after the figure's
 
 
 def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(posed):

@@ -211,7 +211,7 @@ def test_a_source_has_one_stream_at_a_time():
             assert list(stream_of(source, duration_s=1e-6)) == []
 
 
-def test_a_recording_at_the_speed_of_its_reader_has_no_latest(tmp_path):
+def test_a_recording_at_the_speed_of_its_reader_has_no_latest():
     class Patient(FakeLink):
         patient = True
 

@@ -240,11 +240,6 @@ def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
 HELD = json.dumps({"cmd": "pose", "x_mm": 5, "y_mm": -3, "turn_deg": 0, "holds": True}) + "\n"
 
 
-@pytest.fixture
-def long(files, tmp_path):
-    return write_recording(tmp_path / "long.npz", ([0] * 5 + [3000] * 5) * 300)
-
-
 def centre_of(path):
     """Return the middle of what a map covers, in [mm], and how many patterns it holds."""
     with np.load(path) as data:
@@ -254,7 +249,8 @@ def centre_of(path):
         return at.round(2).tolist(), int(data["fused_patterns"])
 
 
-def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, long, tmp_path):
+def test_ctrl_c_writes_the_map_of_poses_on_stdin(files, tmp_path):
+    long = write_recording(tmp_path / "long.npz", ([0] * 5 + [3000] * 5) * 300)
     out, picture, lines = tmp_path / "m.npz", tmp_path / "m.png", tmp_path / "lines"
     options = [*base_options(files), "--source", f"replay:{long}", "--sink", f"jsonl:{lines}"]
     files_of_map = ["--out", out, "--png", picture, "--size-mm", "40", "--px-per-mm", "2"]

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import termios
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -78,18 +79,11 @@ def terminal(request):
     made.close()
 
 
-class Clock:
-    now_s = 100.0
-
-    def __call__(self):
-        return self.now_s
-
-
 @pytest.fixture
 def clock(monkeypatch):
-    """Clock of the bars."""
-    clock = Clock()
-    monkeypatch.setattr("tqdm.std.time", clock)
+    """Clock of the bars, which goes on as a test sets `now_s`."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now_s)
     return clock
 
 
@@ -230,8 +224,7 @@ def test_no_line_is_wider_than_the_terminal(palette):
 def test_side_by_side_where_there_is_room_else_below_each_other():
     panels = [panel(title=name) for name in ("one", "two", "three")]
     wide, narrow = visible(draw(panels, 76, "plain")), visible(draw(panels, 75, "plain"))
-    assert [line.split() for line in (wide[0],)] == [["one", "two", "three"]]
-    assert len(wide) == 1 + 12 + 1
+    assert wide[0].split() == ["one", "two", "three"] and len(wide) == 1 + 12 + 1
     assert [line.strip() for line in narrow if line.strip() in ("one", "two", "three")] == ["one", "two", "three"]
     assert len(narrow) == 3 * (1 + 20 + 1) + 2
 

@@ -55,12 +55,8 @@ PUSHES = {0: (1, 1), 3: (-1, 1), 15: (-1, -1), 12: (1, -1)}
 def visit(order: list[int], swap: bool, signs: tuple[int, int, int], *, rest: int = 20, hold: int = 45) -> np.ndarray:
     """Return the counts of a pad that a person presses as asked, noiseless and over its rest, (n, 3, 4, 4).
 
-    Args:
-        order: taxel of the id map at each place as the person sees it.
-        swap: true where the wire's x is the pad's y.
-        signs: signs of the pad's x, y and z on the wire.
-        rest: number of scans between presses.
-        hold: number of scans of each press, and of each push.
+    `order` holds the taxel of the id map at each place as the person sees it; with `swap` the wire's x is the pad's y.
+    Between presses are `rest` scans; each press, and each push, takes `hold`.
     """
     seen = []
     for place in (0, 3, 15, 12):

@@ -50,13 +50,6 @@ class Camera(abc.ABC):
     def __init__(self, config: CameraConfig) -> None:
         self.fps, self.width, self.height = config.fps, config.width, config.height
 
-    def __enter__(self):
-        self.connect()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self.disconnect()
-
     @property
     @abc.abstractmethod
     def is_connected(self) -> bool: ...

@@ -39,21 +39,13 @@ TWINS = {"min": "max", "max": "min", "any": "all", "all": "any"}
 
 @dataclass(frozen=True, slots=True)
 class Mutant:
-    """One change of a syntax tree.
+    """One change of a syntax tree."""
 
-    Attributes:
-        name: "function or constant: code before -> code after", the same wherever that stands in its file.
-        line: of the change.
-        holder: node or list that is changed.
-        place: attribute or index in it.
-        changed: what comes there.
-    """
-
-    name: str
+    name: str  # "function or constant: code before -> code after", the same wherever that stands in its file
     line: int
-    holder: Any
-    place: str | int
-    changed: Any
+    holder: Any  # node or list that is changed
+    place: str | int  # attribute or index in it
+    changed: Any  # what comes there
 
     @contextmanager
     def applied(self) -> Iterator[None]:
