@@ -54,11 +54,7 @@ class MessageType:
 
     @classmethod
     def of(cls, name: str, definition: str) -> "MessageType":
-        """Return the type of a message by its whole definition, as `definition` gives it.
-
-        Raises:
-            ValueError: a line of it is no such field.
-        """
+        """Return the type of a message by its whole definition, as `definition` gives it; errors as for its text."""
         text, *sections = definition.split(f"\n{_RULE}\nMSG: ")
         parts: list[MessageType] = []
         for section in reversed(sections):  # each comes before its own parts

@@ -88,12 +88,7 @@ class _DamageError(Exception):
 
 
 def load_csv(path: Path) -> Recording:
-    """Read a CSV up to its end, or up to a damaged line, which `notes` then report.
-
-    Raises:
-        RecordingError: it is no recording, or a value in a whole line is impossible.
-        OSError: the file cannot be read.
-    """
+    """Read a CSV up to its end, or up to a damaged line, which `notes` then report."""
     scans = row = damaged = None
     try:
         for row in _rows(path):

@@ -13,7 +13,7 @@ def load_recording(path: str | Path) -> Recording:
     """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format, and a folder is a rosbag2.
 
     Raises:
-        RecordingError: the file cannot be read, or is not a recording.
+        RecordingError: the file cannot be read, is no recording, or a value in it is impossible.
     """
     path = Path(path)
     readers = {".csv": load_csv, ".npz": load_npz, ".mcap": _load_mcap}

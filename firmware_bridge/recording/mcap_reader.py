@@ -83,12 +83,7 @@ class _Sensor:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record.
-
-    Raises:
-        RecordingError: it is no MCAP file, or holds no scans that edge-sr recorded.
-        OSError: the file cannot be read.
-    """
+    """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record."""
     reading = _Reading(path)
     files, missing = mcap_files(path)
     if missing:
@@ -168,11 +163,7 @@ class _Reading:
             self._take_metadata(record.name, record.metadata)
 
     def recording(self) -> Recording:
-        """Return what was read.
-
-        Raises:
-            RecordingError: no scans.
-        """
+        """Return what was read; a RecordingError without scans."""
         scanned = {name: one for name, one in self._sensors.items() if one.times_ns}
         if not scanned:
             self._refuse(f"no scans that edge-sr recorded{self._instead()}")

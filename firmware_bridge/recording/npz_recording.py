@@ -158,12 +158,7 @@ _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "
 
 
 def load_npz(path: Path) -> Recording:
-    """Read an npz; of one that lost its end the arrays that are whole, which `notes` then report.
-
-    Raises:
-        RecordingError: it is no recording, or a value is impossible.
-        OSError: the file cannot be read.
-    """
+    """Read an npz; of one that lost its end the arrays that are whole, which `notes` then report."""
     notes: list[str] = []
     cut_off = f"{path} is damaged: its end is missing, and only its whole arrays are read; copy it again"
     try:
@@ -292,7 +287,7 @@ def _check_arrays(
     arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, str], rows: tuple[int, ...], **of_a_row: tuple[int, ...]
 ) -> None:
     """Refuse arrays that are there, and not of these kinds, so many rows, and the shape of a row, else one value."""
-    for name in kinds.keys() & arrays.keys():
+    for name in filter(arrays.__contains__, kinds):
         array, shape = arrays[name], (*rows, *of_a_row.get(name, ()))
         if array.dtype.kind not in kinds[name] or array.shape != shape:
             _refuse(name, f"{array.dtype} of shape {array.shape}", f"{_KINDS[kinds[name]]} of shape {shape}")

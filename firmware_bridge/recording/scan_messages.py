@@ -1,4 +1,7 @@
-"""Messages of scans, baselines, poses and sensors: all that is needed to play a recording again, bit for bit."""
+"""Messages of scans, baselines, poses and sensors: all that is needed to play a recording again, bit for bit.
+
+Decoders raise a CdrError for bytes that are no such message, and for a value that is impossible.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -124,11 +127,7 @@ def encode_scan(scan: Scan, frame: str, unix_ns: int, fresh: int, renewed: int) 
 
 
 def decode_scan(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> RecordedScan:
-    """Decode the scan in a message.
-
-    Raises:
-        CdrError: it is no scan message, or a value is impossible.
-    """
+    """Decode the scan in a message."""
     fields = scan_type(geometry.taxel_count).decode(data)
     sensor, fresh, renewed = fields["sensor"], fields["fresh"], fields["renewed"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
@@ -178,11 +177,7 @@ def encode_baseline(baseline: Baseline, frame: str, age_s: float | None, unix_ns
 
 
 def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44) -> Baseline:
-    """Decode the baseline in a message, with the origin that it had in the recorded run.
-
-    Raises:
-        CdrError: it is no baseline message, or a value is impossible.
-    """
+    """Decode the baseline in a message, with the origin that it had in the recorded run."""
     fields = baseline_type(geometry.taxel_count).decode(data)
     sensor, created_unix_s, scans = fields["sensor"], fields["created_unix_s"], fields["scans"]
     _check(is_sensor_name(sensor), "sensor", sensor, "a name")
@@ -221,22 +216,14 @@ def encode_pose(timed: TimedPose, unix_ns: int) -> bytes:
 
 
 def decode_pose(data: bytes | memoryview) -> TimedPose:
-    """Decode the pose in a message.
-
-    Raises:
-        CdrError: it is no pose, or a value is impossible.
-    """
+    """Decode the pose in a message."""
     fields = POSE.decode(data)
     numbers = [fields[name] for name in POSE_FIELDS]
     return checked_pose(numbers, *(fields[name] for name in ("time_ns", "holds", "used_from_ns", "sensor")))
 
 
 def checked_pose(numbers: Sequence[float], time_ns: int, holds: int, used_from_ns: int, sensor: str) -> TimedPose:
-    """Return the pose of these POSE_FIELDS, and of the other fields of POSE, as recordings hold them.
-
-    Raises:
-        CdrError: a value is impossible.
-    """
+    """Return the pose of these POSE_FIELDS, and of the other fields of POSE, as recordings hold them."""
     _check(not sensor or is_sensor_name(sensor), "sensor", sensor, "a name, or none")
     _check_times({"time_ns": time_ns, "used_from_ns": used_from_ns}, time_ns=0, used_from_ns=-1)
     _check(holds <= 1, "holds", holds, "0 or 1")

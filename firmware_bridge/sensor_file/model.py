@@ -52,9 +52,6 @@ class PadFrame:
         parent: name of the robot's frame, such as "tool0".
         place_mm: x, y, z of the middle of the face in the parent, in [mm].
         quaternion: x, y, z, w of the turn from the parent's axes to the pad's.
-
-    Raises:
-        ValueError: one of these is invalid.
     """
 
     parent: str

@@ -259,11 +259,7 @@ def unwrapped(counts: NDArray[np.integer]) -> NDArray[np.int32]:
 
 
 def refuse_motion(counts: NDArray[np.int32]) -> None:
-    """Check that a pad was still during scans (n, 3, rows, cols), n at least 3.
-
-    Raises:
-        BaselineRefusedError: it moved, or crept.
-    """
+    """Raise a BaselineRefusedError if a pad moved or crept during scans (n, 3, rows, cols), n at least 3."""
     moved = unwrapped(counts)
     # Percentiles, not the range: the sensor has single readings far off, which are no motion.
     spread = np.percentile(moved, 95, axis=0) - np.percentile(moved, 5, axis=0)
@@ -280,11 +276,7 @@ def refuse_motion(counts: NDArray[np.int32]) -> None:
 
 
 def refuse_load(baseline: Baseline, reference: Baseline) -> None:
-    """Check that no taxel of a baseline lies more than LOAD_LIMIT_COUNTS above a reference.
-
-    Raises:
-        BaselineRefusedError: one does: the pad was loaded.
-    """
+    """Raise a BaselineRefusedError if a taxel lies more than LOAD_LIMIT_COUNTS above a reference: it was loaded."""
     z = len(AXES) - 1
     # A taxel that is missing in either baseline is no evidence of a load.
     known = np.where(np.isnan(baseline.counts), 0, baseline.counts)
