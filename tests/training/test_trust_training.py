@@ -1,4 +1,4 @@
-"""Training of checks: faults that are played, the fit of forward model and networks, their file, and their limits."""
+"""Training of checks: the fit of forward model and networks, their file, and their limits."""
 
 import json
 from dataclasses import replace
