@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from math import hypot, radians, sqrt
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,6 @@ from edge.perception.tap_tracker import TapState, TapTracker
 from edge.perception.taxel_health import TaxelWatch
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
-
-
-class PosedTaps(NamedTuple):
-    """Taps that a pattern can be made from: places in the tracker's window, newest first, and poses as model input."""
-
-    slots: Sequence[int]
-    rows: NDArray[np.float32]
 
 
 class TapPoses:
@@ -55,14 +48,19 @@ class TapPoses:
             self._poses = {number: pose for number, pose in known.items() if number in remembered}
             self._reported &= remembered | {tap.tap}
 
-    def choose(self, tap: TapState, pose: PadPose | None, *, scheduled: bool) -> PosedTaps:
-        """Return the taps to use during contact; the pose is that of the newest tap's pad at this scan."""
+    def choose(
+        self, tap: TapState, pose: PadPose | None, *, scheduled: bool
+    ) -> tuple[Sequence[int], NDArray[np.float32]]:
+        """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
+
+        The pose is that of the newest tap's pad at this scan.
+        """
         if scheduled:
             taps = min(tap.taps_used, self._scheduled)
-            return PosedTaps(range(taps), scheduled_rows(taps, self._step_deg))
+            return range(taps), scheduled_rows(taps, self._step_deg)
         if pose is None:
             self._leave_out(tap.tap, "tap_without_pose", "this tap has no pose: its pattern is made from it alone")
-            return PosedTaps((0,), scheduled_rows(1, 0.0))
+            return (0,), scheduled_rows(1, 0.0)
         slots, poses = [0], [pose]
         for slot, peak in enumerate(tap.peaks, 1):
             earlier = self._poses.get(peak.tap)
@@ -80,7 +78,7 @@ class TapPoses:
                 continue
             slots.append(slot)
             poses.append(earlier)
-        return PosedTaps(slots, pose_rows(poses))
+        return slots, pose_rows(poses)
 
     def _apart_mm(self, one: PadPose, other: PadPose) -> float:
         """Return the distance between two pads, root mean square over their taxels, in [mm], for small turns."""
@@ -214,9 +212,9 @@ class Taps:
             # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
             counts, slots, rows = tap.window.copy(), range(len(tap.window)), None
         else:
-            posed = self._poses.choose(tap, step.pose, scheduled=scheduled)
-            taps = min(taps, len(posed.slots))
-            slots, rows = posed.slots[:taps], posed.rows[:taps]
+            slots, rows = self._poses.choose(tap, step.pose, scheduled=scheduled)
+            taps = min(taps, len(slots))
+            slots, rows = slots[:taps], rows[:taps]
             counts = tap.window[list(slots)]
         made_by = (tap.tap, tuple(slots), taps, step.filled, self._watch.most_repeats >= REPEATS)
         return Window(counts, taps, slots, rows, tap.tap, made_by)

@@ -127,8 +127,7 @@ class Loop:
         self._sinks = ()
         with self._turn:  # unless this is a callback of a step
             self._finish()
-            while self._made:
-                self._next_made()
+            self._pass_over()
             self._error = UsageError(
                 f"the stream of source {self._source.name} is closed: results that were left are old"
             )
@@ -140,6 +139,11 @@ class Loop:
             self._on_event(made)
             return None
         return made
+
+    def _pass_over(self) -> None:
+        """Tell what happened, and leave the results out that were made."""
+        while self._made:
+            self._next_made()
 
     def _step(self, wait_s: float) -> None:
         """Make the results of all that waits, after waiting at most `wait_s` [s]; of a patient source, of every scan.

@@ -188,11 +188,6 @@ class Stream(Loop):
                 self._newest.see(result)
                 yield result
 
-    def _pass_over(self) -> None:
-        """Tell what happened, and leave the results out that were made."""
-        while self._made:
-            self._next_made()
-
     def _round(self, wait_s: float) -> None:
         """Make the results of the scans that wait, after waiting at most `wait_s` for them."""
         if self._source.patient:

@@ -184,13 +184,6 @@ class TestChoice:
             assert result.pose.x_mm == x_mm and result.poses is None and without.pose is None
         assert result.taps_used == 2 and moved.kinds == []
 
-    def test_a_new_object_forgets_taps_and_keeps_poses(self):
-        pad = make_pad()
-        pad.tap(PadPose(1, 0))
-        pad.runtime.reset()
-        result = pad.tap()
-        assert result.taps_used == 1 and result.pose.x_mm == 1
-
 
 class TestChecks:
     def test_the_check_of_earlier_taps_takes_their_poses(self):
