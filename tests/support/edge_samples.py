@@ -57,9 +57,6 @@ def make_contract(**changes) -> Contract:
         "training_sha256": "ab" * 32,
         "test_set_sha256": "cd" * 32,
         "test_error": {"1": {"psnr_db": 30.1}, "4": {"psnr_db": 33.2, "rmse_percent": 2.1}},
-        "pad_inputs": (),
-        "takes_gains": False,
-        "traction_scale": None,
     }
     return Contract(**(values | changes))
 
