@@ -167,7 +167,7 @@ class TestRecord:
     def test_a_killed_recorder_leaves_all_that_was_on_the_disk(self, made, tmp_path):
         """The amount depends on the machine; docs/recordings.md gives a measured one."""
         path = tmp_path / "killed.mcap"
-        process = start("record", path, *source_of(made, 40), stderr=subprocess.DEVNULL)
+        process = start("record", path, *source_of(made, 20), stderr=subprocess.DEVNULL)
         while len(written := scans_on_disk(path)) < 12:
             assert process.poll() is None
             time.sleep(0.02)
