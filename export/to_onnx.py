@@ -144,6 +144,7 @@ def export(
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
     facts = [f"parity {check_parity(net, model, frozen, contract):.1e}"]
+    float_error: dict[str, float] = {}
     if calibration is not None:
         seen, in_float = calibration_batch(calibration, contract), model
         name, model = name + INT8_SUFFIX, quantised(in_float, seen)
@@ -151,14 +152,15 @@ def export(
             contract = replace(contract, interval_levels=intervals.conformed(net, GraphRun(model)))
             model = quantised(to_model(net, pad), seen)
         integer, convs = convolutions(model)
-        float_error = _error(in_float, contract, frozen)
+        facts = [f"{integer} of {convs} convolutions in int8"]
+        if contract.scale == frozen.scale:
+            float_error = mean_error(judge_model(_session(in_float, contract), frozen))
         contract = replace(contract, arithmetic="int8")
-        lost = cost(float_error, _error(model, contract, frozen))
-        facts = [f"{integer} of {convs} convolutions in int8", *lost]
 
     session = _session(model, contract)
     facts = [*judge_in_contract(session, frozen, validation), *facts]
     contract = session.contract
+    facts += cost(float_error, contract.test_error.get(str(contract.taps), {}))
     # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
     checkable = contract.taps == 1 or contract.takes_poses
     if trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
@@ -167,11 +169,6 @@ def export(
     Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
     write_in_place(folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
     return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join(facts)}"
-
-
-def _error(model: onnx.ModelProto, contract: Contract, frozen: FrozenSet) -> dict[str, float]:
-    """Return the mean errors of a graph with all taps; empty if the test set is of another scale."""
-    return mean_error(judge_model(_session(model, contract), frozen)) if contract.scale == frozen.scale else {}
 
 
 def _session(model: onnx.ModelProto, contract: Contract) -> ModelSession:
@@ -190,7 +187,7 @@ def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, st
 
 
 def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
-    """Return the loss by int8 as text, with each exceeded limit; nothing without errors on the test set."""
+    """Return the loss by int8 as text, with each exceeded limit; nothing of a float graph, or if none was judged."""
     if not in_float:
         return []
     lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
