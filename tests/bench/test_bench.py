@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_samples import run
-from edge_samples import ROOT, make_contract, write_model
+from edge_samples import ROOT, make_contract, wait_for, write_model
 
 from edge.bench import command, system
 from edge.bench import provenance as reports
@@ -122,6 +122,14 @@ def test_a_child_that_fails_is_named_with_its_reason():
         command.measured({"do": "first", "subject": subject, "threads": 1, "window": []})
 
 
+def in_group(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
     arguments = ["bench", "--only", "linear map", "--ticks", "100000", "--threads", "1", "--out", str(tmp_path)]
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
@@ -134,8 +142,7 @@ def test_ctrl_c_ends_it_in_a_line_and_keeps_what_was_measured(tmp_path):
         _, complaint = process.communicate(timeout=60)
     assert process.returncode == 130
     assert complaint == f"edge-sr: bench stopped before its end: what was measured is in {tmp_path}\n"
-    with pytest.raises(ProcessLookupError):  # no process of it is left
-        os.killpg(process.pid, 0)
+    wait_for(lambda: not in_group(process.pid))  # soon no process of it is left
     with (tmp_path / "bench.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert row["method"] == "linear map" and "paced_p50_us" not in row

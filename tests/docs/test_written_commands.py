@@ -67,7 +67,7 @@ LEFT_OUT = {
     r"pip install -e \. \./examples/lerobot_camera_tactile_sr": "fetches LeRobot; test_lerobot imports the package",
     r"python examples/viewers/rerun_view\.py .*": "needs Rerun; test_mcap_recording runs it where that is installed",
     r"your-robot-program \| .*": "is the reader's own; test_poses_stdin pipes poses of a program",
-    r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm_reading runs it",
+    r"python examples/shm_read\.py .*": "goes on until it is ended; test_shm runs it",
     r"python examples/zenoh_listen\.py .*": "goes on until it is ended; test_zenoh runs it",
     r"python examples/(print_force|stop_on_area)\.py .*": "goes on until it is ended; test_examples runs them",
     r"python examples/lerobot_camera_tactile_sr/observe\.py .*": "needs LeRobot; test_lerobot runs it",
