@@ -205,7 +205,8 @@ def compared(
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
-    objections = []
+    gains: list[str] = []
+    objections: list[str] = []
     for what, presses in sets.items():
         frozen = freeze_presses(presses, SEED + 1, sensor.nuisances)
         windows, truth = frozen.windows(presses.taps), frozen.patterns()
@@ -223,8 +224,11 @@ def compared(
             cells[name].append(f"{values.mean():.2f}")
             gained = errors[OWN] - values
             low, high = bootstrap_interval(gained, presses.pad)
+            gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
+            if name == bundled.name:
+                gains.append(gain)
             if name != OWN and (high < 0 if what == UNLIKE else low <= 0):
-                objections.append(f"on {what} it is {gained.mean():+.2f} dB ({low:+.2f} to {high:+.2f}) to {name}")
+                objections.append(f"on {what} it is {gain} dB to {name}")
     holes = {}
     for name, model in models.items() if grips else ():
         played = [play(grip, model, pad=knowledge.pad).patterns for grip in grips]
@@ -238,7 +242,7 @@ def compared(
         )
     names = [f"{what} [dB]" for what in sets] + ["recordings with holes"] * bool(grips)
     lines = [" | ".join(("method", *names, "run time [us]"))]
-    for name, row in cells.items():
+    for name, row in (cells | {f"over {bundled.name}": gains}).items():
         run_us = f"{np.median(times_us[name]):.0f}" if name in times_us else "-"
         lines.append(" | ".join((name, *row, *["-"] * (len(names) - len(row)), run_us)))
     return Comparison("\n".join(lines), "; ".join(objections) or None)

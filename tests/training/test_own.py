@@ -83,7 +83,13 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     found = knowledge_of(FILE, "4", None)
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     table, objection = compared(tiny, found, sets, [])
-    assert [line.split(" | ")[0] for line in table.splitlines()] == ["method", OWN, "stsr-int8", "bilinear"]
+    assert [line.split(" | ")[0] for line in table.splitlines()] == [
+        "method",
+        OWN,
+        "stsr-int8",
+        "bilinear",
+        "over stsr-int8",
+    ]
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
     _, objection = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
