@@ -41,9 +41,7 @@ def check_poses(text: str) -> tuple[str | None, str, str]:
 def open_poses(text: str, queue: PoseQueue) -> PoseSource:
     """Open the source of poses that `text` names, as for `check_poses`; they go to the queue.
 
-    Raises:
-        UsageError: no such form, or what it needs is not installed.
-        SinkError: it cannot be opened.
+    Raises a UsageError where a package is not installed, and a SinkError where it cannot be opened.
     """
     sensor, form, target = check_poses(text)
     if form == "zenoh":

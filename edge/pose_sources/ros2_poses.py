@@ -56,10 +56,7 @@ def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> P
     """Return the pose of the pad, of its tool frame in the frame of the plane.
 
     The covariance is (36,) of x, y, z in [m] and of turns about them in [rad], as in PoseWithCovariance; where it is
-    empty, zero or negative, the usual errors hold.
-
-    Raises:
-        PoseError: the pad is tilted out of the plane, or the place is out of range.
+    empty, zero or negative, the usual errors hold. Raises a PoseError for a tilted pad, or a place out of range.
     """
     rotation = tool.rotation
     tilt_deg = degrees(acos(min(abs(float(rotation[2, 2])), 1.0)))

@@ -77,11 +77,7 @@ class CountersInTurn:
 
 
 def chosen_fields(text: str) -> frozenset[str]:
-    """Return the names in `text`, which are separated by commas.
-
-    Raises:
-        UsageError: a record has no such field; the message states the nearest one, or all.
-    """
+    """Return the names in `text`, separated by commas, or raise a UsageError with the nearest field, or all of them."""
     from difflib import get_close_matches
 
     names = frozenset(name.strip() for name in text.split(","))

@@ -102,9 +102,9 @@ DAYS_NS = 3 * 86_400 * 10**9
 def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
     """Recorded on a machine that was up for three days more than this one."""
     recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
-    published, later_ns = [], time.monotonic_ns() + 60 * 10**9
-    run = RunFacts(unix_offset_ns=offset_ns, source="replay")
-    sink = Ros2Sink("skin", ENVIRONMENT, run, clock_ns=lambda: later_ns)
+    clock, published = Clock(), []
+    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(unix_offset_ns=offset_ns, source="replay"), clock_ns=clock)
+    clock.now_ns += 60 * 10**9
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)
     sink.write(replace(result, scan=replace(result.scan, time_ns=recorded_ns)), {})

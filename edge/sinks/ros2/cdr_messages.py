@@ -101,7 +101,7 @@ string record              # all of it as JSON, as in a line of jsonl:
     STD_HEADER,
 )
 Vector = tuple[float, float, float]
-_WARN, _ERROR, _INFO = 30, 40, 20
+_WARN, _ERROR = 30, 40
 _LEVELS: Final[Mapping[EventKind, int]] = {
     **dict.fromkeys(("lost", "sink"), _ERROR),
     **dict.fromkeys(("silent", "trouble", "refused", "in_contact", "given_up", "rest_level"), _WARN),
@@ -174,7 +174,7 @@ def log_message(event: Event, unix_ns: int) -> bytes:
     return LOG.encode(
         {
             "stamp": stamp(unix_ns),
-            "level": _LEVELS.get(event.kind, _INFO),
+            "level": _LEVELS.get(event.kind, 20),
             "name": event.sensor or "edge-sr",
             "msg": event.text,
             "file": "",
@@ -191,19 +191,12 @@ def _taxel_places_m(geometry: SensorGeometry) -> NDArray[np.float64]:
 
 
 LONGEST_TOPIC: Final = 247  # limit of ROS; DDS takes 255, some of which are for prefixes
-_ALLOWED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_PLAIN: Final = re.compile(r"(?!s[0-9])(?!x_)[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
-_FROM_DIGIT: Final = re.compile(r"[0-9][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
 
 
 def base_topic(text: str) -> str:
-    """Return a topic as a user writes it, without a leading slash.
-
-    Raises:
-        UsageError: it is no valid topic of ROS.
-    """
+    """Return a topic as a user writes it without its leading slash, or raise a UsageError."""
     topic = text.removeprefix("/")
-    if not all(_ALLOWED.fullmatch(token) for token in topic.split("/")):
+    if not all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", token) for token in topic.split("/")):
         raise UsageError(
             f"topic {text!r} is not a ROS topic: expected letters, digits and _ between single slashes, no digit "
             "first, such as ros2:skin or ros2:/gripper/skin"
@@ -231,8 +224,8 @@ def sensor_topic(base: str, sensor: str, what: str) -> str:
 
 
 def _token(part: str) -> str:
-    if _PLAIN.fullmatch(part):
+    if re.fullmatch(r"(?!s[0-9])(?!x_)[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", part):
         return part
-    if _FROM_DIGIT.fullmatch(part):
+    if re.fullmatch(r"[0-9][A-Za-z0-9]*(_[A-Za-z0-9]+)*", part):
         return f"s{part}"
     return f"x_{part.encode().hex() or '0'}"

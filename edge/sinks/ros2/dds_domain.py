@@ -20,9 +20,6 @@ from edge.errors import SinkError, UsageError
 from firmware_bridge.recording.cdr import Field, MessageType
 
 _LOOPBACK: Final = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
-# Fast DDS 3, under ROS's default middleware, describes a sequence of bytes in a way that Cyclone DDS takes for no type,
-# and images reached no such node. Names of types, and ROS's hashes of them, are compared as before.
-_FAST_DDS: Final = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # its vendor id
 TYPE_HASHES: Final[dict[str, str]] = {
     "geometry_msgs/msg/PointStamped": "4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
     "sensor_msgs/msg/PointCloud2": "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
@@ -65,7 +62,11 @@ def configuration(environment: Mapping[str, str]) -> str:
         discovery = f"{auto}<Peers>{discovery}</Peers>"
     # The default lets each writer wait a second at its end for a reader that has stopped.
     quick_end = "<Internal><WriterLingerDuration>100ms</WriterLingerDuration></Internal>"
-    parts = f"<General>{general}</General><Discovery>{discovery}</Discovery>{_FAST_DDS}{quick_end}"
+    # Fast DDS 3, under ROS's default middleware, describes a sequence of bytes in a way that Cyclone DDS takes for no
+    # type, and images reached no such node. Names of types, and ROS's hashes of them, are compared as before. The
+    # number is its vendor's id.
+    fast_dds = "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
+    parts = f"<General>{general}</General><Discovery>{discovery}</Discovery>{fast_dds}{quick_end}"
     wanted = f"<CycloneDDS><Domain>{parts}</Domain></CycloneDDS>"
     return ",".join(filter(None, (wanted, environment.get("CYCLONEDDS_URI", ""))))
 
