@@ -27,7 +27,14 @@ from edge.errors import (
     UsageError,
     WindowError,
 )
-from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, demo_recording, find_model
+from edge.inference.bundled import (
+    DEFAULT_MODEL,
+    POSED_MODEL,
+    bundled_models,
+    demo_recording,
+    example_recording,
+    find_model,
+)
 from edge.inference.contract import Contract, Model
 from edge.inference.onnx_guard import unfinished_load
 from edge.perception.event import Event, Note
@@ -148,6 +155,7 @@ __all__ = [
     "demo_recording",
     "devices",
     "examine",
+    "example_recording",
     "find_model",
     "infer",
     "layout_c",

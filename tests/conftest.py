@@ -15,9 +15,10 @@ from firmware_bridge.links.serial_ports import Port
 
 MEMORY_LIMIT_BYTES = 60_000_000
 
-# A shell ignores Ctrl-C in what it starts in the background, and programs that a test interrupts would inherit that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell ignores Ctrl-C in what it starts in the background, nohup a hang-up; programs of a test would inherit that.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 
 def pytest_collection_modifyitems(items):

@@ -26,6 +26,7 @@ from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.demo import demo_recording
 from train.errors import TrainError
+from train.grip import grip_recording
 from train.networks.symmetric import moved_scans
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances, apply_nuisances
@@ -120,9 +121,9 @@ def drawn(taps: PressSet, windows: int) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write classical.npz, taxels.npz, demo.npz, and frozen.npz where it does not exist."""
+    """Write classical.npz, taxels.npz, demo.npz, grip.npz, and frozen.npz where it does not exist."""
     parser = argparse.ArgumentParser(prog="python -m train.freeze", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="folder for frozen.npz, classical.npz, taxels.npz and demo.npz")
+    parser.add_argument("folder", type=Path, help="folder for these files")
     help_of_data = "taps to fit the classical methods and the taxels' covariance on"
     parser.add_argument("--data", type=Path, nargs="+", required=True, help=help_of_data)
     options = parser.parse_args(arguments)
@@ -139,6 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
     grid = (USPA44.rows, USPA44.cols)
     _save(folder / "taxels.npz", fit_taxels(taps), lambda draft: load_estimator(draft, grid))
     _save(folder / "demo.npz", demo_recording(), load_recording)
+    _save(folder / "grip.npz", grip_recording(), load_recording)
     sys.stdout.write(f"{len(frozen)} frames of {len(frozen.surface)} taps, sha256 {frozen.sha256()}\n")
 
 

@@ -104,7 +104,8 @@ DEMO: Final = Group("sensor", Option("--rate-hz R", positive, "scans a second (d
 RECORD: Final = Group("file", Option("file FILE", str, "new file, .mcap"))
 REPLAY: Final = Group("recording",
     Option("file FILE", str, "recording, .mcap, .npz, .csv or a rosbag2 folder; of several sensors a file each, also "
-           "as FILE,FILE", nargs="+"),
+           "as FILE,FILE", nargs="*"),
+    Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
     (Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline, instead of the recorded ones"),
      Option("--zero", bool, "take the first 100 scans during which the pad is free and still as its baseline")),
     Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),

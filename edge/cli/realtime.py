@@ -29,7 +29,7 @@ def realtime(tell: Callable[[str], object], thread_ids: Sequence[int] = ()) -> I
         for name, remedy, begin in (
             ("SCHED_FIFO", rights, partial(_schedule, threads)),
             ("one processor of its own", "the container or cgroup must permit it", partial(_pin, threads)),
-            ("locked memory", memory, _lock_memory),
+            ("locked memory", memory, lock_memory),
         ):
             try:
                 undo.callback(begin())
@@ -67,7 +67,8 @@ def _pin(threads: Sequence[int]) -> Callable[[], object]:
     return lambda: pin(allowed)
 
 
-def _lock_memory() -> Callable[[], object]:
+def lock_memory() -> Callable[[], object]:
+    """Keep the used memory of this process in RAM, and return what gives it back."""
     libc = ctypes.CDLL(None, use_errno=True)
     # MCL_CURRENT, MCL_FUTURE and MCL_ONFAULT, which locks only used memory: the stack of a thread alone would be 8 MB.
     if libc.mlockall(1 | 2 | 4) != 0:

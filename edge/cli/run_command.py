@@ -76,13 +76,17 @@ def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
 def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr replay`."""
+    from edge.api import example_recording
     from edge.pipeline.replay_setup import Player, open_recording
 
+    files = [*options.file, *[example_recording()] * options.example]
+    if not files:
+        raise UsageError("which recording? name its FILE, or pass --example (edge-sr replay --help lists all options)")
     # A person looks for as long as he likes; a sink gets each result once.
     player = Player() if options.view is not None and not set(options.sink) - {"status"} else None
     paced = options.paced or options.view is not None
     source = open_recording(
-        *options.file,
+        *files,
         sensor=options.sensor,
         zero=options.zero or options.baseline is not None,
         paced=paced,

@@ -103,6 +103,7 @@ With --view and no --sink it is played again and again, from the first viewer un
 and scrub it.
 
 examples:
+  edge-sr replay --example --view
   edge-sr replay left.csv right.csv \\
           --view
   edge-sr replay press.mcap \\
@@ -185,7 +186,9 @@ HELP: Final = {
         (of.RECORD, *of.RUN),
         _RECORD,
     ),
-    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY),
+    "replay": Help(
+        "{FILE...,--example} [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY
+    ),
     "convert": Help(
         "FILE NEW",
         "Writes a recording in another format: that of the ending of the new name.",

@@ -55,12 +55,17 @@ def _stem(name: str | Path) -> str:
 
 
 def demo_recording() -> Path:
-    """Return the file of the recording that the demo plays.
+    """Return the file of the recording that the demo plays; UsageError if it is missing from this installation."""
+    return _installed("demo.npz")
 
-    Raises:
-        UsageError: it is missing from this installation.
-    """
-    path = BUNDLE_DIR / "demo.npz"
+
+def example_recording() -> Path:
+    """Return the file of a recording of two emulated fingers that grip things; UsageError if it is missing."""
+    return _installed("grip.npz")
+
+
+def _installed(name: str) -> Path:
+    path = BUNDLE_DIR / name
     if not path.is_file():
-        raise UsageError(f"the demo's recording is not installed: {path} is missing")
+        raise UsageError(f"a recording is not installed: {path} is missing")
     return path

@@ -95,7 +95,7 @@ class MapSink(Sink):
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
         self._clock_ns = clock_ns
-        self._pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // 240**2)
+        self.pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // 240**2)
         self._due_ns = 0
         self._unseen = False
         self._shown = 0
@@ -190,7 +190,7 @@ class MapSink(Sink):
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
             return
-        self._due_ns, self._unseen = self._clock_ns() + self._pause_ns, False
+        self._due_ns, self._unseen = self._clock_ns() + self.pause_ns, False
         whole = self.whole
         seen_ns = max((time_ns for _, time_ns in self._pads.values()), default=0)
         pads = {name: pose for name, (pose, at_ns) in self._pads.items() if seen_ns - at_ns <= SENSOR_SILENT_NS}

@@ -146,11 +146,11 @@ class McapFile:
             job()
         if self._writer.finish not in jobs:
             self._writer.flush()
-        self._put(self._made)
+        self.put(self._made)
         self._made.clear()
         self.written = written
 
-    def _put(self, data: bytearray) -> None:
+    def put(self, data: bytearray) -> None:
         """Write all of the data or nothing: a disk that fills takes a part and refuses the rest."""
         try:
             with memoryview(data) as left:

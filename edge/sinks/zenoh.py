@@ -69,13 +69,13 @@ class ZenohSink(Sink):
         publishers = self._publishers.get(result.scan.sensor) or self._declare(result.scan.sensor)
         text = record(result, self._turns.of(result, counters))
         self._read = any(map(_matched, (*publishers, self._events)))
-        self._put(publishers[0], orjson.dumps(text, option=orjson.OPT_SERIALIZE_NUMPY))
+        self.put(publishers[0], orjson.dumps(text, option=orjson.OPT_SERIALIZE_NUMPY))
         if result.pattern is not None and result.reused_from is None:
-            self._put(publishers[1], pack(text, maps_of(result)))
+            self.put(publishers[1], pack(text, maps_of(result)))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Put an event."""
-        self._put(self._events, orjson.dumps(event_record(event, counters, self._source)))
+        self.put(self._events, orjson.dumps(event_record(event, counters, self._source)))
 
     def close(self) -> None:
         """Send what is under way, and end; subscribers to KEY/alive/* are notified by zenoh."""
@@ -90,7 +90,8 @@ class ZenohSink(Sink):
     def _publisher(self, key: str, encoding: str) -> "zenoh.Publisher":
         return self._session.declare_publisher(key, encoding=encoding, congestion_control=self._congestion)
 
-    def _put(self, publisher: "zenoh.Publisher", message: bytes) -> None:
+    def put(self, publisher: "zenoh.Publisher", message: bytes) -> None:
+        """Send a message, with a time stamp."""
         try:
             publisher.put(message, timestamp=self._session.new_timestamp())
         except self._failure as error:

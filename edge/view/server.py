@@ -118,7 +118,7 @@ class Server:
         self._snapshot, self._commands, self._access = snapshot, commands, access
         self._recorder, self._failed = recorder, failed
         self._page = load_page(access.key)
-        self._socket = _listen(access.host, port)
+        self._socket = listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
         self._connections = Connections()
@@ -251,7 +251,8 @@ class Server:
                 self._news.set()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens there; SinkError if it cannot."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server((str(address[0]), port), family=family)

@@ -195,3 +195,12 @@ def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
 def test_a_baseline_of_a_recording_that_may_be_of_a_held_pad_is_in_doubt(tmp_path):
     done = run("replay", write_recording(tmp_path / "held.npz", [*[400] * 60, *[0] * 110]))
     assert "sensor 4 has no pattern to be believed: baseline in doubt: taken from this recording" in done.stderr
+
+
+def test_the_example_is_a_grip_of_two_emulated_fingers():
+    done = run("replay", "--example", "--sink", "jsonl:-", "--fields", "trusted,force_counts")
+    assert done.returncode == 0 and "grip.npz was recorded from an emulated sensor" in done.stderr
+    got = [one for one in records(done.stdout) if one["state"] != "event"]
+    for sensor in "46":
+        held = [one for one in got if one["sensor"] == sensor and one["state"] == "contact"]
+        assert len(held) > 300 and sum(one["trusted"] is True for one in held) > 0.9 * len(held)

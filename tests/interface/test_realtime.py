@@ -37,8 +37,8 @@ started.start(), bystander.start()
 folder = Path(tempfile.mkdtemp())
 recorder = Recorder(folder, lambda event: None)
 recorder.open_sink = partial(open_sink, contract=make_contract())
-writing, put = [], McapFile._put
-McapFile._put = lambda file, data: (writing.append(state()), put(file, data))
+writing, put = [], McapFile.put
+McapFile.put = lambda file, data: (writing.append(state()), put(file, data))
 with realtime(told.append, [started.native_id]):
     within = state()
     begun = threading.Thread(target=lambda: writing.append((*state()[:2], before[2])))  # by whatever the loop calls
@@ -78,14 +78,14 @@ def test_what_is_permitted_is_had_by_every_thread_and_given_back():
     [
         ("os.sched_setscheduler", ["SCHED_FIFO", "rtprio"]),
         ("os.sched_setaffinity", ["one processor", "cgroup"]),
-        ("edge.cli.realtime._lock_memory", ["locked memory", "ulimit -l"]),
+        ("edge.cli.realtime.lock_memory", ["locked memory", "ulimit -l"]),
     ],
 )
 def test_a_refusal_is_one_line_and_the_run_goes_on(monkeypatch, call, words):
     def refuse(*args):
         raise PermissionError(1, "Operation not permitted")
 
-    granted, calls = [], ("os.sched_setscheduler", "os.sched_setaffinity", "edge.cli.realtime._lock_memory")
+    granted, calls = [], ("os.sched_setscheduler", "os.sched_setaffinity", "edge.cli.realtime.lock_memory")
     for name in calls:
         grant = lambda *args, name=name: granted.append(name) or (lambda: None)  # noqa: E731
         monkeypatch.setattr(name, refuse if name == call else grant)

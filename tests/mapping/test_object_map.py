@@ -263,7 +263,7 @@ def test_a_reset_ends_a_map_and_begins_the_next(tmp_path):
 
 def test_two_pads_at_one_place_are_not_fused():
     shared, apart, shown = MapSink(ObjectMap()), MapSink(ObjectMap()), []
-    apart.show, apart._pause_ns = shown.append, 0
+    apart.show, apart.pause_ns = shown.append, 0
     for number in range(6):
         for sensor, x_mm in (("4", 0.0), ("6", 20.0)):
             pressing = number > 0  # both are free at first

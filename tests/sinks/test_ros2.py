@@ -75,7 +75,7 @@ class Talker:
             scan = replace(result.scan, vendor=vendor, device_ns=result.scan.time_ns - 3_000_000)
             result = replace(result, scan=scan, area_mm2=40.0, centroid_mm=(1.5, -2.0), trusted=True)
             self.sink.write(result, {"dropped": 7})
-            self.wrote[sensor, result.scan.device_ns + self.sink._unix_offset_ns] = result
+            self.wrote[sensor, result.scan.device_ns + self.sink.unix_offset_ns] = result
 
 
 def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(sink):

@@ -203,8 +203,8 @@ def test_the_launch_file_starts_a_command_that_edge_sr_takes():
 def test_rviz_shows_topics_that_are_published(sink):
     shown = yaml.safe_load((FILES / "skin.rviz").read_text())["Visualization Manager"]
     published = set()
-    sink._publish = lambda writer, message: published.add(writer.topic.name.removeprefix("rt"))
-    sink._is_read = lambda writer: True
+    sink.publish = lambda writer, message: published.add(writer.topic.name.removeprefix("rt"))
+    sink.is_read = lambda writer: True
     result = make_wrench_result()
     sink.write(result, {})
     sink.close()  # which withdraws the points
@@ -243,7 +243,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
         package, _, kind = writer.data_type.__idl_typename__.split(".", 2)
         sent.append((f"{package}/msg/{kind.removeprefix('dds_.').removesuffix('_')}", message))
 
-    sink._publish, sink._is_read = keep, lambda writer: True
+    sink.publish, sink.is_read = keep, lambda writer: True
     event = Event(3, "refused", "4", "not done, ä")
     sink.write(replace(result, deviation=result.pattern / 10, centroid_mm=(1.0, 2.0), events=(event,)), {"dropped": 1})
     sink.close()

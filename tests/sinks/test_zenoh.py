@@ -255,4 +255,4 @@ class TestEndOfTheProgram:
             program.send_signal(signal.SIGTERM)
             words = program.communicate()[1].decode()
         assert program.returncode == EXIT_FORCED
-        assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\._put .*: ended .*\n", words)
+        assert re.search(r"edge-sr: not ended 1\.5 s after the signal, still in ZenohSink\.put .*: ended .*\n", words)

@@ -67,7 +67,7 @@ def keep_published(sink, kept, *names):
         if not names or name in names:
             kept.append(ros2_messages.decode(name, data))
 
-    sink._publish, sink._is_read = keep, lambda writer: True
+    sink.publish, sink.is_read = keep, lambda writer: True
 
 
 class Listener:

@@ -99,7 +99,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert emulation == {"pty_port", "slcan_emulator", "xela_controller"}, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
-        *("contacts.npz", "demo.npz", "taxels.npz"),
+        *("contacts.npz", "demo.npz", "grip.npz", "taxels.npz"),
     }
 
 

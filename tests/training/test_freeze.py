@@ -83,7 +83,7 @@ def test_the_command_makes_all_files_but_the_frozen_set_that_models_name(tmp_pat
     make_press_set(600).save(tmp_path / "seen.npz")
     before = (tmp_path / "frozen.npz").stat()
     main([str(tmp_path), "--data", str(tmp_path / "seen.npz")])
-    names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "seen", "taxels")]
+    names = [f"{name}.npz" for name in ("classical", "demo", "frozen", "grip", "seen", "taxels")]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert (tmp_path / "frozen.npz").stat() == before
 

@@ -89,7 +89,7 @@ class Ros2Sink(Sink):
         """
         self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
         self._of_now = run.unix_offset_ns is None
-        self._unix_offset_ns = unix_ns() - clock_ns() if run.unix_offset_ns is None else run.unix_offset_ns
+        self.unix_offset_ns = unix_ns() - clock_ns() if run.unix_offset_ns is None else run.unix_offset_ns
         self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
         self._counters: Mapping[str, int] = {}
@@ -111,7 +111,7 @@ class Ros2Sink(Sink):
         sensor.last, self._counters = result, counters
         for kind in _OUTAGES:
             sensor.trouble.pop(kind, None)
-        unix_ns = scan.on_bus_ns + self._unix_offset_ns
+        unix_ns = scan.on_bus_ns + self.unix_offset_ns
         self._publish_to(sensor, "taxels", IMAGE, lambda: image(taxels(scan), sensor.frame, unix_ns))
         if result.pattern is not None:
             self._show(sensor, result, unix_ns)
@@ -184,13 +184,15 @@ class Ros2Sink(Sink):
         if to is None:
             topic = sensor_topic(self._base, sensor.last.scan.sensor, what)
             to = sensor.writers[what] = writer(self._participant, topic, kind)
-        if self._is_read(to):
-            self._publish(to, make())
+        if self.is_read(to):
+            self.publish(to, make())
 
-    def _is_read(self, writer: DataWriter[Any]) -> bool:
+    def is_read(self, writer: DataWriter[Any]) -> bool:
+        """Return whether anybody subscribes to a topic."""
         return bool(writer.get_matched_subscriptions())
 
-    def _publish(self, writer: DataWriter[Any], message: bytes) -> None:
+    def publish(self, writer: DataWriter[Any], message: bytes) -> None:
+        """Send an encoded message to a topic."""
         try:
             writer.write(writer.data_type(message))
         except DDSException as error:
@@ -230,7 +232,7 @@ class Ros2Sink(Sink):
         self._publish_to(sensor, "points", POINT_CLOUD, empty)
 
     def _clear_of_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
-        self._clear(sensor, time_ns + self._unix_offset_ns, np.nan)
+        self._clear(sensor, time_ns + self.unix_offset_ns, np.nan)
         self._publish_numbers(sensor, None, why)
 
     def _publish_numbers(self, sensor: _Sensor, result: Result | None, state: str) -> None:
@@ -251,11 +253,11 @@ class Ros2Sink(Sink):
         places = self._run.frames
         frames = {sensor.frame: places[name] for name, sensor in self._sensors.items() if name in places}
         if self._placed is not None and frames:
-            self._publish(self._placed, transforms(frames, self._now_ns() + self._unix_offset_ns))
+            self.publish(self._placed, transforms(frames, self._now_ns() + self.unix_offset_ns))
 
     def _tell(self, event: Event) -> None:
         text = orjson.dumps(event_record(event, self._counters, self._run.source)).decode()
-        self._publish(self._events, STRING.encode({"data": text}))
+        self.publish(self._events, STRING.encode({"data": text}))
 
     def _diagnose(self, *, ended: bool = False) -> None:
         self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
@@ -267,7 +269,7 @@ class Ros2Sink(Sink):
             diagnosis = Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis
             statuses.append((f"{self._base}: {name}", name, diagnosis))
         self._counters_before = self._counters
-        self._publish(self._diagnostics, diagnostics_message(statuses, now_ns + self._unix_offset_ns))
+        self.publish(self._diagnostics, diagnostics_message(statuses, now_ns + self.unix_offset_ns))
 
     def _now_ns(self) -> int:
         """Return the time on the scans' clock; where that is of another time, the time of the newest scan."""
