@@ -186,9 +186,7 @@ HELP: Final = {
         (of.RECORD, *of.RUN),
         _RECORD,
     ),
-    "replay": Help(
-        "{FILE...,--example} [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY
-    ),
+    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY),
     "convert": Help(
         "FILE NEW",
         "Writes a recording in another format: that of the ending of the new name.",
