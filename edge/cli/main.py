@@ -45,16 +45,17 @@ def _main(arguments: Sequence[str]) -> int:
         return 0
     except KeyboardInterrupt:
         return 130  # as a shell's, until a run has begun that ends well
-    except (BridgeError, EdgeError) as error:
+    except (BridgeError, EdgeError, OSError) as error:
+        lacking = error.__cause__ if isinstance(error, (BridgeError, EdgeError)) else error
+        if isinstance(lacking, OSError) and lacking.errno in (errno.EMFILE, errno.ENFILE):
+            # Anything may meet it: a thread, a link, a port that is opened, or Python as it loads a module.
+            print(f"edge-sr: {os.strerror(lacking.errno)}: allow more of them, ulimit -n 256", file=sys.stderr)
+            return _EXIT_CODES[SinkError]
+        if not isinstance(error, (BridgeError, EdgeError)):
+            raise
         with contextlib.suppress(OSError):  # the terminal may have gone
             print(f"edge-sr: {' '.join(str(error).split())}", file=sys.stderr)
         return next((code for kind, code in _EXIT_CODES.items() if isinstance(error, kind)), EXIT_USAGE)
-    except OSError as error:
-        if error.errno not in (errno.EMFILE, errno.ENFILE):
-            raise
-        # Anything may meet it: a thread, a link, or Python as it loads a module.
-        print(f"edge-sr: {error.strerror}: allow more of them, ulimit -n 256", file=sys.stderr)
-        return _EXIT_CODES[SinkError]
 
 
 def _command(arguments: Sequence[str]) -> int | None:
