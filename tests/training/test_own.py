@@ -10,8 +10,10 @@ from edge.inference.onnx_session import ModelSession
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline
 from train import own
 from train.data.press_batches import OneSensor, PressBatches
+from train.data.real_grips import Grip
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
 from train.own import OWN, UNLIKE, compared, knowledge_of, main
@@ -29,7 +31,7 @@ FILE = SensorFile(sensors={"4": SensorEntry(pad=THICK, counts_per_newton=1100.0)
 
 
 def test_pads_are_drawn_as_wide_as_what_is_not_known():
-    found = knowledge_of(FILE, None, None)
+    found = knowledge_of(FILE, None)
     assert found.ranges["thickness_mm"] == (4.9, 5.1), "by its interval"
     assert found.ranges["shear_modulus_mpa"] == pytest.approx((0.114, 0.126)), "a fifth where nobody said how well"
     assert found.ranges["poisson"] == RANGES["poisson"]
@@ -54,7 +56,7 @@ def test_pads_are_drawn_as_wide_as_what_is_not_known():
 )
 def test_which_sensor_is_said_in_a_line(names, asked, complaint):
     with pytest.raises(DatasetError, match=complaint):
-        knowledge_of(SensorFile(sensors={name: SensorEntry() for name in names}), asked, None)
+        knowledge_of(SensorFile(sensors={name: SensorEntry() for name in names}), asked)
 
 
 def test_its_network_is_told_of_it_in_most_windows():
@@ -70,7 +72,7 @@ def test_its_network_is_told_of_it_in_most_windows():
 
 
 def test_what_its_model_is_made_for_is_what_is_known():
-    made_for = knowledge_of(FILE, "4", None).sensor().made_for
+    made_for = knowledge_of(FILE, "4").sensor().made_for
     assert set(made_for) == {"thickness_mm", "shear_modulus_mpa", "counts_per_newton", "gains_certainty"}
     contract = make_contract(made_for={name: [*ends] for name, ends in made_for.items()})
     same = Pad(thickness_mm=5.05, shear_modulus_mpa=0.12, counts_per_newton=1100, gains=(1.0,) * GAINS)
@@ -80,7 +82,7 @@ def test_what_its_model_is_made_for_is_what_is_known():
 def test_what_is_worse_is_not_handed_over(tmp_path):
     """In place of an own model: a tiny one that knows nothing, and then the bundled one against itself."""
     sets = {name: solve_pad(World(count=12, per_pad=12, seed=seed), 0) for seed, name in enumerate(("figures", UNLIKE))}
-    found = knowledge_of(FILE, "4", None)
+    found = knowledge_of(FILE, "4")
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     table, objection = compared(tiny, found, sets, [])
     assert [line.split(" | ")[0] for line in table.splitlines()] == [
@@ -91,6 +93,10 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
         "over stsr-int8",
     ]
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
+    rest = Baseline.from_counts("xela_4", np.full((2, 3, 4, 4), 30_000), created_unix_s=0.0)
+    free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)
+    _, objection = compared(tiny, found, sets, [free])
+    assert "in untouched nan% of its patterns have holes" in objection, "no pattern is no proof"
     _, objection = compared(ModelSession(find_model("stsr-int8")), found, sets, [])
     assert objection is not None and UNLIKE not in objection, "no worse there"
 
