@@ -88,7 +88,7 @@ def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
             op_types_to_quantize=["Conv", *PASSING_ON],
             nodes_to_quantize=nodes,
             calibrate_method=CalibrationMethod.Percentile,
-            # Larger values are cut: with the whole range the bundled models lose .03 to .07 dB more, because a few
+            # Larger values are cut: with the whole range the bundled models lose 0.03 to 0.07 dB more, because a few
             # large values make all steps coarser.
             extra_options={"CalibPercentile": 99.999},
         )

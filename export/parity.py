@@ -145,7 +145,7 @@ def differences(
 def accepted(output: str, tolerance: float) -> float:
     """Return the largest accepted difference in an output, where it is `tolerance` in a pattern."""
     # A pixel at the contact level lies inside or outside by its last bit; that moves the regions around it, and with
-    # their sizes the factors of the deviations in the whole window: measured .0002.
+    # their sizes the factors of the deviations in the whole window: measured 0.0002.
     return max(tolerance, 1e-3) if output == DEVIATION_NAME else tolerance
 
 

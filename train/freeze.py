@@ -36,7 +36,7 @@ TEST_FORCE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
 CLASSICAL_WINDOWS: Final = 12_000
 KINDS: Final = 16
-"""Number of kinds of contact. RMS error of a hidden taxel's z over that of the scan is .61 with 1 and .56 with 16.
+"""Number of kinds of contact. RMS error of a hidden taxel's z over that of the scan is 0.61 with 1 and 0.56 with 16.
 
 More kinds reduce it on figures, but not on contacts that vary little over the pad.
 """

@@ -299,7 +299,7 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     before = mean[:2].sum(axis=(1, 2))
 
     def pushed(reading: Reading) -> bool:
-        # 300 counts are about .2 N; noise of two counts a taxel sums up to eight.
+        # 300 counts are about 0.2 N; noise of two counts a taxel sums up to eight.
         return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= 300.0)
 
     felt = yield from _wait(

@@ -110,7 +110,7 @@ def weigh(
     """Return the evidence of a pattern, None if it is flat: touched is where its share of the top exceeds `level`."""
     height, width = pattern.shape
     top_mm = float(np.partition(pattern, -8, axis=None)[-8:].mean())
-    if not top_mm >= 0.05:  # [mm]; it may be all drift: a free pad that has warmed by a few kelvin makes .02 mm
+    if not top_mm >= 0.05:  # [mm]; it may be all drift: a free pad that has warmed by a few kelvin makes 0.02 mm
         return None
     variance = np.full_like(pattern, 0.05**2) if deviation is None else deviation * deviation
     variance += _moved(pattern, pose, pixel_mm)

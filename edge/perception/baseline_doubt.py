@@ -167,5 +167,5 @@ class BaselineDoubt:
     def _alike(zeroed: NDArray[np.float32]) -> bool:
         flat = zeroed.reshape(3, -1)
         common = np.median(flat, axis=1, keepdims=True)
-        # In real flat grips a taxel differs by .55 of the median and more, in simulated presses by more than all of it.
+        # In real flat grips taxels differ by 0.55 of the median and more, in simulated presses by more than all of it.
         return bool((np.abs(flat - common) <= 10 + 0.3 * np.abs(common)).all())

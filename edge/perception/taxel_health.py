@@ -39,8 +39,8 @@ wraps round."""
 NEAR_END_COUNTS: Final = 500.0
 LONE_COUNTS: Final = 1500.0  # size of a reading from which a lone taxel is checked: as large as a contact
 LONE_SHARE: Final = 0.015
-"""Share of the largest taxel's reading that the second largest reaches in any contact: at least .030 with a small
-sphere on one taxel alone, .063 on simulated taps, .67 on real grips."""
+"""Share of the largest taxel's reading that the second largest reaches in any contact: at least 0.030 with a small
+sphere on one taxel alone, 0.063 on simulated taps, 0.67 on real grips."""
 REST_COUNTS: Final = 500.0  # reading below which a taxel that was far from rest is believed again
 REACH_COUNTS: Final = ((-2800.0, 2800.0), (-2800.0, 2800.0), (-2800.0, 27000.0))
 """Limits of x, y, z: twice what sensors in the field have shown, whose z only rises when pressed."""

@@ -4,7 +4,7 @@ A press is local, drift is common. So the drift common to all taxels is followed
 share of the common drift explains it, and beyond that very slowly; a larger change of a taxel is a touch, long before
 it is a tap, and stops the tracking. The tracker works in blocks of half a second, each of which counts once the next
 one was free as well. A press so slow and even that it meets all these criteria is followed as drift, and lost: of
-simulated taps that grow to 1500 counts of summed z in 10 s .2 % to 4 %, in 30 s 14 to 44 %, by their evenness.
+simulated taps that grow to 1500 counts of summed z in 10 s 0.2 % to 4 %, in 30 s 14 to 44 %, by their evenness.
 """
 
 from dataclasses import dataclass
@@ -184,7 +184,7 @@ class DriftTracker:
         step = self._step
         ahead = level - self._followed if step is None else level - self._followed - step
         common, own = self._parts(ahead, self._voters)
-        # Ten counts are .01 N, nine times a block's highest noise.
+        # Ten counts are 0.01 N, nine times a block's highest noise.
         touched = (np.abs(own) > 10 + OWN_SHARE * np.abs(common)).any()
         if touched or np.abs(common).max() > COMMON_COUNTS:
             self._cause = "after a touch too light for a tap"
@@ -196,7 +196,7 @@ class DriftTracker:
         self.counts = self._followed
         # Smoothed over 2 s, so that a taxel's share of it is not one of noise.
         self._rate_per_s += np.float32(min(seconds / 2, 1.0)) * (moved / np.float32(seconds) - self._rate_per_s)
-        # In [counts/s]: four standard deviations of noise cause .2 of the common rate; while a taxel may be touched,
+        # In [counts/s]: four standard deviations of noise cause 0.2 of the common rate; while a taxel may be touched,
         # none follows a slow one on its own, nor creeps.
         slow_per_s, own_per_s = (np.float32(0.2), 0.05) if step is None else (np.float32(1), 0.0)
         share_per_s = np.maximum(np.abs(self._rate_per_s) - slow_per_s, 0)

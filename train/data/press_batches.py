@@ -73,7 +73,7 @@ def in_units(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 _NOTHING: Final = 0.35
 _ALL: Final = 0.35
-"""Shares of windows with no or all constants of the pad as input; in the others each is drawn with probability .5."""
+"""Shares of windows with no or all constants of the pad as input; in the others each is drawn with probability 0.5."""
 _GAIN_SPREADS: Final = ((0.4, 1.0), (0.15, 1.6), (0.15, 0.1), (0.15, 0.3), (0.15, 0.6))
 """Share of windows, and the spread of their gains over that of a new sensor.
 

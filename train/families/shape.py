@@ -106,7 +106,7 @@ def slot(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 
 
 def step(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
-    """Draw two faces side by side, one .05 to .5 mm lower."""
+    """Draw two faces side by side, one 0.05 to 0.5 mm lower."""
     return raised(x > 0, -log_uniform(rng, 0.05, 0.5))
 
 
@@ -136,7 +136,7 @@ def ridge(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 
 
 def wire(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
-    """Draw a straight or bent wire of .3 to 2 mm radius on a plate."""
+    """Draw a straight or bent wire of 0.3 to 2 mm radius on a plate."""
     radius, bend = log_uniform(rng, 0.3, 2), rng.uniform(-0.06, 0.06) * (rng.random() < 0.5)
     across = (x - bend * y * y) / np.sqrt(1 + (2 * bend * y) ** 2)
     round_ = np.sqrt(np.maximum(radius**2 - across**2, 0)) + radius
@@ -150,7 +150,7 @@ def saddle(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
 
 
 def relief(rng: np.random.Generator, x: Lengths, y: Lengths) -> Lengths:
-    """Draw a smooth random surface with waves of 4 to 20 mm and .05 to .6 mm RMS."""
+    """Draw a smooth random surface with waves of 4 to 20 mm and 0.05 to 0.6 mm RMS."""
     shortest, rms = log_uniform(rng, 4, 14), log_uniform(rng, 0.05, 0.6)
     waves = 24
     q = 2 * np.pi / rng.uniform(shortest, 2 * shortest, waves)

@@ -75,7 +75,7 @@ def relative_error(patterns: Tensor, truth: Tensor) -> Tensor:
 def relative_rms_error(patterns: Tensor, truth: Tensor) -> Tensor:
     """Return the mean over (n, H, W) of each pattern's RMS error as a share of its truth's RMS.
 
-    Its minimum is near the mean of the possible patterns, which gains .1 dB over their median (docs/decisions.md).
+    Its minimum is near the mean of the possible patterns, which gains 0.1 dB over their median (docs/decisions.md).
     """
     share = (patterns - truth) / truth_size(truth)
     return (share.square().mean(dim=(1, 2)) + 1e-6).sqrt().mean()  # the root's slope at 0 is unbounded

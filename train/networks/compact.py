@@ -158,7 +158,7 @@ class CompactNet(PatternNet):
         # Not an exponential, which would be unbounded on a window unlike all others. It begins at about 0.02 mm.
         logits = self.uncertainty(features.detach())[:, 0].to(newest.dtype) + log(expm1(0.02))
         uncertainty = F.softplus(logits) if self.training else _softplus(logits)
-        # At least .05 % of the indentation of such a tap.
+        # At least 0.05 % of the indentation of such a tap.
         deviation = (uncertainty + 1e-4) * self.deviation_scale
         return Seen(features, newest, entered.about, later, pattern, deviation, traction)
 

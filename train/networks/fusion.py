@@ -67,7 +67,7 @@ class FusionNet(CompactNet):
             for part in added.parameters():
                 nn.init.zeros_(part)
         self.own_share = nn.Parameter(torch.zeros(()))
-        self.log_reach = nn.Parameter(torch.full((2,), log(0.5)))  # cells at which a weight has fallen to .6
+        self.log_reach = nn.Parameter(torch.full((2,), log(0.5)))  # cells at which a weight has fallen to 0.6
         if intervals:
             self.add_intervals()
 

@@ -181,7 +181,7 @@ class PadGrid:
         compliance: Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.float64]],
     ) -> None:
         # A period of eight thicknesses limits the error of a punch's force to 5e-4; with one of twice the pad it was
-        # .8 % for a layer of 10 mm and 9 % for one of 50 mm.
+        # 0.8 % for a layer of 10 mm and 9 % for one of 50 mm.
         period = 2 * max(size, ceil(4 * layer.thickness_mm / cell_mm))
         self._kernels = np.fft.irfft2(compliance(*waves(period, cell_mm)), s=(period, period))
         self._size = size

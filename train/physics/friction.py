@@ -8,7 +8,7 @@ That is a convex problem: the least of 1/2 t C t - t g over tractions with |t| <
 compliance and g the surface's movement. It is solved by spectral projected gradients (Birgin, Martinez and Raydan
 2000), with one product with C per step. Slopes of the surface are taken as small. Friction does not resist here that
 pressure alone spreads the surface, and the effect of traction on pressure is left out (Goodman 1962): exact for a thick
-layer of nu = .5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
+layer of nu = 0.5, while the pressure under a wide contact on a bonded one would lean by some tens of per cent.
 """
 
 from typing import Final

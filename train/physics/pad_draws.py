@@ -20,7 +20,7 @@ _TILT_RAD: Final = 0.05
 _SEAT_MM: Final = 0.02
 """Standard deviation of one magnet's height about the pad's, in [mm].
 
-With the moment it makes a gain of .04, and with the chips' .075 the 15 % either way that is seen on devices.
+With the moment it makes a gain of 0.04, and with the chips' 0.075 the 15 % either way that is seen on devices.
 """
 _MOMENT: Final = 0.015  # standard deviation of one magnet's moment, relative to the nominal one, within one batch
 
@@ -34,7 +34,7 @@ class Pad:
     poisson: float = 0.45
     in_plane_share: float = 0.4
     """Factor on the in-plane movement that pressure alone gives the magnets, which in reality friction holds: grips
-    have an in-plane to normal ratio of .18 to .26, without the factor it would be .57."""
+    have an in-plane to normal ratio of 0.18 to 0.26, without the factor it would be 0.57."""
     magnet_height_mm: float = 2.5
     counts_per_newton: float = 1 / NEWTONS_PER_COUNT_Z  # summed z under an even load
     pitch_mm: float = USPA44.pitch_mm  # of another model in proportion to its own

@@ -35,9 +35,9 @@ class Nuisances:
     Spreads are cut at two standard deviations. One sensor reads all taps of a window.
 
     Attributes:
-        pose_error_mm: standard deviation of a tap's x and y, for a hand-mounted gripper; the paper's robot has .03 mm.
+        pose_error_mm: standard deviation of a tap's x and y, for a hand-mounted gripper; the paper's robot has 0.03 mm.
         pose_error_deg: the same of its angle.
-        hysteresis: largest share of a reading that lags, per sensor from .01: data sheet 1.1 %, in the field to 11 %.
+        hysteresis: largest share of a reading that lags, per sensor from 0.01: data sheet 1.1 %, in the field to 11 %.
         cross_talk: largest share of a reading that shows in its four neighbours in addition to that of the nominal
             magnets, per sensor: 5 % corresponds to half a millimetre of magnet height, by the dipole's law.
         gain_spread: standard deviation of a chip axis' gain about 1, per sensor: +-15 % observed.
