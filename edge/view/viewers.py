@@ -37,6 +37,7 @@ class Connections:
 
     def __init__(self) -> None:
         self._gone = 0  # since the last tidying up
+        self._due: asyncio.TimerHandle | None = None  # the next one
         self._all: dict[Connection, None] = {}  # in order of arrival
         self._granted: set[Connection] = set()
 
@@ -65,14 +66,22 @@ class Connections:
         self._all.pop(connection, None)
         self._granted.discard(connection)
         self._gone += 1
-        if self._gone in (1, _TIDY_CONNECTIONS):
-            connection.loop.call_later(TIDY_S if self._gone == 1 else 0, self._tidy)
+        if self._gone == _TIDY_CONNECTIONS:
+            connection.loop.call_soon(self._tidy, connection.loop)
+        elif self._due is None:
+            self._due = connection.loop.call_later(TIDY_S, self._tidy, connection.loop)
 
-    def _tidy(self) -> None:
-        """Collect the garbage of lost connections, since the collector is off while the loop runs."""
-        if self._gone and not gc.isenabled():
-            gc.collect()
+    def _tidy(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Collect the garbage of lost connections, since the collector is off while the loop runs.
+
+        Those that are still closing are collected a while later, also where no further one is lost.
+        """
+        if self._due is not None:
+            self._due.cancel()
+        self._due = loop.call_later(TIDY_S, self._tidy, loop) if self._gone else None
         self._gone = 0
+        if not gc.isenabled():
+            gc.collect()
 
 
 class Connection(ServerConnection):

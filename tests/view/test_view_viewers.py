@@ -155,7 +155,7 @@ def test_what_ends_the_server_is_told_and_the_run_goes_on(tmp_path):
 @pytest.mark.parametrize("client", CLIENTS)
 def test_clients_leave_nothing_behind(page, client, limits):
     """Garbage collection is off, as while the loop runs."""
-    limits(attended, TIDY_S=0.5)  # by then the last connection has ended, also on a busy machine
+    limits(attended, TIDY_S=0.05)
 
     def come_and_go(count):
         for number in range(count):
