@@ -1,6 +1,6 @@
 """Train a model for one sensor, from what its sensor file says of it; handed over where it is the better one.
 
-    python -m train.own sensor.toml --out mine
+    python -m train.own sensor.toml --recordings trials --out mine
     python -m train.own sensor.toml --recordings trials --mesh part.stl --minutes 60 --out mine
 
 The bundled models are for any pad. One for a single pad is better by decibels, and worse than none on another pad: so

@@ -233,7 +233,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             files = [f"kept in {options.out}"] if kept else []
             files += [f"the former file is now {options.out}{BACKUP_SUFFIX}"] if kept and replaced else []
             if kept and options.weight_g is not None:
-                files += wrapped(f"train a model for it alone: python -m train.own {options.out} --out mine", columns())
+                then = f"python -m train.own {options.out} --recordings FOLDER --out mine"
+                files += wrapped(f"train a model for it alone: {then}", columns())
             emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
             early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
             print(f"{link.name}{emulated}", page(examined.findings, columns()), *files, sep="\n", file=out)

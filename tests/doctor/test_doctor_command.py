@@ -164,7 +164,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     shown = (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines()
     # One word alone may be longer: the path of the latency timer, which a reader that comes late is told of.
     assert [line for line in shown if len(line) > 40 and len(line.split()) > 1] == []
-    assert f"python -m train.own {file} --out mine" in " ".join(done.out.split())
+    assert f"python -m train.own {file} --recordings FOLDER --out mine" in " ".join(done.out.split())
     known = load_sensor_file(file)
     entry = known.sensors["4"]
     assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
