@@ -29,7 +29,7 @@ import numpy as np
 from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.metrics import psnr_db
-from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, INT8_SUFFIX, POSED_MODEL, find_model
+from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, INT8_SUFFIX, find_model
 from edge.inference.contract import GAINS_CERTAINTY
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
@@ -39,20 +39,18 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from train.data.frozen_presses import freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
-from train.data.press_batches import OneSensor, stated_poses
+from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, recorded_grips
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.experiments.sensor.real import has_hole, play
 from train.families.catalogue import FIGURES, SHARES
-from train.fit import given_taps
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.physics.pad_draws import INPUTS, KNOWN, RANGES
 from train.report import bootstrap_interval
 from train.surfaces.meshes import mesh_name
-from train.surfaces.poses import MAX_TAPS
 
 _FIFTH: Final = 0.2
 """Share of a constant's range within which it is taken as known where nobody said how well, and by which the pads
@@ -159,17 +157,15 @@ def tried(world: World, folder: Path) -> tuple[float, float]:
     begun_s = time.monotonic()
     presses = solve_pad(small, 1)
     press_s = (time.monotonic() - begun_s) / TRIED / len(os.sched_getaffinity(0))
-    training = replace(_training("tried", OneSensor((0.0,) * KNOWN, 1.0), 1, TRIED // 4), start=None)
+    training = replace(_training("tried", OneSensor((0.0,) * KNOWN, 1.0), TRIED // 4), start=None)
     with tempfile.TemporaryDirectory(dir=folder) as drafts:
         report = fit_network(training, presses, freeze_presses(unseen, SEED).as_frozen_set(), Path(drafts))
     return press_s, report["elapsed_s"] / report["steps"]
 
 
-def _training(name: str, sensor: OneSensor, taps: int, steps: int) -> Training:
-    several = taps > 1
-    network, start = ("fusion-mtsr7", "mtsr.onnx") if several else ("compact-stsr", "stsr.onnx")
-    recipe = Recipe(steps, learning_rate=2e-3, given=given_taps(MAX_TAPS) if several else (1.0,), bf16=True)
-    return Training(name, network, recipe, start=start, options={"known": KNOWN}, sensor=sensor)
+def _training(name: str, sensor: OneSensor, steps: int) -> Training:
+    recipe = Recipe(steps, learning_rate=2e-3, bf16=True)
+    return Training(name, "compact-stsr", recipe, start="stsr.onnx", options={"known": KNOWN}, sensor=sensor)
 
 
 class Comparison(NamedTuple):
@@ -190,7 +186,7 @@ def compared(
         sets: presses that it was not trained on, by what they are; the last are of pads a little unlike the sensor.
         grips: recordings of the sensor that holds flat faces, which cover its pad.
     """
-    bundled = ModelSession(find_model(POSED_MODEL if own.contract.takes_poses else DEFAULT_MODEL))
+    bundled = ModelSession(find_model(DEFAULT_MODEL))
     sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled}
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
@@ -199,15 +195,13 @@ def compared(
     objections: list[str] = []
     for what, presses in sets.items():
         frozen = freeze_presses(presses, SEED + 1, sensor.nuisances)
-        windows, truth = frozen.windows(presses.taps), frozen.patterns()
-        poses = stated_poses(np.random.default_rng(SEED), presses.poses)
+        windows, truth = frozen.windows(1), frozen.patterns()
         patterns = {name: np.empty_like(truth) for name in models} | {"bilinear": bilinear(windows[:, 0])}
         for number, window in enumerate(windows):
             for name, model in models.items():  # in turn, so that both meet the same machine
                 row, scaled = model.contract.pad_row(knowledge.pad), model.contract.scale_window(window)
-                taken = poses[number] if model.contract.takes_poses else None
                 begun_ns = time.perf_counter_ns()
-                patterns[name][number] = model.run(scaled, row, taken)
+                patterns[name][number] = model.run(scaled, row)
                 times_us[name].append((time.perf_counter_ns() - begun_ns) / 1000)
         errors = {name: psnr_db(made, truth, own.contract.output_full_scale) for name, made in patterns.items()}
         for name, values in errors.items():
@@ -279,7 +273,7 @@ def _train(options: argparse.Namespace) -> int:
             "edge-sr doctor, let edge-sr learn its gains from contacts, or find constants by train.identify"
         )
     families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
-    world = World(families=families, ranges=knowledge.ranges, seed=options.seed, taps=options.taps)
+    world = World(families=families, ranges=knowledge.ranges, seed=options.seed)
     plan = _plan(options, world, work)
     even = replace(world, families=dict.fromkeys(families, 1.0), count=COMPARED, per_pad=6, begun=0.0)
     sets = {
@@ -297,10 +291,9 @@ def _train(options: argparse.Namespace) -> int:
             made[what] = make_presses(replace(of, seed=options.seed + 1000 * number), path)
     name, sensor = out.resolve().name, knowledge.sensor()
     frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
-    report = fit_network(_training(name, sensor, options.taps, plan.steps), presses, frozen, work)
+    report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work)
     _say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
-    bundled = find_model(POSED_MODEL if options.taps > 1 else DEFAULT_MODEL)
-    path = _exported(work, name, bundled)
+    path = _exported(work, name)
     verdict = compared(ModelSession(path), knowledge, {what: made[what] for what in list(sets)[2:]}, grips)
     _say(verdict.table)
     objection = verdict.objection
@@ -321,11 +314,12 @@ def _train(options: argparse.Namespace) -> int:
 COMPARED: Final = 480  # presses of each set that nothing is trained on
 
 
-def _exported(work: Path, name: str, bundled: Path) -> Path:
+def _exported(work: Path, name: str) -> Path:
     """Return the model of a checkpoint, in 8-bit integers: what they cost is part of the comparison."""
     # A command of its own: the export is the floor above, and needs the memory that training leaves.
-    command = [sys.executable, "-m", "export.to_onnx", work / f"{name}.pt", "--out", work, "--trust", bundled]
+    command = [sys.executable, "-m", "export.to_onnx", work / f"{name}.pt", "--out", work]
     command += ["--validation", work / "validation.npz", "--test", work / "test.npz", "--int8", work / "presses.npz"]
+    command += ["--trust", find_model(DEFAULT_MODEL)]
     path = work / f"{name}{INT8_SUFFIX}.onnx"
     path.unlink(missing_ok=True)
     subprocess.run([*map(str, command)], check=False)
@@ -337,13 +331,12 @@ def _exported(work: Path, name: str, bundled: Path) -> Path:
 def _plan(options: argparse.Namespace, world: World, work: Path) -> Plan:
     """Return the plan of an earlier run with the same time, or one by the speed of this machine."""
     path = work / "plan.json"
-    asked = {"minutes": options.minutes, "taps": options.taps}
-    if path.exists() and (kept := json.loads(path.read_text()))["asked"] == asked:
+    if path.exists() and (kept := json.loads(path.read_text()))["minutes"] == options.minutes:
         return Plan(kept["presses"], kept["steps"])
     press_s, step_s = tried(world, work)
     plan = planned(options.minutes, press_s, step_s)
     _say(plan.line(press_s, step_s))
-    text = json.dumps({"asked": asked, "presses": plan.presses, "steps": plan.steps}) + "\n"
+    text = json.dumps({"minutes": options.minutes, "presses": plan.presses, "steps": plan.steps}) + "\n"
     write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False)
     return plan
 
@@ -364,7 +357,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
     add("--minutes", type=positive, default=20.0, help="about how long all takes (20)")
-    add("--taps", type=int, default=1, help="taps of each sequence; more than 1 trains mtsr instead of stsr (1)")
     add("--seed", type=int, default=1, help="seed of everything random (1)")
     return parser
 

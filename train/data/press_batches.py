@@ -168,7 +168,7 @@ def _batch(
     presses: PressSet,
     readings: NDArray[np.float32],
     certainty: NDArray[np.float32],
-    sensor: OneSensor | None,
+    sensor: OneSensor | None = None,
 ) -> Batch:
     pads = known_of_pads(rng, presses.constants, certainty) if sensor is None else sensor.rows(rng, len(presses))
     return Batch(
@@ -226,10 +226,8 @@ def known_of_pads(
 class PosedBatches:
     """Batches of windows with poses, pad inputs, and truth; DatasetError if there are no presses of so many taps."""
 
-    def __init__(
-        self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int, sensor: OneSensor | None = None
-    ) -> None:
-        self._presses, self._seed, self._sensor = presses, seed, sensor
+    def __init__(self, presses: PressSet, given: tuple[float, ...], batch: int, seed: int) -> None:
+        self._presses, self._seed = presses, seed
         self._given = np.array(given) / sum(given)
         there = presses.counts.any(axis=(2, 3, 4)).sum(axis=1)
         self._rows = [np.flatnonzero(there >= taps) for taps in range(1, len(given) + 1)]
@@ -249,7 +247,7 @@ class PosedBatches:
             rows = self._single
         picked = self._presses.pick(rng.choice(rows, self._batch, replace=len(rows) < self._batch))
         picked = _some_of(rng, picked, taps)
-        batch = _batch(rng, picked, *read_by_many(rng, picked, _NEW_SENSORS, self._sensor), self._sensor)
+        batch = _batch(rng, picked, *read_by_many(rng, picked, _NEW_SENSORS))
         batch = replace(batch, poses=torch.from_numpy(stated_poses(rng, picked.poses)))
         return batch.mirrored(torch.from_numpy(rng.random(len(picked)) < 0.5))
 

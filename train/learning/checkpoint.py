@@ -162,7 +162,7 @@ def batches_of(
             f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others with --scale"
         )
     if posed:
-        return PosedBatches(data, recipe.given, recipe.batch, seed, sensor)
+        return PosedBatches(data, recipe.given, recipe.batch, seed)
     turned = data.only_turned() if len(recipe.given) > 1 else data
     return PressBatches(turned, recipe.given, recipe.batch, seed, sensor=sensor)
 
