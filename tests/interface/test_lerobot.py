@@ -73,6 +73,8 @@ def test_it_reads_an_emulated_sensor_as_a_robot_reads_its_cameras(plugin):
         assert state.keys() == camera.state_features.keys() and set(camera.state_features.values()) == {float}
         assert np.isfinite(list(state.values())).all() and len(state) in (49, 55)
         assert camera.read().shape == image.shape
+        window = camera.read_window()
+        assert window.shape == (4, 48) and window.dtype == np.float32 and len(np.unique(window, axis=0)) == 4
         time.sleep(0.05)
         with pytest.raises(TimeoutError, match=r"ms old, expected at most 0 ms"):
             camera.read_latest(max_age_ms=0)
@@ -114,6 +116,8 @@ def test_what_is_no_sensor_is_refused_unless_one_pretends(plugin):
         lost.connect()
     with pytest.raises(ValueError, match=r"image of 41x40, expected a multiple of the pattern's 40x40"):
         camera_of(plugin, width=41)
+    with pytest.raises(ValueError, match=r"window_scans is 0, expected 1 or more"):
+        camera_of(plugin, window_scans=0)
 
 
 def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plugin):
@@ -143,8 +147,10 @@ def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plu
 def test_a_recording_becomes_frames_at_the_dataset_s_rate(plugin):
     to_dataset = importlib.import_module("lerobot_camera_tactile_sr.to_dataset")
     model = load_model("stsr-int8")
-    frames = list(to_dataset.frames_of(demo_recording(), 10, model, 0.3))
-    features = to_dataset.features_of(frames[0][0], model.contract, "image")
+    results = to_dataset.results_of(demo_recording(), model)
+    scans = to_dataset.scans_in_frame(results, 10)
+    frames = list(to_dataset.frames_of(results, 10, model.contract, 0.3, scans))
+    features = to_dataset.features_of(frames[0][0], model.contract, "image", scans)
     for sensors, frame in frames:
         assert frame.keys() == features.keys() and sensors == frames[0][0]
         for key, values in frame.items():
@@ -153,6 +159,10 @@ def test_a_recording_becomes_frames_at_the_dataset_s_rate(plugin):
     assert min(touched) == 0 and max(touched) > 100
     names = features["observation.state"]["names"]
     assert len(names) == len(set(names)) == frames[0][1]["observation.state"].size
+    readings = np.array([result.zeroed.ravel() for result in results if result.zeroed is not None])
+    windows = np.stack([frame["observation.tactile_window"] for _, frame in frames])
+    assert (windows[0] == windows[0, 0]).all(), "the first reading stands for those before it"
+    assert (windows[1:].reshape(-1, 48) == readings[1 : 1 + scans * (len(frames) - 1)]).all(), "each scan, once"
 
 
 @pytest.mark.skipif(not REAL, reason="LeRobot is not installed: pip install lerobot")
@@ -169,6 +179,7 @@ def test_lerobot_loads_the_dataset_that_it_was_given(plugin, tmp_path):
     assert images.shape[1:] == (3, 40, 40) and images[:, 0].max() > 0.4
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["features"]["observation.state"]["dtype"] == "float32"
+    assert dataset[5]["observation.tactile_window"].shape == (10, 48)
 
 
 def test_the_example_observes_by_the_command_of_the_readme(plugin, argv, capsys):

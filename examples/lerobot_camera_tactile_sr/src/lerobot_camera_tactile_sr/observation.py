@@ -34,6 +34,13 @@ def state_names(contract: Contract) -> list[str]:
     return [*taxels, *(WRENCH if contract.traction_shape is not None else ()), BELIEVED]
 
 
+def taxels_of(result: Result) -> NDArray[np.float32]:
+    """Return the taxels of a scan in counts over the baseline, in the order of `state_names`; 0 where not available."""
+    if result.zeroed is None:
+        return np.zeros(result.scan.counts.size, dtype=np.float32)
+    return np.nan_to_num(result.zeroed.ravel(), nan=0.0).astype(np.float32)
+
+
 def state_of(result: Result, contract: Contract) -> dict[str, float]:
     """Return taxels in counts over the baseline, the wrench in N and N mm, and whether all of it is to be believed.
 

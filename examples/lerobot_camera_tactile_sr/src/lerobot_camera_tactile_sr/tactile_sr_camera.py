@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +23,7 @@ from edge.api import (
     open_runtime,
     open_source,
 )
-from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of
+from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of, taxels_of
 
 
 @CameraConfig.register_subclass("tactile_sr")
@@ -37,12 +38,15 @@ class TactileSrCameraConfig(CameraConfig):
     sensor_file: str | None = None  # file of edge-sr doctor
     name: str | None = None  # of the sensor where the source has several
     model: str = DEFAULT_MODEL  # name of a bundled model, or a file
+    window_scans: int = 4  # scans of read_window: at 100 a second, all that come within a frame of 1/30 s
     full_scale_mm: float = 0.3  # deformation and deviation at 255; it is fixed, so that images can be compared
     pretend: bool = False  # accept emulated sensors and recordings, on which no robot may act
 
     def __post_init__(self) -> None:
         if not self.full_scale_mm > 0:
             raise ValueError(f"full_scale_mm is {self.full_scale_mm}, expected a number above 0")
+        if self.window_scans < 1:
+            raise ValueError(f"window_scans is {self.window_scans}, expected 1 or more")
 
 
 class TactileSrCamera(Camera):
@@ -67,6 +71,7 @@ class TactileSrCamera(Camera):
         self._stop = threading.Event()
         self._changed = threading.Condition()
         self._newest: Result | None = None
+        self._readings = deque[NDArray[np.float32]](maxlen=config.window_scans)
         self._newest_s = 0.0
         self._fresh = False
         self._failure: Exception | None = None
@@ -101,6 +106,7 @@ class TactileSrCamera(Camera):
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
         self._stop.clear()
         self._newest, self._failure, self._fresh = None, None, False
+        self._readings.clear()
         self._thread = threading.Thread(target=self._follow, name="tactile-sr", daemon=True)
         self._thread.start()
         if not warmup:
@@ -142,6 +148,17 @@ class TactileSrCamera(Camera):
         Together with an image, read the state first: the image is then of the same scan or of a newer one.
         """
         return state_of(self._check_age(max_age_ms), self._contract)
+
+    def read_window(self, max_age_ms: int = 500) -> NDArray[np.float32]:
+        """Return the taxels of the newest scans, (window_scans, channels), the newest last; raises as `read_latest`.
+
+        In counts over the baseline, in the order of `state_features`; also of scans whose pattern a busy machine left
+        out. Until so many scans were read the first one stands for those before it.
+        """
+        self._check_age(max_age_ms)
+        with self._changed:
+            kept = list(self._readings)
+        return np.stack([kept[0]] * (self.config.window_scans - len(kept)) + kept)
 
     def disconnect(self) -> None:
         """Close the sensor; raises DeviceNotConnectedError where it is not connected."""
@@ -200,9 +217,12 @@ class TactileSrCamera(Camera):
             raise ValueError(
                 f"sensors {self._newest.scan.sensor} and {result.scan.sensor} send: set name to one of them"
             )
-        if (name is not None and result.scan.sensor != name) or result.state == "dropped":
+        if name is not None and result.scan.sensor != name:
             return
         with self._changed:
+            self._readings.append(taxels_of(result))
+            if result.state == "dropped":
+                return
             # As old as its readings: what waited on the way is not of now. A recording has times of its own.
             self._newest_s = time.monotonic() if result.source == "replay" else result.scan.on_bus_ns / 1e9
             self._newest, self._fresh = result, True

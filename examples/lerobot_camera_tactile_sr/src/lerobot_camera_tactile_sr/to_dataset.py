@@ -5,7 +5,9 @@ tactile-sr-to-lerobot press.mcap grip.mcap --repo-id me/presses --task "press th
 
 import argparse
 import sys
+from collections import deque
 from collections.abc import Iterator, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,10 @@ from edge.api import (
     open_recording,
     open_runtime,
 )
-from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of
+from lerobot_camera_tactile_sr.observation import AXES, image_of, state_names, state_of, taxels_of
 
 STATE = "observation.state"
+WINDOW = "observation.tactile_window"
 
 
 def image_key(sensor: str) -> str:
@@ -32,41 +35,61 @@ def image_key(sensor: str) -> str:
     return f"observation.images.{sensor.replace('/', '_')}"
 
 
-def features_of(sensors: Sequence[str], contract: Contract, dtype: str) -> dict[str, dict[str, Any]]:
-    """Return the features of a dataset, as `LeRobotDataset.create` takes them."""
+def features_of(sensors: Sequence[str], contract: Contract, dtype: str, scans: int) -> dict[str, dict[str, Any]]:
+    """Return the features of a dataset, as `LeRobotDataset.create` takes them, with so many scans in a frame."""
     image = {"dtype": dtype, "shape": (*contract.pattern_shape, 3), "names": ["height", "width", "channels"]}
     names = [f"{sensor}.{name}" for sensor in sensors for name in state_names(contract)]
     state = {"dtype": "float32", "shape": (len(names),), "names": names}
-    return {STATE: state} | {image_key(sensor): image for sensor in sensors}
+    channels = len(AXES) * contract.rows * contract.cols * len(sensors)
+    window = {"dtype": "float32", "shape": (scans, channels), "names": ["scan", "channel"]}
+    return {STATE: state, WINDOW: window} | {image_key(sensor): image for sensor in sensors}
 
 
-def frames_of(path: Path, fps: int, model: Any, full_scale_mm: float) -> Iterator[tuple[list[str], dict[str, Any]]]:
+def results_of(path: Path, model: Any) -> list[Result]:
+    """Return the results of a recording in the order of their times; BridgeError if it cannot be used."""
+    with open_recording(path) as source:
+        return sorted(Stream(source, open_runtime(model, source)), key=lambda one: one.scan.time_ns)
+
+
+def scans_in_frame(results: Sequence[Result], fps: int) -> int:
+    """Return how many scans of the fastest sensor come within a frame."""
+    times_ns: dict[str, list[int]] = {}
+    for result in results:
+        times_ns.setdefault(result.scan.sensor, []).append(result.scan.time_ns)
+    periods_ns = [float(np.median(np.diff(times))) for times in times_ns.values() if len(times) > 1]
+    return max((ceil(1e9 / fps / period) for period in periods_ns if period > 0), default=1)
+
+
+def frames_of(
+    results: Sequence[Result], fps: int, contract: Contract, full_scale_mm: float, scans: int
+) -> Iterator[tuple[list[str], dict[str, Any]]]:
     """Yield the sensors and the frame of each instant, from when every sensor is zeroed.
 
-    A frame holds the newest result of each sensor at that instant, never a later one.
-
-    Raises:
-        BridgeError: the recording cannot be used.
+    A frame holds the newest result of each sensor at that instant, never a later one, and its newest `scans` readings.
     """
-    with open_recording(path) as source:
-        results = list(Stream(source, open_runtime(model, source)))
     sensors = sorted({result.scan.sensor for result in results})
     newest: dict[str, Result] = {}
+    readings = {sensor: deque[Any](maxlen=scans) for sensor in sensors}
     due_ns: int | None = None
-    for result in sorted(results, key=lambda one: one.scan.time_ns):
+    for result in results:
         while due_ns is not None and result.scan.time_ns > due_ns:
-            yield sensors, _frame([newest[sensor] for sensor in sensors], model.contract, full_scale_mm)
+            yield sensors, _frame([newest[sensor] for sensor in sensors], readings, contract, full_scale_mm)
             due_ns += round(1e9 / fps)
         if result.zeroed is not None:
             newest[result.scan.sensor] = result
+            readings[result.scan.sensor].append(taxels_of(result))
         if due_ns is None and newest.keys() == set(sensors):
             due_ns = result.scan.time_ns
 
 
-def _frame(results: Sequence[Result], contract: Contract, full_scale_mm: float) -> dict[str, Any]:
+def _frame(
+    results: Sequence[Result], readings: dict[str, deque[Any]], contract: Contract, full_scale_mm: float
+) -> dict[str, Any]:
     state = [number for result in results for number in state_of(result, contract).values()]
     images = {image_key(one.scan.sensor): image_of(one, contract, full_scale_mm) for one in results}
-    return {STATE: np.array(state, dtype=np.float32), **images}
+    # Right after zeroing there are fewer readings than a frame has rows: the first one stands for those before it.
+    rows = [[kept[0]] * ((kept.maxlen or 0) - len(kept)) + list(kept) for kept in readings.values()]
+    return {STATE: np.array(state, dtype=np.float32), WINDOW: np.concatenate(rows, axis=1), **images}
 
 
 def convert(
@@ -88,12 +111,13 @@ def convert(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    loaded, dataset, known, count = load_model(model), None, None, 0
+    loaded, dataset, known, count, scans = load_model(model), None, None, 0, 0
     for path in recordings:
-        before = count
-        for sensors, frame in frames_of(path, fps, loaded, full_scale_mm):
+        before, results = count, results_of(path, loaded)
+        scans = scans or scans_in_frame(results, fps)
+        for sensors, frame in frames_of(results, fps, loaded.contract, full_scale_mm, scans):
             if dataset is None:
-                features = features_of(sensors, loaded.contract, "video" if video else "image")
+                features = features_of(sensors, loaded.contract, "video" if video else "image", scans)
                 dataset = LeRobotDataset.create(
                     repo_id, fps, features, root=root, robot_type="tactile_sr", use_videos=video
                 )
