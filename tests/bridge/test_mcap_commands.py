@@ -1,7 +1,6 @@
 """MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
 
 import json
-import re
 import resource
 import signal
 import subprocess
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording
 from cli_samples import start
-from edge_samples import BASELINE, ROOT, make_scan, write_model
+from edge_samples import BASELINE, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
@@ -24,7 +23,7 @@ from edge.doctor.examine import prepare
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2.map_messages import image_map
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -198,17 +197,6 @@ class TestRecord:
         assert f"recorded {path}: at most " in said
         assert 0 < len(recording.tracks[0].counts) < 160 and path.stat().st_size <= limit
         assert recording.notes == (recording.notes[0],) and "without an end" in recording.notes[0]
-
-
-def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
-    (script,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "recordings.md").read_text(), re.DOTALL)
-    results = make_results(odd_scans())
-    record_into(tmp_path / "press.mcap", results)
-    monkeypatch.chdir(tmp_path)
-    exec(compile(script, "recordings.md", "exec"), {})
-    shown = [one.pattern for one in results if one.scan.sensor == "4" and one.pattern is not None]
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(shown) > 0 and lines[0].endswith(f"(40, 40) {in_si('pattern', shown[0]).max()!s}")
 
 
 def test_the_doctor_goes_by_how_the_recorded_sensors_sat(tmp_path):

@@ -31,7 +31,7 @@ from edge.perception.event import Event
 from edge.pipeline.sink import RunFacts
 from edge.sinks import mcap_writer
 from edge.sinks.mcap import McapSink
-from edge.sinks.mcap_writer import CHUNK_S, McapFile
+from edge.sinks.mcap_writer import CHUNK_S
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import RESULT
@@ -152,23 +152,6 @@ class TestSink:
         sink.close()
         [track] = load_recording(tmp_path / "out.mcap").tracks
         np.testing.assert_array_equal(track.counts, [result.scan.counts for result in results[: 50 - left_out]])
-
-    def test_a_reader_seeks_by_its_chunks(self, tmp_path):
-        now_s = [0.0]
-        file = McapFile(tmp_path / "out.mcap", "", "", lambda: now_s[0])
-        channel = file.add_channel("/a", "cdr", file.add_schema("A", "ros2msg", "int8 a\n"), {})
-        for _ in range(100):
-            file.add_message(channel, round(now_s[0] * 1e9), b"\0\1\0\0\1")
-            now_s[0] += CHUNK_S
-            file.look()
-        file.close()
-        with (tmp_path / "out.mcap").open("rb") as opened:
-            reader = make_reader(opened, validate_crcs=True)
-            assert len(reader.get_summary().chunk_indexes) == 100
-            assert [message.log_time for _, _, message in reader.iter_messages("/a", starting_at=90 * 10**9)] == [
-                round(number * CHUNK_S * 1e9) for number in range(90, 100)
-            ]
-        assert list(tmp_path.iterdir()) == [tmp_path / "out.mcap"]
 
 
 class TestReplay:
