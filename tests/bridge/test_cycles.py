@@ -181,8 +181,7 @@ def test_a_link_whose_first_cycles_are_lost_mixes_none_later(lost, reader, again
 
 
 @pytest.mark.parametrize("reader", [PLAIN, STAMPED, USB], ids=str)
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("first_frame", [0, 7])
+@pytest.mark.parametrize(("order", "first_frame"), zip(ORDERS, (0, 7, 0, 7), strict=True))
 def test_another_order_is_learnt_and_nothing_mixed_meanwhile(reader, order, first_frame):
     ids = {IDS[place]: IDS[other] for place, other in enumerate(ORDERS[order])}
     usual = bus(300, first_frame=first_frame)

@@ -1,8 +1,6 @@
 """Scenes whose outcome is frozen; `python tests/golden/scenes.py [NAME...]` writes it again after a meant change."""
 
-import contextlib
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -10,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
@@ -19,8 +16,7 @@ if __name__ == "__main__":  # as pyproject.toml has it for pytest
 
 from bridge_samples import write_npz
 from bridge_samples import write_recording as write_csv
-from cli_samples import run
-from golden_runs import EDGE_SR, brief, differences, edge_sr, environment, outcome, short
+from golden_runs import EDGE_SR, brief, differences, edge_sr, environment, short
 
 from edge.api import demo_recording
 from firmware_bridge.can.slcan import CanFrame
@@ -247,7 +243,7 @@ def over_slcan(folder: Path, *, stamped: bool = True, faulty: bool = False) -> O
     # A port of its own: a pseudo-terminal that is gone may be given to another, and the run tries it again.
     port, adapter = folder / "port", Adapter(stamped=stamped, faulty=faulty)
     with Emulator([recording], jitter_s=0, adapter=adapter, link=port):
-        command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "5", *MODEL, *RECORDS]
+        command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "4", *MODEL, *RECORDS]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
     scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
     if not stamped:  # how many cycles wait for their pace to show depends on when they were read
@@ -322,11 +318,8 @@ def refusals(folder: Path) -> Outcome:
     write_csv(folder / "short.csv", counts[:10])
     (folder / "text.csv").write_text("a,b\n1,2\n")
     (folder / "press.txt").write_text("nothing")
-    with contextlib.chdir(folder), mock.patch.dict(os.environ, environment()):
-        ran = {line: run(*line.split()) for line in REFUSALS}  # in this process: as many starts take ten seconds
-    return {
-        line: {"exit": done.returncode, "stderr": outcome(0, "", done.stderr)["stderr"]} for line, done in ran.items()
-    }
+    ran = {line: edge_sr(folder, *line.split()) for line in REFUSALS}
+    return {line: {key: done[key] for key in ("exit", "stderr")} for line, done in ran.items()}
 
 
 def frozen_of(name: str) -> Path:

@@ -38,7 +38,7 @@ def test_every_place_that_decides_is_changed_and_no_word_is():
 
 
 def test_a_survey_of_one_module_is_a_page():
-    """python tests/system/mutation_survey.py taps --mutants 2"""
-    command = [sys.executable, "tests/system/mutation_survey.py", "taps", "--mutants", "2"]
+    """python tests/system/mutation_survey.py slcan --mutants 1"""
+    command = [sys.executable, "tests/system/mutation_survey.py", "slcan", "--mutants", "1"]
     page = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert page.startswith("# ") and "edge.perception.tap_tracker" in page
+    assert page.startswith("# ") and "firmware_bridge.can.slcan" in page
