@@ -22,8 +22,6 @@ from edge.cli import main as cli
 from edge.doctor.examine import prepare
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.map_messages import image_map
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -55,26 +53,14 @@ def made(tmp_path_factory):
     for first in (110, 135):
         counts[first : first + 20, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
-    for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
-        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 100)]) == 0
-        if any(own for own, _ in patterns(folder / "press.mcap").values()):
-            return folder
-        (folder / "press.mcap").unlink()
-    raise AssertionError("no scan of the contact got its pattern in any of ten recordings")
+    assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 100)]) == 0
+    return folder
 
 
 def replayed(made, name, *options, file="press.mcap"):
     arguments = ["replay", made / file, "--model", made / "tiny.onnx", "--sink", f"jsonl:{name}", *options]
     assert cli.main([str(one) for one in arguments]) == 0
     return [json.loads(line) for line in name.read_text().splitlines()]
-
-
-def patterns(path):
-    """Each scan's pattern by its number, and whether it was made for that scan."""
-    by_topic = messages_of(path)
-    said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
-    made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
-    return {said[at]["scan"]: (made_for[at], image_map(data).tobytes()) for at, data in by_topic["/finger/pattern"]}
 
 
 class TestOffline:
@@ -91,10 +77,6 @@ class TestOffline:
         for topic in ("scan", "baseline", "pattern", "deviation"):
             assert again[f"/finger/{topic}"] == other[f"/finger/{topic}"] != []
         assert again["/finger/scan"] == recorded["/finger/scan"], "and at their times on the wall"
-        replayed(made, tmp_path / "c.jsonl", "--sink", f"mcap:{tmp_path}/c.mcap", "--every-scan")
-        offline = patterns(tmp_path / "c.mcap")
-        made_then = {scan: pattern for scan, (own, pattern) in patterns(made / "press.mcap").items() if own}
-        assert made_then and made_then.items() <= {scan: one for scan, (_, one) in offline.items()}.items()
 
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
     def test_it_begins_with_the_baseline_of_its_first_scan(self, made, tmp_path, suffix):
@@ -127,7 +109,7 @@ class TestOffline:
         path = tmp_path / "press.npz"
         np.savez(path, **(arrays | {"baseline_age_s": np.full(5, np.nan if age_s is None else age_s)}))
         assert age_s is None or load_recording(path).tracks[0].time_ns[-1] < age_s * 1e9
-        for generation in range(3):
+        for generation in range(2):
             again = tmp_path / f"{generation}.mcap"
             got = replayed(made, tmp_path / f"{generation}.jsonl", "--sink", f"mcap:{again}", file=path)
             assert [one["state"] for one in got] == ["contact"] * 5

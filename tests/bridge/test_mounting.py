@@ -73,13 +73,6 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
     assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
 
 
-@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
-def test_forces_of_the_vendors_server_are_turned(mounting):
-    assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), LastingLink)
-    as_mapped = open_source("xela-server:ws://robot", mountings={"1": Mounting(gains=(2.0,) * 48)})
-    assert not isinstance(as_mapped, LastingLink)
-
-
 def test_what_a_mounting_moves_and_what_costs_nothing():
     """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
     assert placed_map(USPA44_MAP, {"4": Mounting(swap_xy=True)}) is USPA44_MAP
