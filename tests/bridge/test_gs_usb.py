@@ -223,6 +223,17 @@ def test_a_transfer_cut_short_takes_nothing_from_the_next(kept_bytes):
     assert (counted["skipped_bytes"], counted["frames"], counted["bus_off"]) == (kept_bytes, 47, 0)
 
 
+def test_frames_of_an_unknown_channel_swallow_no_other():
+    decoder = GsUsbDecoder(stamped=True)
+    taken = []
+    for frame in SCAN:
+        for channel in (3, 0):
+            taken += decoder.feed(host_frame(frame, stamp_us=1, channel=channel))
+            decoder.end_transfer()
+    assert [one.frame for one in taken] == SCAN
+    assert decoder.counters()["other_channels"] == 16 and decoder.counters()["skipped_bytes"] == 0
+
+
 @pytest.mark.parametrize(("classes", "data"), [(0x100, bytes(8)), (0x04, bytes((0, 0x40))), (0x204, bytes((0, 0x08)))])
 def test_passive_ends_with_what_the_controller_says(classes, data):
     """Classes and data are as in Linux's error.h."""
