@@ -1,6 +1,7 @@
 """MCAP recordings of `edge-sr record`: whole whatever ended it, and replayed offline."""
 
 import json
+import re
 import resource
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording
 from cli_samples import start
-from edge_samples import BASELINE, make_scan, write_model
+from edge_samples import BASELINE, ROOT, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
@@ -22,6 +23,8 @@ from edge.cli import main as cli
 from edge.doctor.examine import prepare
 from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
+from edge.sinks.ros2 import cdr_messages as ros_messages
+from edge.sinks.ros2.map_messages import image_map, in_si
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -53,14 +56,26 @@ def made(tmp_path_factory):
     for first in (110, 135):
         counts[first : first + 20, 2, 1, 1] += 3000
     write_recording(folder / "finger.csv", counts)
-    assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 100)]) == 0
-    return folder
+    for _ in range(10):  # a machine that is busy may let all of a contact wait, and drop it
+        assert cli.main(["record", f"{folder}/press.mcap", *source_of(folder, 100)]) == 0
+        if any(own for own, _ in patterns(folder / "press.mcap").values()):
+            return folder
+        (folder / "press.mcap").unlink()
+    raise AssertionError("no scan of the contact got its pattern in any of ten recordings")
 
 
 def replayed(made, name, *options, file="press.mcap"):
     arguments = ["replay", made / file, "--model", made / "tiny.onnx", "--sink", f"jsonl:{name}", *options]
     assert cli.main([str(one) for one in arguments]) == 0
     return [json.loads(line) for line in name.read_text().splitlines()]
+
+
+def patterns(path):
+    """Each scan's pattern by its number, and whether it was made for that scan."""
+    by_topic = messages_of(path)
+    said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
+    made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
+    return {said[at]["scan"]: (made_for[at], image_map(data).tobytes()) for at, data in by_topic["/finger/pattern"]}
 
 
 class TestOffline:
@@ -77,6 +92,10 @@ class TestOffline:
         for topic in ("scan", "baseline", "pattern", "deviation"):
             assert again[f"/finger/{topic}"] == other[f"/finger/{topic}"] != []
         assert again["/finger/scan"] == recorded["/finger/scan"], "and at their times on the wall"
+        replayed(made, tmp_path / "c.jsonl", "--sink", f"mcap:{tmp_path}/c.mcap", "--every-scan")
+        offline = patterns(tmp_path / "c.mcap")
+        made_then = {scan: pattern for scan, (own, pattern) in patterns(made / "press.mcap").items() if own}
+        assert made_then and made_then.items() <= {scan: one for scan, (_, one) in offline.items()}.items()
 
     @pytest.mark.parametrize("suffix", ["mcap", "npz"])
     def test_it_begins_with_the_baseline_of_its_first_scan(self, made, tmp_path, suffix):
@@ -109,7 +128,7 @@ class TestOffline:
         path = tmp_path / "press.npz"
         np.savez(path, **(arrays | {"baseline_age_s": np.full(5, np.nan if age_s is None else age_s)}))
         assert age_s is None or load_recording(path).tracks[0].time_ns[-1] < age_s * 1e9
-        for generation in range(2):
+        for generation in range(3):
             again = tmp_path / f"{generation}.mcap"
             got = replayed(made, tmp_path / f"{generation}.jsonl", "--sink", f"mcap:{again}", file=path)
             assert [one["state"] for one in got] == ["contact"] * 5
@@ -179,6 +198,17 @@ class TestRecord:
         assert f"recorded {path}: at most " in said
         assert 0 < len(recording.tracks[0].counts) < 160 and path.stat().st_size <= limit
         assert recording.notes == (recording.notes[0],) and "without an end" in recording.notes[0]
+
+
+def test_what_the_page_says_of_reading_it_works(tmp_path, monkeypatch, capsys):
+    (script,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "recordings.md").read_text(), re.DOTALL)
+    results = make_results(odd_scans())
+    record_into(tmp_path / "press.mcap", results)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(script, "recordings.md", "exec"), {})
+    shown = [one.pattern for one in results if one.scan.sensor == "4" and one.pattern is not None]
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(shown) > 0 and lines[0].endswith(f"(40, 40) {in_si('pattern', shown[0]).max()!s}")
 
 
 def test_the_doctor_goes_by_how_the_recorded_sensors_sat(tmp_path):

@@ -16,8 +16,10 @@ from contextlib import contextmanager, suppress
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, wait_for, write_model
-from view_samples import HANDSHAKE, LONG_PING
+from view_samples import HANDSHAKE, LONG_PING, Swallowing
+from websockets.sync.client import connect
 
+from edge.sinks.json_encoding import unpack
 from edge.terminal.stop_signals import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
@@ -111,6 +113,21 @@ def end(process, number):
     process.send_signal(number)
     words = process.communicate(timeout=LONG_S)[1]
     return process.returncode, words.decode()
+
+
+def test_a_viewer_whose_network_vanishes_holds_up_no_end():
+    settings = {"compression": None, "close_timeout": 0, "max_queue": 1000}
+    with (
+        running(*WATCHED) as process,
+        Swallowing(page_port(process)) as network,
+        connect(f"ws://127.0.0.1:{network.port}/ws", **settings) as viewer,
+    ):
+        while unpack(viewer.recv(60))[0].get("state") != "contact":
+            pass
+        network.swallow()
+        time.sleep(2)
+        code, words = end(process, signal.SIGINT)
+    assert code == 0 and "EMULATED demo:" in words
 
 
 def test_a_local_viewer_that_pings_and_does_not_read_holds_up_no_end():
