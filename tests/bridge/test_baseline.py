@@ -273,52 +273,41 @@ def test_saving_where_nothing_can_be_written(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"format": "other"}, "'format': \"other\", expected 'tactile-baseline'"),
-        ({"version": 2}, "'version': 2, expected 1"),
-        ({"baselines": []}, "'baselines'"),
-        ({"baselines": [{}, 1]}, r"'baselines': \[{}, 1\], expected a list of at least one object"),
-        ({"sensor": ""}, "'sensor'"),
-        ({"sensor": 4}, "'sensor'"),
-        ({"created_unix_s": 0}, "'created_unix_s'"),
-        ({"created_unix_s": "5"}, "'created_unix_s'"),
-        ({"created_unix_s": 1e300}, "'created_unix_s'"),
-        ({"scans": 0}, "'scans'"),
-        ({"scans": 2**31}, "'scans'"),
-        ({"counts": None}, "'counts': null"),
-        ({"counts": [[[]], [[]], [[]]]}, "'counts'"),
-        ({"counts": REST.tolist()[:2]}, "'counts'"),
-        ({"counts": REST.ravel().tolist()}, "'counts'"),
-        ({"counts": [REST.tolist()] * 3}, "'counts'"),
-        ({"counts": [[[1, 2], [3]], [[4]], [[5]]]}, "'counts'"),
-        ({"counts": with_cell(65_536)}, "'counts'"),
-        ({"counts": with_cell(-1)}, "'counts'"),
-        ({"counts": with_cell(float("nan"))}, "'counts'"),
-        ({"counts": with_cell(False)}, "'counts'"),
-        ({"counts": with_cell(16_000)}, "'id': .*the file was changed"),
-        ({"id": "00000000"}, "'id': '00000000'"),
-        ({"id": None}, "'id': None"),
+ENTRY = {"sensor": "4", "created_unix_s": 1_000.0, "scans": 100, "counts": REST.tolist()}
+WRONG = {
+    "format": ["other"],
+    "version": [2],
+    "baselines": [[], [{}, 1], [ENTRY, ENTRY]],
+    "sensor": ["", 4],
+    "created_unix_s": [0, "5", 1e300],
+    "scans": [0, 2**31],
+    "counts": [
+        *(None, [[[]], [[]], [[]]], REST.tolist()[:2], REST.ravel().tolist(), [REST.tolist()] * 3),
+        *([[[1, 2], [3]], [[4]], [[5]]], *map(with_cell, (65_536, -1, float("nan"), False))),
     ],
-)
-def test_files_that_are_none(tmp_path, changes, match):
+    "id": ["00000000", None],
+}
+"""Values that cannot be, by key."""
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in WRONG.items() for value in values])
+def test_a_value_that_cannot_be_is_refused_by_its_key(tmp_path, key, value):
     path = tmp_path / "zero.json"
     save_baselines(path, [made()])
     document = json.loads(path.read_text())
-    (document if changes.keys() <= document.keys() else document["baselines"][0]).update(changes)
+    (document if key in document else document["baselines"][0])[key] = value
     path.write_text(json.dumps(document))
-    with pytest.raises(RecordingError, match=rf"zero\.json.*{match}.*zero again") as refused:
+    shown = "'sensor': '4', expected each sensor once" if value == [ENTRY, ENTRY] else f"'{key}': "
+    with pytest.raises(RecordingError, match=rf"zero\.json.*{shown}.*zero again") as refused:
         load_baselines(path)
     assert one_line(refused)
 
 
-def test_a_sensor_twice(tmp_path):
+def test_counts_that_were_changed_are_refused_by_their_id(tmp_path):
     path = tmp_path / "zero.json"
     save_baselines(path, [made()])
-    document = json.loads(path.read_text())
-    path.write_text(json.dumps(document | {"baselines": document["baselines"] * 2}))
-    with pytest.raises(RecordingError, match=r"'sensor': '4', expected each sensor once.*zero again"):
+    path.write_text(path.read_text().replace("16000", "16001", 1))
+    with pytest.raises(RecordingError, match=r"'id': .*the file was changed"):
         load_baselines(path)
 
 

@@ -1,6 +1,5 @@
 """The controller and the adapter that are emulated: their frames, times and answers, on a pseudo-terminal as well."""
 
-import random
 import time
 
 import can
@@ -11,23 +10,11 @@ from can.interfaces.slcan import slcanBus
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline, scan_frames
+from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
-from firmware_bridge.scans.scan import ABSENT
-
-# Frames of the controller.
-
-
-def test_the_ends_of_the_range_and_absent_taxels():
-    counts = make_counts(1)[0]
-    counts[:, 0, 3] = [0, 65_535, 256]
-    counts[:, 1, 1] = ABSENT
-    frames = scan_frames(counts, 15, random.Random(0))  # columns run backwards
-    assert frames[0].data[1:7] == bytes.fromhex("0000 FFFF 0100")
-    assert len(frames) == 15 and 0x12F not in {frame.can_id for frame in frames}
 
 
 def timeline(rate_hz, jitter_s):
@@ -89,20 +76,6 @@ def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
         time.sleep(0.4)  # the terminal is full after .1 s; nor does it take its lateness for a stop, amid a scan
         scans = read_until_lost(link)
     assert (stacked(scans) == make_counts(200)).all()
-
-
-def test_it_tells_when_the_last_frame_of_each_scan_is_handed_on():
-    stamps = []
-    recordings = [make_recording(10), make_recording(10, seed=1)]
-    emulator = Emulator(recordings, frame_s=2e-4, on_scan=lambda *stamp: stamps.append(stamp))
-    begun_ns = time.monotonic_ns()
-    with emulator, SlcanSerialLink(emulator.port) as link:
-        scans = read_until_lost(link)
-    for controller in (4, 6):
-        told_ns = [time_ns for name, time_ns in stamps if name == controller]
-        came_ns = [scan.time_ns for scan in scans if scan.sensor == str(controller)]
-        assert len(told_ns) == len(came_ns) == 10
-        assert all(begun_ns < before < after for before, after in zip(told_ns, came_ns, strict=True))
 
 
 def test_python_can_reads_our_emulator():

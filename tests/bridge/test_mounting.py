@@ -22,7 +22,7 @@ mountings = st.builds(
     order=st.permutations(AS_MAPPED).map(tuple),
     swap_xy=st.booleans(),
     signs=st.tuples(*[st.sampled_from((1, -1))] * 3),
-    gains=st.lists(st.sampled_from((0.5, 1.0, 2.0)), min_size=48, max_size=48).map(tuple),
+    gains=st.integers(0, 99).map(lambda seed: tuple(np.random.default_rng(seed).choice((0.5, 1.0, 2.0), 48).tolist())),
 )
 TURNED = Mounting(order=tuple(np.rot90(np.arange(16).reshape(4, 4)).ravel().tolist()))
 
@@ -71,13 +71,6 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
         assert told is not None and np.array_equal(told.ravel(), was.ravel()[list(mounting.order)])
     nothing = mounting.place(replace(wire, vendor=VendorReading())).vendor
     assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
-
-
-@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
-def test_forces_of_the_vendors_server_are_turned(mounting):
-    assert isinstance(open_source("xela-server:ws://robot", mountings={"1": mounting}), LastingLink)
-    as_mapped = open_source("xela-server:ws://robot", mountings={"1": Mounting(gains=(2.0,) * 48)})
-    assert not isinstance(as_mapped, LastingLink)
 
 
 def test_what_a_mounting_moves_and_what_costs_nothing():

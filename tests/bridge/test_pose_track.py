@@ -21,14 +21,6 @@ def test_a_pose_seen_from_another_gives_the_place_again():
     assert seen.error_mm == pytest.approx(np.hypot(0.2, 0.2)) and seen.error_deg == pytest.approx(np.hypot(1, 1))
 
 
-def test_a_pose_between_two_turns_the_shorter_way_round():
-    track = PoseTrack()
-    track.add(0, PadPose(0, 0, 175))
-    track.add(100 * MS, PadPose(2, -4, -175))
-    pose = track.at(25 * MS)
-    assert (pose.x_mm, pose.y_mm) == pytest.approx((0.5, -1.0)) and pose.turn_deg == pytest.approx(177.5)
-
-
 def test_there_is_no_pose_beyond_those_that_came():
     track = PoseTrack()
     assert track.at(0) is None

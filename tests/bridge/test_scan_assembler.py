@@ -120,17 +120,6 @@ def test_renewed_is_against_the_taxels_own_reading_before():
     assert counters(assembler) == expected
 
 
-@pytest.mark.parametrize("apart_ns", [1, 2 * SCAN_GIVEN_UP_NS])
-def test_a_flipped_id_invents_no_sensor(apart_ns):
-    """Nor do stray readings add up to one."""
-    assembler, phantom = ScanAssembler(USPA44_MAP), cycle(0, "5")
-    scans = feed(assembler, cycle(0))
-    for number, reading in enumerate([*phantom[:7], phantom[0]._replace(x=1), *phantom[7:]]):
-        scans += assembler.feed(reading, 100 + number * apart_ns) if apart_ns > 1 or number < 8 else []
-    assert {scan.sensor for scan in scans} == {"4"}
-    assert counters(assembler)["unconfirmed"] == (7 if apart_ns == 1 else 16)
-
-
 def test_a_bit_that_flips_in_one_id_of_fifty_invents_no_sensor():
     """The same bit each time, so that the readings of a pretended sensor come at random, seldom two of one cycle."""
     assembler, noise, ms, found = ScanAssembler(USPA44_MAP), random.Random(1), 1_000_000, set()
@@ -300,19 +289,6 @@ def test_a_cycle_takes_doubts_of_the_order_away():
     assert assembler.longest_cycle_ns(WHOLE) == 0, "one more, and the order is another"
     assert assembler.fewest_missing() == 1, "no pause is slept through while it is learnt"
     assert counters(assembler)["resynchronised"] == 15 * 3 and counters(assembler)["scans"] == 2
-
-
-@pytest.mark.parametrize("stamped", [False, True])
-def test_a_few_taxels_set_apart_by_a_pause_are_a_scan(stamped):
-    assembler, factor = ScanAssembler(USPA44_MAP), 10 if stamped else 1
-    feed_at(assembler, cycle(0), stamped=stamped)
-    assert feed_at(assembler, cycle(1)[:7], stamped=stamped) == []
-    later_ns = (LONGEST_PAUSE_NS + 1) * factor
-    torn, whole = feed_at(assembler, cycle(2), later_ns, stamped=stamped)
-    assert torn.fresh.sum() == 7 and whole.whole
-    assert (torn.counts[2][torn.fresh] == 3001).all() and (torn.counts[:, ~torn.fresh] == ABSENT).all()
-    assert torn.time_ns == 0 and torn.device_ns == (-7 if stamped else None)
-    assert counters(assembler) == {"readings": 39, "scans": 3, "torn_wire": 1, "missing_taxels": 9}
 
 
 @pytest.mark.parametrize("stamped", [False, True])

@@ -50,9 +50,9 @@ def test_a_scan_for_every_renewal_however_often_it_is_told():
 
 def test_a_still_pad_gives_repeated_scans():
     server = Server()
-    scans = [scan for step in range(1500) for scan in server.say(2 * step)]
+    scans = [scan for step in range(600) for scan in server.say(2 * step)]
     assert scans[0].whole and all(scan.repeated for scan in scans[1:])
-    assert 180 <= len(scans) <= 201  # three seconds of 100 Hz, each due after a period and a half
+    assert 72 <= len(scans) <= 81  # 1.2 s of 100 Hz, each due after a period and a half
     assert server.scans.trouble is None, "it is no dead cable"
 
 
@@ -80,28 +80,20 @@ def test_a_taxel_without_updates_is_absent_unless_it_changes():
     assert scan.whole
 
 
-def test_the_last_reading_of_a_dying_sensor_is_no_sign_of_life():
-    server = Server()
-    server.say(0)
-    assert len([scan for step in range(1, 300) for scan in server.say(10 * step, cycle(1), ups=0.0)]) == 1
-    (scan,) = server.say(3000, cycle(3))
-    assert scan.whole
-
-
 @pytest.mark.parametrize("unknown", [{"ups": 0.0}, {"time_s": UNIX_S}, {"ups": 0.0, "time_s": UNIX_S}])
 def test_a_server_that_states_nothing_but_changes_is_used(unknown):
     """A third of the taxels in every message: none of the scans is torn for it."""
     server = Server()
     scans = []
-    for step in range(1200):
+    for step in range(600):
         grown = (step + np.arange(16) % 3) // 3
         scans += server.say(10 * step / 3, REST_COUNTS.reshape(3, 16) + grown, **unknown)
-    assert 395 <= len(scans) <= 401 and sum(scan.whole for scan in scans) >= 0.98 * len(scans)
+    assert 195 <= len(scans) <= 201 and sum(scan.whole for scan in scans) >= 0.98 * len(scans)
     assert server.scans.trouble is None
     if "ups" in unknown:
         assert all(scan.vendor is not None and scan.vendor.ups_hz is None for scan in scans)
-    late = [scan for step in range(400, 800) for scan in server.say(10 * step, cycle(900), **unknown)]
-    assert [scan for scan in late if scan.time_ns > 5100 * MS] == [] and server.scans.trouble is not None
+    late = [scan for step in range(200, 600) for scan in server.say(10 * step, cycle(900), **unknown)]
+    assert [scan for scan in late if scan.time_ns > 3100 * MS] == [] and server.scans.trouble is not None
 
 
 @pytest.mark.parametrize(
@@ -133,11 +125,11 @@ def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
     server = Server()
     assert server.say(0, cycle(1))
     server.clock_s += set_by_s
-    scans = [scan for step in range(1, 700) for scan in server.say(100 * step, cycle(1), time_s=UNIX_S)]
+    scans = [scan for step in range(1, 200) for scan in server.say(100 * step, cycle(1), time_s=UNIX_S)]
     assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
     assert server.scans.trouble is not None and "nothing arrives from sensor 1" in server.scans.trouble
     server.scans.begin()
-    assert server.say(80_000, cycle(1), time_s=UNIX_S) == []
+    assert server.say(20_100, cycle(1), time_s=UNIX_S) == []
 
 
 def test_a_slow_taxel_does_not_hold_up_the_others():
@@ -203,37 +195,29 @@ def test_memory_is_bounded():
     assert len({scan.sensor for scan in found}) == MOST_SENSORS
 
 
-def test_when_it_was_acquired():
+@pytest.mark.parametrize("age_ms", [6, 40, -5, 3_600_000])
+def test_when_it_was_acquired_unless_that_cannot_be(age_ms):
     server = Server()
-    (first,) = server.say(0, age_ms=6)
-    assert first.device_ns is not None and first.time_ns - first.device_ns == pytest.approx(6 * MS, abs=2000)
-    (second,) = server.say(10, cycle(1), age_ms=40)
-    assert second.device_ns is not None and second.time_ns - second.device_ns == pytest.approx(40 * MS, abs=2000)
-    assert server.counted("stale_scans") == (0,)
-
-
-def test_readings_that_are_always_of_some_age_are_no_trouble():
-    """The vendor's own sample has 0.3 s from acquired to sent."""
-    server = Server()
-    for step in range(300):
-        server.say(10 * step, cycle(step), age_ms=300 + step % 7)
-        assert server.scans.trouble is None
+    (scan,) = [*server.say(0), *server.say(10, cycle(1), age_ms=age_ms)][1:]
+    expected_ns = age_ms * MS if 0 < age_ms < 1000 else None
+    assert (scan.device_ns and scan.time_ns - scan.device_ns) == (expected_ns and pytest.approx(expected_ns, abs=2000))
     assert server.counted("stale_scans") == (0,)
 
 
 def test_what_comes_later_than_usual_is_counted_and_is_trouble():
+    """Readings that are always of some age are none: the vendor's own sample has 0.3 s from acquired to sent."""
     server = Server()
     for step in range(10):
-        server.say(10 * step, cycle(step), age_ms=30)
+        server.say(10 * step, cycle(step), age_ms=300)
     for step in range(10, 70):
-        server.say(10 * step, cycle(step), age_ms=30, way_ms=300)
+        server.say(10 * step, cycle(step), age_ms=300, way_ms=300)
     assert server.counted("stale_scans") == (60,)
     assert server.scans.trouble is not None and "older by 150 ms than usual" in server.scans.trouble
     for step in range(100, 120):
-        server.say(10 * step, cycle(step), age_ms=30)
+        server.say(10 * step, cycle(step), age_ms=300)
     assert server.scans.trouble is not None  # no flicker
     for step in range(120, 200):
-        server.say(10 * step, cycle(step), age_ms=30)
+        server.say(10 * step, cycle(step), age_ms=300)
     assert server.scans.trouble is None
 
 
@@ -255,12 +239,6 @@ def test_another_connection_may_be_another_clock():
     server.clock_s -= 0.05
     (scan,) = server.say(10, cycle(1))
     assert scan.device_ns == pytest.approx(scan.time_ns, abs=2000)
-
-
-@pytest.mark.parametrize("age_ms", [-5.0, 3_600_000.0])
-def test_an_age_that_cannot_be_is_none(age_ms):
-    (scan,) = Server().say(0, age_ms=age_ms)
-    assert scan.device_ns is None
 
 
 @pytest.mark.parametrize(

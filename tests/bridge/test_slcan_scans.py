@@ -2,7 +2,6 @@
 
 import random
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -113,21 +112,3 @@ def test_any_chunking_gives_the_same_scans_and_counters(seed, sensors, stamped, 
         for one, other in zip(mine, theirs, strict=True):
             assert one.number == other.number
             assert (one.counts == other.counts).all() and (one.renewed == other.renewed).all()
-
-
-@pytest.mark.parametrize("lost", [0.0, 0.002, 0.05])
-@pytest.mark.parametrize("longest", [40, 400])
-def test_mixed_cycles_read_late_give_the_scans_of_their_frames(longest, lost):
-    noise, names = random.Random(longest), ("4", "6", "8", "10")
-    lines = text_of(60, names, stamped=True).split(b"\r")[:-1]
-    timed = [(150_000 * at, line + b"\r") for at, line in enumerate(lines) if noise.random() >= lost]
-    late, one_by_one, got, at = SlcanScans(), SlcanScans(), [], 0
-    expected = [scan for now_ns, line in timed for scan in one_by_one.feed(line, now_ns)]
-    while at < len(timed):
-        piece = timed[at : at + noise.randint(1, longest)]
-        got, at = got + late.feed(b"".join(line for _, line in piece), piece[-1][0]), at + len(piece)
-    assert late.counters() == one_by_one.counters() and len(got) > 200
-    for name in names:
-        mine, theirs = ([scan for scan in some if scan.sensor == name] for some in (got, expected))
-        for scan, other in zip(mine, theirs, strict=True):
-            assert (scan.number, scan.counts.tolist()) == (other.number, other.counts.tolist())

@@ -1,15 +1,13 @@
 """Scenes whose outcome is frozen; `python tests/golden/scenes.py [NAME...]` writes it again after a meant change."""
 
-import contextlib
 import json
-import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
@@ -18,11 +16,67 @@ if __name__ == "__main__":  # as pyproject.toml has it for pytest
 
 from bridge_samples import write_npz
 from bridge_samples import write_recording as write_csv
-from cli_samples import run
-from golden_runs import EDGE_SR, Adapter, brief, differences, edge_sr, environment, outcome, short
-from golden_world import ABSENT, FREE_SCANS, PRESSES, gripped, pressed
+from golden_runs import EDGE_SR, brief, differences, edge_sr, environment, short
 
 from edge.api import demo_recording
+from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.emulation.xela_controller import SlcanAdapter
+from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.scan import ABSENT
+
+PITCH_MM = 4.7
+PLACES_MM = (np.arange(4) - 1.5) * PITCH_MM
+REST = np.array([16_000, 16_400, 38_600])[:, None, None] + 37 * np.arange(16).reshape(4, 4)
+FREE_SCANS = 110
+"""Scans of the free pad before the first press: those of a zeroing, and some."""
+TAP_SCANS = 40
+
+
+@dataclass(frozen=True)
+class Press:
+    """Round press: its place and radius in [mm], the z of its strongest taxel in [counts], and its drag along x."""
+
+    x_mm: float
+    y_mm: float
+    radius_mm: float
+    counts: float
+    drag: float = 0.0
+
+    def readings(self) -> np.ndarray:
+        """Return what it adds to the counts of the pad, (3, 4, 4), x right and y down."""
+        x, y = np.meshgrid(PLACES_MM - self.x_mm, PLACES_MM - self.y_mm)
+        # The layer spreads a load by its thickness, and pushes material outwards at the edge of a contact.
+        spread = self.radius_mm**2 + 3.0**2
+        z = self.counts * np.exp(-(x**2 + y**2) / spread)
+        return np.stack([z * (0.12 * x + self.drag), z * 0.12 * y, z])
+
+
+PRESSES = (
+    Press(0.0, 0.0, 5.0, 700),
+    Press(2.0, -3.0, 4.0, 900, drag=0.3),
+    Press(-4.0, 4.0, 6.0, 600),
+    Press(1.0, 1.0, 3.0, 1100, drag=-0.2),
+)
+
+
+def pressed(presses: Sequence[Press] = PRESSES, *, seed: int = 1, free: int = FREE_SCANS) -> np.ndarray:
+    """Return the counts (n, 3, 4, 4) of a free pad and of taps, each pressed, held and released."""
+    force = np.concatenate([np.linspace(0, 1, 8), np.ones(12), np.linspace(1, 0, 8), np.zeros(TAP_SCANS - 28)])
+    taps = [force[:, None, None, None] * press.readings() for press in presses]
+    made = np.concatenate([np.zeros((free, 3, 4, 4)), *taps])
+    noise = np.random.default_rng(seed).normal(0, 2, made.shape)
+    return np.rint(REST + made + noise).astype(np.int32)
+
+
+def gripped(scans: int = 200, *, free: int = 60) -> np.ndarray:
+    """Return the counts of a grip from the first scan, which is opened before the last `free` ones."""
+    load = np.ones(scans)
+    load[scans - free - 10 : scans - free], load[scans - free :] = np.linspace(1, 0, 10), 0
+    face = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), np.full((4, 4), 650.0)])
+    noise = np.random.default_rng(2).normal(0, 2, (scans, 3, 4, 4))
+    return np.rint(REST + load[:, None, None, None] * face + noise).astype(np.int32)
+
 
 FROZEN = Path(__file__).parent / "frozen"
 MODEL = ("--model", "stsr-small-int8")
@@ -164,10 +218,32 @@ def of(result: Any) -> dict[str, Any]:
     return kept | {"pattern": None if result.pattern is None else result.pattern.tolist()}
 
 
-def over_slcan(folder: Path, mangle: Any = None, *, stamped: bool = True) -> Outcome:
+class Adapter(SlcanAdapter):
+    """Adapter that may know no time stamps, and may lose and garble what it hands on, by the number of the frame."""
+
+    def __init__(self, *, stamped: bool, faulty: bool) -> None:
+        super().__init__()
+        self._stamped, self._faulty, self._frames = stamped, faulty, 0
+
+    def feed(self, data: bytes) -> bytes:
+        return super().feed(data if self._stamped else data.replace(b"Z1", b"Z?"))
+
+    def encode(self, frame: CanFrame, time_s: float) -> bytes:
+        number, place = divmod(self._frames, 16)
+        self._frames += 1
+        line = super().encode(frame, time_s)
+        if self._faulty and number % 15 == 9:
+            return b"garbage\r" * (place == 0) + line + b"t0048zz\r" * (place == 15)
+        return b"" if self._faulty and number % 15 == 7 and place == 5 else line
+
+
+def over_slcan(folder: Path, *, stamped: bool = True, faulty: bool = False) -> Outcome:
     """Play presses over a link; states and forces depend on times, readings do not."""
-    with Adapter(pressed(PRESSES[:2]), stamped=stamped, mangle=mangle) as adapter:
-        command = [*EDGE_SR, "--source", f"slcan:{adapter.path}", "--duration-s", "5", *MODEL, *RECORDS]
+    recording = Recording(folder, (Track("4", pressed(PRESSES[:2]), None),), 100.0)
+    # A port of its own: a pseudo-terminal that is gone may be given to another, and the run tries it again.
+    port, adapter = folder / "port", Adapter(stamped=stamped, faulty=faulty)
+    with Emulator([recording], jitter_s=0, adapter=adapter, link=port):
+        command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "4", *MODEL, *RECORDS]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
     scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
     if not stamped:  # how many cycles wait for their pace to show depends on when they were read
@@ -188,14 +264,7 @@ def slcan_without_stamps(folder: Path) -> Outcome:
 
 @scene
 def slcan_with_faults(folder: Path) -> Outcome:
-    def mangle(number: int, lines: list[bytes]) -> list[bytes]:
-        if number % 15 == 7:
-            return [line for place, line in enumerate(lines) if place != 5]
-        if number % 15 == 9:
-            return [b"garbage\r", *lines, b"t0048zz\r"]
-        return lines
-
-    return over_slcan(folder, mangle)
+    return over_slcan(folder, faulty=True)
 
 
 REFUSALS = (
@@ -249,11 +318,8 @@ def refusals(folder: Path) -> Outcome:
     write_csv(folder / "short.csv", counts[:10])
     (folder / "text.csv").write_text("a,b\n1,2\n")
     (folder / "press.txt").write_text("nothing")
-    with contextlib.chdir(folder), mock.patch.dict(os.environ, environment()):
-        ran = {line: run(*line.split()) for line in REFUSALS}  # in this process: as many starts take ten seconds
-    return {
-        line: {"exit": done.returncode, "stderr": outcome(0, "", done.stderr)["stderr"]} for line, done in ran.items()
-    }
+    ran = {line: edge_sr(folder, *line.split()) for line in REFUSALS}
+    return {line: {key: done[key] for key in ("exit", "stderr")} for line, done in ran.items()}
 
 
 def frozen_of(name: str) -> Path:

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import make_contract
 from hostile_samples import archive, npy, one_line, recording_arrays, stored
 
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.test_set import load_frozen_set
-from edge.inference.contract import KEY_PREFIX, Contract
 from edge.inference.onnx_guard import read_model
 from firmware_bridge.errors import NpzError, RecordingError
 from firmware_bridge.in_place import read_bounded
@@ -152,23 +150,3 @@ class TestText:
         path.write_text(",".join(CSV_HEADER) + "\n" + (",".join(["1"] * 48) + "\n") * 10)
         with pytest.raises(RecordingError, match=r"larger than 1,000 bytes, expected a smaller one"):
             load_recording(path)
-
-
-class TestContract:
-    @pytest.mark.parametrize(
-        ("key", "text"),
-        [
-            ("scale", "9" * 5000),
-            ("pitch_mm", "1" + "0" * 400),
-            ("counts_per_unit", "[NaN, 1, 1]"),
-            ("output_full_scale", "1e300"),
-            ("interval_factor", "Infinity"),
-            ("confidence", "[" * 60_000),
-            ("sensor", '"a\\nb"'),
-        ],
-    )
-    def test_values_that_nothing_can_be_done_with(self, key, text):
-        metadata = make_contract().to_metadata() | {KEY_PREFIX + key: text}
-        with pytest.raises(ModelError, match=f"'{key}'") as raised:
-            Contract.from_metadata(metadata)
-        assert one_line(raised)

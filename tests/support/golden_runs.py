@@ -1,26 +1,21 @@
 """Runs of edge-sr and edge.api whose outcome is frozen: what they give, and how it is told apart from noise."""
 
+import contextlib
 import json
 import math
 import os
-import pty
 import re
-import select
-import subprocess
 import sys
-import threading
-import time
-import tty
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
+from unittest import mock
 
 import numpy as np
-from golden_world import slcan_cycle
+from cli_samples import run
 
 EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
 ROOT = Path(__file__).parents[2]
-TIMEOUT_S = 90
 SAMPLED = 15
 """Every so many records of a sensor one is kept whole, and the first two of each stretch of a state."""
 OF_THE_RUN = {
@@ -33,12 +28,10 @@ RELATIVE, ABSOLUTE = 0.02, 2e-3
 OWN_ABSOLUTE = {"force_counts": 1.0, "area_mm2": 3.0, "mean": 2e-3, "peak": 5e-3}
 
 
-def edge_sr(folder: Path, *arguments: object, stdin: str = "") -> dict[str, Any]:
-    """Run edge-sr with records on stdout, and return its outcome."""
-    command = [*EDGE_SR, *map(str, arguments)]
-    done = subprocess.run(
-        command, cwd=folder, input=stdin, capture_output=True, text=True, timeout=TIMEOUT_S, env=environment()
-    )
+def edge_sr(folder: Path, *arguments: object) -> dict[str, Any]:
+    """Run edge-sr with records on stdout, in this process since as many starts take half a minute."""
+    with contextlib.chdir(folder), mock.patch.dict(os.environ, environment()):
+        done = run(*arguments)
     return outcome(done.returncode, done.stdout, done.stderr)
 
 
@@ -132,58 +125,3 @@ def is_number(value: Any) -> TypeGuard[float]:
 
 def close(frozen: float, now: float, key: str) -> bool:
     return math.isclose(frozen, now, rel_tol=RELATIVE, abs_tol=OWN_ABSOLUTE.get(key, ABSOLUTE))
-
-
-class Adapter:
-    """slcan adapter on a pseudo-terminal, which sends the lines of scans once its channel is open.
-
-    Args:
-        counts: (n, 3, 4, 4).
-        stamped: the adapter obeys Z1.
-        mangle: changes the lines of a scan, by its number.
-    """
-
-    def __init__(
-        self, counts: np.ndarray, *, stamped: bool, mangle: Callable[[int, list[bytes]], list[bytes]] | None = None
-    ) -> None:
-        self._counts, self._stamped = counts, stamped
-        self._mangle = mangle or (lambda number, lines: lines)
-        self._host, self._device = pty.openpty()
-        tty.setraw(self._host)
-        tty.setraw(self._device)
-        self.path = os.ttyname(self._device)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._play)
-
-    def __enter__(self) -> "Adapter":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        os.close(self._host)
-        os.close(self._device)
-
-    def _play(self) -> None:
-        due_s, number, stamped, commands = None, 0, False, b""
-        while not self._end.is_set() and number < len(self._counts):
-            wait_s = 0.05 if due_s is None else max(due_s - time.monotonic(), 0.0)
-            if select.select([self._host], [], [], wait_s)[0]:
-                commands += os.read(self._host, 4096)
-                *whole, commands = commands.split(b"\r")
-                for command in whole:
-                    if command == b"Z1" and self._stamped:
-                        stamped = True
-                    if command == b"O" and due_s is None:
-                        due_s = time.monotonic()
-                    refused = command == b"Z1" and not self._stamped
-                    os.write(self._host, b"\a" if refused else b"F00\r" if command == b"F" else b"\r")
-            elif due_s is not None:
-                due_s += 0.01  # the controller goes on at its pace, whatever the machine does
-                os.write(
-                    self._host,
-                    b"".join(self._mangle(number, slcan_cycle(self._counts[number], number, stamped=stamped))),
-                )
-                number += 1
-        self._end.wait()
