@@ -11,10 +11,6 @@ from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from train.data.paper_taps import PaperTaps
-from train.data.presses import SEED
-from train.freeze import freeze
-from train.physics.sensor_noise import Nuisances
 
 BINS: Final = 10
 
@@ -39,12 +35,6 @@ def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Coll
     if fitting and session.deviation is not None:
         contract.confidence.update(fit_confidence(session, fitting))
     return parts
-
-
-def confidence_sets(validation: PaperTaps, scale: int) -> list[FrozenSet]:
-    """Return the sets to fit confidence on, at a network's scale, from sequences that it was not trained on."""
-    # As on the frozen test set, and lighter ones, which carry less information.
-    return [freeze(validation, Nuisances(), SEED, force_n, scale) for force_n in (5.0, 2.0, 1.0)]
 
 
 def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:

@@ -1,11 +1,11 @@
 """Checkpoints to ONNX: one file a model, the contract inside, parity checked before it is written.
 
-python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr.pt --out edge/models
-python -m export.to_onnx checkpoints/stsr.pt --int8 data/gripped.npz --out edge/models
+python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
+python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --int8 data/gripped.npz
 
-A graph takes any number of windows in one run. With validation presses, deviations are corrected by region, so that
-their intervals hold; with --intervals, by window.
+A graph takes any number of windows in one run. Deviations are corrected by region on validation presses, so that their
+intervals hold; with --intervals, by window.
 """
 
 import argparse
@@ -27,15 +27,13 @@ from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Cont
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust import Trust
 from edge.terminal.progress_bar import tracked
-from export.confidence import confidence_sets, judge_in_contract
-from export.errors import ExportError
-from export.graph import outputs, to_model
+from export.confidence import judge_in_contract
+from export.graph import ExportError, outputs, to_model
 from export.int8 import calibration_batch, convolutions, quantised
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
-from train.data.paper_taps import paper_taps
 from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
@@ -50,9 +48,7 @@ from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 from train.trust import load_trust
 
 MOST_LOSS_DB: Final = 0.1  # largest accepted loss by int8 on the frozen test set, in [dB]
-_COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interval's coverage by int8
-_UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
@@ -122,8 +118,8 @@ def export(
     validation: Sequence[FrozenSet] = (),
     trust: Trust | None = None,
     intervals: IntervalData | None = None,
-) -> str:
-    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
+) -> tuple[str, str]:
+    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx; return a line that describes it, and the limits it exceeds.
 
     Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
     The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
@@ -160,7 +156,7 @@ def export(
     session = _session(model, contract)
     facts = [*judge_in_contract(session, frozen, validation), *facts]
     contract = session.contract
-    facts += cost(float_error, contract.test_error.get(str(contract.taps), {}))
+    lost, exceeded = cost(float_error, contract.test_error.get(str(contract.taps), {}))
     # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
     checkable = contract.taps == 1 or contract.takes_poses
     if trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
@@ -168,7 +164,8 @@ def export(
     content = _content(model, contract, origin(report))
     Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
     write_in_place(folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
-    return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join(facts)}"
+    line = f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*facts, *lost])}"
+    return line, exceeded and f"{name}.onnx ({exceeded})"
 
 
 def _session(model: onnx.ModelProto, contract: Contract) -> ModelSession:
@@ -186,17 +183,15 @@ def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, st
     return model.SerializeToString(deterministic=True)
 
 
-def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
-    """Return the loss by int8 as text, with each exceeded limit; nothing of a float graph, or if none was judged."""
+def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> tuple[list[str], str]:
+    """Return the loss by int8 as text, and which limits it exceeds; nothing of a float graph, or if none was judged."""
     if not in_float:
-        return []
+        return [], ""
     lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
-    facts = [f"{lost_db:.3f} dB lost to quantisation"]
-    if lost_db > MOST_LOSS_DB:
-        facts.append(_COSTLY)
+    exceeded = [f"more than {MOST_LOSS_DB} dB"] * (lost_db > MOST_LOSS_DB)
     if "coverage_90" in in_float and abs(in_integers["coverage_90"] - in_float["coverage_90"]) > MOST_COVERAGE_CHANGE:
-        facts.append(_UNSURE)
-    return facts
+        exceeded.append(f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}")
+    return [f"{lost_db:.3f} dB lost to quantisation"], " and ".join(exceeded)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -205,17 +200,13 @@ def main(arguments: list[str] | None = None) -> None:
     add = parser.add_argument
     add("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
     add("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
-    help_of_intervals = "training presses on which intervals are fitted"
-    add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
-    add("--trust", type=Path, metavar="FILE", help="checks of train.trust, with --validation, or those of a model")
-    add("--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training")
+    add("--intervals", type=Path, nargs="+", metavar="DATA", help="training presses on which intervals are fitted")
+    add("--trust", type=Path, metavar="FILE", help="checks of train.trust, or those of a model")
+    add("--validation", type=Path, required=True, metavar="FILE", help="presses of the validation set, not trained on")
     add("--test", type=Path, metavar="FILE", help="presses of a test set in place of the frozen one, for train.own")
-    help_of_int8 = "write NAME-int8.onnx too, with ranges from these taps"
-    add("--int8", type=Path, nargs="+", metavar="DATA", help=help_of_int8)
+    add("--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx, with ranges from these taps")
     options = parser.parse_args(arguments)
-    if options.intervals is not None and options.validation is None:
-        parser.error("--intervals needs --validation")
-    lines: list[str] = []
+    lossy: list[str] = []
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(load_network(options.checkpoints[0])[1])
@@ -223,18 +214,14 @@ def main(arguments: list[str] | None = None) -> None:
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         if options.test is not None:
             frozen = freeze_presses(load_presses(options.test), SEED, nuisances).as_frozen_set()
+        presses = load_presses(options.validation)
+        training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
-        presses = intervals = None
-        if options.validation is None:
-            validation = confidence_sets(paper_taps("validation"), frozen.scale)
-        else:
-            presses = load_presses(options.validation)
-            validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
-            training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
-            intervals = IntervalData(presses, training, sensor=sensor)
         trust = None if options.trust is None else load_trust(options.trust, presses)
+        validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
+        intervals = IntervalData(presses, training, sensor=sensor)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
-            line = export(
+            line, exceeded = export(
                 checkpoint,
                 options.out,
                 frozen,
@@ -244,13 +231,11 @@ def main(arguments: list[str] | None = None) -> None:
                 intervals=intervals,
             )
             sys.stdout.write(line + "\n")
-            lines.append(line)
+            lossy += [exceeded] * bool(exceeded)
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"export: {error}")
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
-    costly = {line.partition(":")[0]: [one for one in (_COSTLY, _UNSURE) if one in line] for line in lines}
-    lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")
 

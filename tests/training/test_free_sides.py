@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from train.physics.contact import ContactSolver
-from train.physics.elastic_layer import Layer
+from train.physics.elastic_layer import FreeSides, Layer
 from train.physics.pad_draws import Pad
-from train.physics.side_correction import FreeSides
 from train.physics.taxel_response import Skin
 
 SIZE, CELL_MM = 42, 0.47

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from train.physics.resample import resample, resample_touching
+from train.physics.tpsf import resample, resample_touching
 
 SCALES = [4, 4.5, 7, 12.5, 19]
 

@@ -1,25 +1,21 @@
 """Tables III and IV, Figs. 12, 13 and 16: errors by method, scale, angle between taps, number of taps, and surface."""
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.test_set import FrozenSet, judge
+from edge.evaluation.test_set import judge
 from edge.terminal.progress_bar import tracked
 from train.data.presses import PressSet, join_presses
 from train.errors import CheckpointError
-from train.experiments.paper.protocol import (
+from train.experiments.paper_networks import (
     BASE,
     HELD_OUT,
     KNOWN,
-    SEED_BATCH,
     SETS,
-    by_angle,
     classical_methods,
     compact,
     error_cells,
@@ -27,18 +23,19 @@ from train.experiments.paper.protocol import (
     judged,
     mixed,
     presses,
-    seed_size,
+    published,
     trained,
 )
-from train.experiments.workbench import Method, Workbench
+from train.experiments.workbench import Workbench
 from train.fit import given_taps
 from train.learning.checkpoint import Training
 from train.learning.interval_fit import half_width_mm
 from train.learning.training_loop import Recipe
+from train.physics.gripped import SCALE
 from train.report import Report, Row, with_interval
-from train.surfaces.poses import MAX_TAPS
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
 
-TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
+TABLE_3: Final[dict[str, tuple[float, float]]] = {
     "bilinear": (18.10, 0.5663),
     "srcnn": (21.10, 0.7690),
     "srgan": (21.54, 0.7876),
@@ -55,7 +52,6 @@ TABLE_3: Final[Mapping[str, tuple[float, float]]] = {
 TABLE_4: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
 """Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""
 
-SEED_NETWORKS: Final = ("srcnn", "srgan", "stsr", "mtsr2", "mtsr3", "mtsr4", "mtsr5", "mtsr6", "mtsr7", "stsr longer")
 COMPARED: Final = (
     *(("compact stsr", "stsr"), ("compact mtsr4", "mtsr4")),
     *(("mtsr2", "stsr longer"), ("compact mtsr2", "compact stsr")),
@@ -63,30 +59,33 @@ COMPARED: Final = (
 ONE_IN: Final = 8  # step between evaluated frames of a tap
 
 
-def run_table3(bench: Workbench, folder: Path) -> Path:
-    """Train absent networks, evaluate all methods, and write the table."""
-    data = mixed(bench)
-    sets = {split: bench.frozen(split) for split in ("validation", "test")}
-    evaluated = {split: frozen.thinned(ONE_IN) for split, frozen in sets.items()}
-    test, rows = evaluated["test"], list[Row]()
-    test_db: dict[str, NDArray[np.float64]] = {}
-    epochs: list[str] = []
-    for name, paper, method in _methods(bench, data, sets["validation"], evaluated["validation"]):
-        errors, test_db[name] = judged(method, evaluated)
-        theirs_db, theirs_ssim = TABLE_3.get(paper, (None, None))
-        theirs: Row = {"paper's test PSNR dB": theirs_db, "paper's test SSIM": theirs_ssim}
-        rows.append({"method": name} | errors | theirs | method.cost | method.training)
-        if method.training and not name.startswith("compact"):
-            epochs.append(f"{name} {float(str(method.training['steps'])) * SEED_BATCH / len(data):.2f}")
-    report = Report("table3", folder, __file__, bench.used, quick=bench.quick)
+def _of_paper(figures: tuple[float, float] | None) -> Row:
+    db, ssim = figures or (None, None)
+    return {"paper's test PSNR dB": db, "paper's test SSIM": ssim}
+
+
+def methods(bench: Workbench, report: Report) -> None:
+    """Compare all methods on the same targets at x10: Table III."""
+    data, validation = mixed(bench), bench.frozen("validation")
+    sets = {"validation": validation.thinned(ONE_IN), "test": bench.frozen("test").thinned(ONE_IN)}
+    names = ("srgan", "stsr", "mtsr2") if bench.quick else tuple(TABLE_3)[1:]
+    # The paper's networks, which are large, are calibrated on few frames.
+    networks = [(name, published(name), sets["validation"]) for name in (*names, "stsr longer")]
+    networks += [(f"compact {name}", compact(name), validation) for name in ("stsr", "mtsr2", "mtsr4", "mtsr7")]
+    compared = {one.name: one for one in classical_methods(bench, data, ("bilinear", "bicubic", "linear map"))}
+    for name, training, calibrated_on in tracked(networks, "networks", "network"):
+        compared[name] = trained(bench, training, data, calibrated_on)
+    test, rows, test_db = sets["test"], list[Row](), dict[str, NDArray[np.float64]]()
+    for name, method in compared.items():
+        theirs = TABLE_3.get(name.removeprefix("compact ").removesuffix(" longer"))
+        row, test_db[name] = judged({"method": name} | _of_paper(theirs), method, sets)
+        rows.append(row)
     report.say(
         f"{len(test)} frames of {len(test.surface)} taps a set, one in {ONE_IN} evenly over each tap, the same for "
         f"every row; full scale {test.full_scale_mm} mm. PSNR with its 95 % interval by tap. Run time: one window, "
-        f"torch, one thread. All are trained on the same {len(data)} sequences; training min and steps count those of "
-        "the network that a row's started from. The paper's figures are of real data in other units."
-    )
-    report.say(
-        f"The networks of the paper were trained for a fixed time, here for so many epochs: {', '.join(epochs)}."
+        f"torch, one thread. All are trained on the same {len(data)} sequences, the paper's networks in one pass over "
+        "them; training min and steps count those of the network that a row's started from. The paper's figures are "
+        "of real data in other units."
     )
     verdicts = [
         f"- {better} over {worse} [dB]: {with_interval(test_db[better] - test_db[worse], test.tap, sign='+')}"
@@ -95,89 +94,73 @@ def run_table3(bench: Workbench, folder: Path) -> Path:
     ]
     report.say("On the test set, tap by tap:\n\n" + "\n".join(verdicts))
     report.table(rows, "Validation and test set, x10.")
-    return report.write()
 
 
-def _methods(
-    bench: Workbench, data: PressSet, validation: FrozenSet, thinned: FrozenSet
-) -> Iterator[tuple[str, str, Method]]:
-    """Yield each method with its name in the table and in the paper's; large networks are calibrated on few frames."""
-    for method in classical_methods(bench, data, ("bilinear", "bicubic", "linear map")):
-        yield method.name, method.name, method
-    names = (*SEED_NETWORKS[1:4], SEED_NETWORKS[-1]) if bench.quick else SEED_NETWORKS
-    networks = [(name, seed_size(name), thinned) for name in names]
-    networks += [(f"compact {name}", compact(name), validation) for name in ("stsr", "mtsr2", "mtsr4", "mtsr7")]
-    for name, training, calibrated_on in tracked(networks, "networks", "network"):
-        yield name, training.network.removeprefix("compact-"), trained(bench, training, data, calibrated_on)
-
-
-def run_table4(bench: Workbench, folder: Path) -> Path:
-    """Train absent networks, evaluate each scale against the truth at that scale, and write the table."""
+def scales(bench: Workbench, report: Report) -> None:
+    """Compare the compact STSR at five scales, each against the truth at that scale: Table IV."""
     rows: list[Row] = []
     bench.fit(BASE, mixed(bench), bench.frozen("validation"))  # at its own scale
-    for scale, (paper_db, paper_ssim) in tracked(TABLE_4.items(), "scales", "scale"):
+    for scale, theirs in tracked(TABLE_4.items(), "scales", "scale"):
         sets = {split: bench.frozen(split, scale=scale) for split in ("validation", "test")}
         training = BASE if scale == BASE.scale else from_base(f"stsr-x{scale}", 1, 2500, scale)
         method = bench.network(training, mixed(bench, scale), sets["validation"])
-        errors, _ = judged(method, sets)
         pattern = "{} x {}".format(*sets["test"].unit_patterns.shape[1:])
-        theirs: Row = {"paper's test PSNR dB": paper_db, "paper's test SSIM": paper_ssim}
-        rows.append({"scale": f"x{scale}", "pattern": pattern} | errors | theirs | method.cost | method.training)
-    report = Report("table4", folder, __file__, bench.used, quick=bench.quick)
+        rows.append(judged({"scale": f"x{scale}", "pattern": pattern} | _of_paper(theirs), method, sets)[0])
     report.say(
         "The compact STSR. Truth is made at x20 and brought to each scale with anti-aliasing. At x10 the layers that"
         " make pixels are as old as the base network, at the other scales they are trained from nothing for the last"
         " steps alone: compare those with each other."
     )
     report.table(rows, "STSR by scale.")
-    return report.write()
 
 
-def run_angle(bench: Workbench, folder: Path) -> Path:
-    """Train an MTSR-2 for each angle, evaluate it on taps turned by that angle, and write the table."""
-    test = bench.frozen("test")
+def angles(bench: Workbench, report: Report) -> None:
+    """Compare an MTSR-2 for each angle between its taps, on taps turned by that angle: Fig. 12."""
     stsr = trained(bench, compact("stsr"), mixed(bench), bench.frozen("validation"))
-    errors, alone_db = judged(stsr, {"test": test})
-    rows: list[Row] = [{"network": "STSR", "angle deg": None} | errors | stsr.cost]
+    row, alone_db = judged({"network": "STSR", "angle deg": None}, stsr, {"test": bench.frozen("test")})
+    rows = [row]
     for angle_deg in tracked((5.0, 10.0, 15.0, 20.0, 25.0, 30.0), "angles", "angle"):
         validation, turned = (bench.frozen(split, angle_step_deg=angle_deg) for split in ("validation", "test"))
         training = from_base(f"mtsr2-{angle_deg:g}-deg", 2, 1500)
-        method = bench.network(training, by_angle(bench, angle_deg), validation)
-        errors, found_db = judged(method, {"test": turned})
-        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
-        rows.append({"network": "MTSR-2", "angle deg": angle_deg} | errors | over | method.cost | method.training)
-    report = Report("angle", folder, __file__, bench.used, quick=bench.quick)
+        method = bench.network(training, _by_angle(bench, angle_deg), validation)
+        head: Row = {"network": "MTSR-2", "angle deg": angle_deg}
+        rows.append(judged(head, method, {"test": turned}, alone_db=alone_db)[0])
     report.say(
         "Compact networks, each trained from the STSR for as many steps and evaluated with its own angle; of the gain"
         " over the STSR a part is these steps. In the paper 10 degrees are best. The newest taps differ between angles"
         " by their pose error alone."
     )
     report.table(rows, "MTSR-2 by angle between the taps, test set.")
-    return report.write()
 
 
-def run_taps(bench: Workbench, folder: Path) -> Path:
-    """Train absent networks, evaluate all on the same targets, and write the table."""
-    data, test, validation = mixed(bench), bench.frozen("test"), bench.frozen("validation")
+def _by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
+    """Return the mixed data with two taps that are turned by another angle."""
+    if angle_step_deg == ANGLE_STEP_DEG:
+        return mixed(bench)
+    schedule = f"turns:{angle_step_deg:g}"
+    turned = {name: replace(world, taps=2, schedule=schedule, scale=SCALE) for name, world in SETS.items()}
+    parts = [bench.presses(f"paper-{name}-{angle_step_deg:g}-deg", world, 2) for name, world in turned.items()]
+    return join_presses(parts)
+
+
+def taps(bench: Workbench, report: Report) -> None:
+    """Compare networks of one to seven taps, and the last one with fewer, on the same targets: Fig. 13."""
+    data, test, validation = mixed(bench), {"test": bench.frozen("test")}, bench.frozen("validation")
     trainings = {"stsr": from_base("stsr-alike", 1, 2000)}
-    trainings |= {name: compact(name) for name in (f"mtsr{taps}" for taps in range(2, MAX_TAPS + 1))}
-    methods = {name: trained(bench, training, data, validation) for name, training in trainings.items()}
-    ways = [(name, method.taps) for name, method in methods.items()]
+    trainings |= {name: compact(name) for name in (f"mtsr{number}" for number in range(2, MAX_TAPS + 1))}
+    networks = {name: trained(bench, training, data, validation) for name, training in trainings.items()}
+    ways = [(name, method.taps) for name, method in networks.items()]
     ways += [(f"mtsr{MAX_TAPS}", given) for given in range(1, MAX_TAPS + 1)]
-    rows: list[Row] = []
-    _, alone_db = judged(methods["stsr"], {"test": test})
-    for name, given in tracked(ways, "taps", "run"):
-        method = methods[name]
-        errors, found_db = judged(method, {"test": test}, given)
-        over: Row = {"over STSR dB": with_interval(found_db - alone_db, test.tap, sign="+")}
-        rows.append({"network": name, "taps given": given} | errors | over | method.cost | method.training)
-    report = Report("taps", folder, __file__, bench.used, quick=bench.quick)
+    _, alone_db = judged({}, networks["stsr"], test)
+    rows = [
+        judged({"network": name, "taps given": given}, networks[name], test, given, alone_db)[0]
+        for name, given in tracked(ways, "taps", "run")
+    ]
     report.say(
         "Compact networks on the same targets, all trained on from one of a single tap for as long: one for each number"
         " of taps, then the one of seven taps with fewer as input."
     )
     report.table(rows, "By number of taps, test set.")
-    return report.write()
 
 
 TEST_SEED: Final = 999_000_000
@@ -186,8 +169,8 @@ GIVEN: Final = (1, 4)
 _EVERY: Final = Training("unseen-all", "compact-mtsr4", Recipe(steps=16_000, given=given_taps(max(GIVEN)), bf16=True))
 
 
-def run_unseen(bench: Workbench, folder: Path) -> Path:
-    """Train networks on surfaces alone and with random figures, evaluate them on others, and write the table.
+def unseen(bench: Workbench, report: Report) -> None:
+    """Compare networks trained on surfaces alone and with random figures, on others.
 
     Three of the 18 surfaces are held out; tested glyphs and polygons are of another seed than the trained ones. All
     networks are identical. All figures make as many windows as all surfaces do, so training on surfaces alone runs once
@@ -196,9 +179,12 @@ def run_unseen(bench: Workbench, folder: Path) -> Path:
 
     Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
     """
-    tests, validation = test_sets(bench), bench.frozen("validation", KNOWN)
+    numbers = range(TEST_SEED, TEST_SEED + TEST_FIGURES)
+    glyphs, polygons = ([f"{kind}:{number}" for number in numbers] for kind in ("glyph", "polygon"))
+    surfaces = {"15 seen": KNOWN, "3 held out": HELD_OUT, "glyphs": glyphs, "polygons": polygons}
+    tests, validation = {name: bench.frozen("test", one) for name, one in surfaces.items()}, bench.frozen("validation")
     networks = {
-        name: bench.network(training, data, bench.frozen("validation") if training is _EVERY else validation)
+        name: bench.network(training, data, validation if training is _EVERY else bench.frozen("validation", KNOWN))
         for name, (training, data) in training_sets(bench).items()
     }
     rows: list[Row] = []
@@ -218,8 +204,6 @@ def run_unseen(bench: Workbench, folder: Path) -> Path:
             row["covered %"] = with_interval(100 * figures["coverage_90"], frozen.tap, 1)
             row["width %"] = with_interval(width_percent.mean(axis=(1, 2)), frozen.tap, 1)
             rows.append(row | method.cost | method.training)
-
-    report = Report("unseen", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"Held out: {', '.join(HELD_OUT)}. Figures are random glyphs and polygons, {SETS['figures'].count} to train on "
         f"and {TEST_FIGURES} of each kind, of another seed, to test. All tests are made at the test position, though "
@@ -232,15 +216,6 @@ def run_unseen(bench: Workbench, folder: Path) -> Path:
         "`over the 15` is over the network trained on the 15 surfaces alone, frame by frame; `covered` and `width` are "
         "of the 90 % interval, the width in % of the frame's indentation.",
     )
-    return report.write()
-
-
-def test_sets(bench: Workbench) -> dict[str, FrozenSet]:
-    """Return the test sets, by name."""
-    numbers = range(TEST_SEED, TEST_SEED + TEST_FIGURES)
-    glyphs, polygons = ([f"{kind}:{number}" for number in numbers] for kind in ("glyph", "polygon"))
-    surfaces = {"15 seen": KNOWN, "3 held out": HELD_OUT, "glyphs": glyphs, "polygons": polygons}
-    return {name: bench.frozen("test", these) for name, these in surfaces.items()}
 
 
 def training_sets(bench: Workbench) -> dict[str, tuple[Training, PressSet]]:
