@@ -38,7 +38,7 @@ from train.own import Knowledge, compared, plan_of
 from train.physics.pad_draws import KNOWN, RANGES
 from train.surfaces.meshes import mesh_name
 
-UNSEEN = 480
+UNSEEN = 240
 """Presses by which the network is calibrated, and as many by which it is compared, on pads of their own."""
 
 

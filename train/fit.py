@@ -98,7 +98,7 @@ def _training(options: argparse.Namespace) -> Training:
     recipe = Recipe(options.steps, given=given_taps(int(taps) if taps.isdigit() else 1), bf16=options.bf16)
     compact = options.network.startswith(_COMPACT)
     # A network of the paper must not overwrite a bundled one.
-    name = options.name or (options.network if compact else f"seed-{options.network}")
+    name = options.network if compact else f"seed-{options.network}"
     known, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
     return Training(name, options.network, recipe, start=start, seed=options.seed, options=known, keep=keep)
 
@@ -109,8 +109,12 @@ def _parser() -> argparse.ArgumentParser:
     add("folder", type=Path, help="folder for the checkpoints")
     add("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     add("--validation", type=Path, required=True, help="presses to calibrate on, not used for training")
-    one("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
-    one("--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)")
+    one(
+        "--network",
+        choices=NETWORKS,
+        metavar="NAME",
+        help=", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt",
+    )
     one("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
     one("--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)")
     one("--steps", type=int, default=9000)

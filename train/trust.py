@@ -111,11 +111,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m train.trust", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, metavar="OUT.json", help="trust.json in the folder of the checkpoints")
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
-    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     try:
         data = join_presses([*map(load_presses, options.data)])
-        text = json.dumps(fit_trust(data, options.seed)) + "\n"
+        text = json.dumps(fit_trust(data, seed=1)) + "\n"
         options.out.parent.mkdir(parents=True, exist_ok=True)
         write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))
     except TrainError as error:

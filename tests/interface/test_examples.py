@@ -36,9 +36,9 @@ def start(folder, name, *arguments):
     )
 
 
-def run(folder, name, *arguments):
+def run(folder, name, *arguments, timeout_s=TIMEOUT_S):
     process = start(folder, name, *arguments)
-    out, errors = process.communicate(timeout=TIMEOUT_S)
+    out, errors = process.communicate(timeout=timeout_s)
     return process.returncode, out.splitlines(), errors.splitlines()
 
 
@@ -306,7 +306,7 @@ def test_an_object_of_ones_own_is_trained_on_and_run(empty, tmp_path):
     (empty / "ball" / "work").mkdir(parents=True)
     (empty / "ball" / "work" / "plan.json").write_text('{"minutes": 4.0, "presses": 24, "steps": 2}')
     words = (tmp_path / "ball.stl", "--out", "ball", "--minutes", 4, "--figures", 0.5, "--source", "demo")
-    code, out, errors = run(empty, "train_and_deploy.py", *words)
+    code, out, errors = run(empty, "train_and_deploy.py", *words, timeout_s=280)
     assert code == 1, errors
     assert {path.name for path in empty.iterdir()} == {"ball"} and not (empty / "ball" / "ball.onnx").exists()
     assert any(line.startswith("this model | ") for line in out)

@@ -150,10 +150,10 @@ def test_the_bundled_networks_need_presses_of_as_many_taps_as_they_take(data):
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
     files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
-    options = [*files, "--network", "compact-mtsr2", "--name", "mine", "--steps", "2"]
+    options = [*files, "--network", "compact-mtsr2", "--steps", "2"]
     main([str(tmp_path), *options, "--bf16"])
-    assert capsys.readouterr().out.startswith("mine: validation ")
-    assert load_network(tmp_path / "mine.pt")[1]["config"]["recipe"]["bf16"] is True
+    assert capsys.readouterr().out.startswith("compact-mtsr2: validation ")
+    assert load_network(tmp_path / "compact-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
 
 
 @pytest.mark.parametrize(

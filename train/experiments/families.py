@@ -1,28 +1,30 @@
 """The shipped model on every family of shapes on unseen pads, and on pads off the nominal one.
 
-Of families no choice depended on the presses: networks, baselines, contact levels and the baseline that is called the
-best were settled on training and validation presses, on other pads. Of pads each constant is changed alone. Shapes,
-poses, depths, drags, friction and every draw of the nuisances are then the same on all pads, so that losses are press
-by press; half of the shapes are the paper's, half random figures.
+Of families no choice depended on the presses: networks and baselines were settled on training and validation presses,
+on other pads. Of pads each constant is changed alone. Shapes, poses, depths, drags, friction and every draw of the
+nuisances are then the same on all pads, so that losses are press by press; half of the shapes are the paper's, half
+random figures.
 """
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
+from timeit import repeat
 from typing import Final, NamedTuple, cast
 
 import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.evaluation.classical_methods import Method, bilinear, fit_gain, fit_linear_map
+from edge.evaluation.classical_methods import Method, fitted_methods
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import judge
+from edge.inference.bundled import BUNDLE_DIR
 from edge.inference.intervals import REGIONS, half_widths_mm, near_pixels, regions
 from edge.inference.onnx_session import ModelSession
 from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import FrozenPresses, freeze_presses
-from train.data.press_batches import COUNTS_PER_UNIT, read_presses
+from train.data.press_batches import in_units, read_presses
 from train.data.presses import SEED, PressSet, one_thread
 from train.data.world import World, press_shapes
 from train.experiments.workbench import SHORT, Figures, Inferred, Workbench, infer_presses, name_of
@@ -34,8 +36,9 @@ from train.physics.sensor_noise import Nuisances
 from train.report import Report, Row, with_interval
 
 TRAINING: Final = World(count=24_000, per_pad=48, seed=67)
-VALIDATION: Final = World(count=2520, taps=7, per_pad=10, families=dict.fromkeys(SHARES, 1.0), seed=1_000_001)
-"""Settings of data/gripped.npz and data/validation.npz in the Makefile."""
+"""Settings of data/gripped.npz in the Makefile."""
+_LEVELLED: Final = 2000  # training presses by which the level of contact of a baseline is chosen
+_BEST: Final = "linear map"  # of the baselines on validation presses
 _LEVEL: Final = "90"
 _NEAREST: Final = 8
 _AT_ONCE: Final = 64
@@ -48,36 +51,23 @@ class Found(NamedTuple):
     run_time_us: float
 
 
-class Baseline(NamedTuple):
-    """Method from the newest tap, with the level of contact that suits validation best, and its mean PSNR there."""
-
-    name: str
-    run: Method
-    contact_level: float
-    validation_db: float
-
-    def found(self, wide: FrozenPresses) -> Found:
-        """Return the errors on a set, and the median run time of a scan."""
-        newest, times_s = wide.windows(1)[:, 0], []
-        for index in range(min(len(newest), 100)):
-            started_s = time.perf_counter()
-            self.run(newest[index : index + 1])
-            times_s.append(time.perf_counter() - started_s)
-        figures = judge(self.run(newest), wide.as_frozen_set(), self.contact_level)
-        return Found(figures, 1e6 * float(np.median(times_s)))
-
-
 def families(bench: Workbench, report: Report) -> None:
     """Evaluate all methods on the wide test set."""
     wide = bench.wide_test()
     model = bench.model()
-    validation = freeze_presses(bench.presses("validation", VALIDATION), SEED)
-    baselines = fit_baselines(bench.presses("gripped", TRAINING), validation)
-    best = max(baselines, key=lambda one: one.validation_db).name
+    fitted = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
+    training = bench.presses("gripped", TRAINING)
+    read = read_presses(training.with_taps(1), Nuisances(), SEED)[:, 0]
+    baselines = {name: fitted[name] for name in ("bilinear", _BEST)}
+    baselines |= {f"nearest {_NEAREST}": nearest_presses(read, training.patterns)}
     inferred = {name: infer_presses(model, wide, known) for known, name in SHORT.items()}
-    frozen, level = wide.as_frozen_set(), model.contract.contact_level
-    found = {name: Found(judge(one.patterns, frozen, level), one.run_time_us) for name, one in inferred.items()}
-    found |= {one.name: one.found(wide) for one in tracked(baselines, "judging", "baseline")}
+    frozen, own = wide.as_frozen_set(), model.contract.contact_level
+    found = {name: Found(judge(one.patterns, frozen, own), one.run_time_us) for name, one in inferred.items()}
+    for name, run in tracked(baselines.items(), "judging", "baseline"):
+        newest = wide.windows(1)[:, 0]
+        level = best_contact_level(run(read[:_LEVELLED]), training.touching[:_LEVELLED])
+        times_s = [min(repeat(partial(run, scan[None]), number=1, repeat=3)) for scan in newest[:100]]
+        found[name] = Found(judge(run(newest), frozen, level), 1e6 * float(np.median(times_s)))
 
     report.say(
         f"{name_of(model)}, through the runtime's session, one tap. "
@@ -85,9 +75,9 @@ def families(bench: Workbench, report: Report) -> None:
         f"{len(np.unique(wide.presses.pad))} pads that nothing was trained on or chosen by, sha256 "
         f"{wide.presses.sha256()[:12]}. Full scale {MAX_INDENTATION_MM} mm. 95 % intervals are by pad. Known: all "
         "constants of the pad that a sensor file holds, and the taxels' gains. Baselines see the newest tap and are "
-        "fitted on the training presses, as sensors of their own read them: bilinear by one gain, the linear map by "
-        f"ridge regression, the mean of the {_NEAREST} presses of nearest readings. Best of them on validation: "
-        f"{best}. Run time: median of a scan, one thread."
+        "fitted on training presses, as sensors of their own read them, which choose their levels of contact, too: "
+        f"bilinear by one gain, the linear map by ridge regression, the mean of the {_NEAREST} presses of nearest "
+        f"readings. Best of them on validation presses: {_BEST}. Run time: median of a scan, one thread."
     )
     truth, pads = wide.patterns(), wide.presses.pad
     rows: list[Row] = [
@@ -102,50 +92,32 @@ def families(bench: Workbench, report: Report) -> None:
         for name, (figures, run_time_us) in found.items()
     ]
     report.table(rows, "All families.")
-    report.table(family_rows(found, best, wide), f"PSNR in dB by family; `over` is over {best}, press by press.")
+    report.table(family_rows(found, wide), f"PSNR in dB by family; `over` is over {_BEST}, press by press.")
     if _LEVEL in model.contract.interval_levels:
         text = f"Pixels whose truth the {_LEVEL} % interval holds, in %, by region of the predicted pattern."
         report.table(interval_rows(model, inferred, truth, wide), text)
 
 
-def fit_baselines(training: PressSet, validation: FrozenPresses) -> list[Baseline]:
-    """Fit all baselines to the newest presses, each read by a sensor of its own; levels are chosen on validation."""
-    newest = read_presses(training.with_taps(1), Nuisances(), SEED)[:, 0]
-    patterns = training.patterns.astype(np.float32)
-    gain = fit_gain(bilinear(newest[:, 2], SCALE), patterns)
-    matrix = fit_linear_map(newest.reshape(len(newest), -1), patterns.reshape(len(patterns), -1))
-    methods: Mapping[str, Method] = {
-        "bilinear": lambda some: bilinear(some[:, 2], SCALE) * gain,
-        "linear map": lambda some: (some.reshape(len(some), -1) @ matrix).reshape(-1, *patterns.shape[1:]),
-        f"nearest {_NEAREST}": lambda some: nearest_presses(some, newest, training.patterns, _NEAREST),
-    }
-    check, truth = validation.windows(1)[:, 0], validation.patterns()
-    fitted: list[Baseline] = []
-    for name, method in methods.items():
-        found = np.asarray(method(check), dtype=np.float32)
-        level = best_contact_level(found, validation.presses.touching)
-        fitted.append(Baseline(name, method, level, float(psnr_db(found, truth, MAX_INDENTATION_MM).mean())))
-    return fitted
+def nearest_presses(known: NDArray[np.float32], patterns: NDArray[np.float16]) -> Method:
+    """Return the method that gives the mean pattern of the known presses with the nearest readings, in network units.
 
-
-def nearest_presses(
-    some: NDArray[np.floating], known: NDArray[np.float32], patterns: NDArray[np.float16], count: int
-) -> NDArray[np.float32]:
-    """Return the mean pattern of the `count` known presses with the nearest readings, compared in network units.
-
-    Readings are (n, 3, rows, cols) and (m, 3, rows, cols) in zeroed counts, patterns (m, H, W) in [mm].
+    Readings are (n, 3, rows, cols) in zeroed counts, patterns (n, H, W) in [mm].
     """
-    per_unit = np.array(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
-    asked, held = ((one / per_unit).reshape(len(one), -1).astype(np.float32) for one in (some, known))
-    squares, found = np.square(held).sum(axis=1), []
-    for start in range(0, len(asked), _AT_ONCE):
-        apart = squares - 2 * asked[start : start + _AT_ONCE] @ held.T
-        nearest = np.argpartition(apart, count - 1, axis=1)[:, :count]
-        found.append(patterns[nearest].mean(axis=1, dtype=np.float32))
-    return np.concatenate(found)
+    held = in_units(known).reshape(len(known), -1)
+    squares = np.square(held).sum(axis=1)
+
+    def nearest(newest: NDArray[np.floating]) -> NDArray[np.floating]:
+        found = []
+        for asked in np.array_split(in_units(newest.astype(np.float32)), -(-len(newest) // _AT_ONCE)):
+            apart = squares - 2 * asked.reshape(len(asked), -1) @ held.T
+            those = np.argpartition(apart, _NEAREST - 1, axis=1)[:, :_NEAREST]
+            found.append(patterns[those].mean(axis=1, dtype=np.float32))
+        return np.concatenate(found)
+
+    return nearest
 
 
-def family_rows(found: Mapping[str, Found], best: str, wide: FrozenPresses) -> list[Row]:
+def family_rows(found: Mapping[str, Found], wide: FrozenPresses) -> list[Row]:
     """Return the PSNR of every method by family and in total, and the model's margin over the best baseline."""
     rows: list[Row] = []
     for family, which in _families(wide):
@@ -155,7 +127,7 @@ def family_rows(found: Mapping[str, Found], best: str, wide: FrozenPresses) -> l
         for name, values in found_db.items():
             row[name] = with_interval(values, pads) if name in SHORT.values() else round(float(values.mean()), 2)
         for name in SHORT.values():
-            row[f"{name}, over"] = with_interval(found_db[name] - found_db[best], pads)
+            row[f"{name}, over"] = with_interval(found_db[name] - found_db[_BEST], pads)
         rows.append(row)
     return rows
 
