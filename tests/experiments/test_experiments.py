@@ -4,8 +4,7 @@ import pytest
 from experiment_samples import tables_of
 
 from train.experiments.__main__ import EXPERIMENTS, experiment, main, run
-from train.experiments.paper_networks import HELD_OUT
-from train.experiments.paper_tables import training_sets
+from train.experiments.paper_tables import HELD_OUT, training_sets
 from train.experiments.workbench import Workbench
 
 ERRORS = {"test PSNR dB", "run time ms"}

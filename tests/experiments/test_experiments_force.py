@@ -22,7 +22,7 @@ from train.experiments.force import (
     pressed,
     training_presses,
 )
-from train.experiments.paper_networks import mixed
+from train.experiments.paper_tables import mixed
 from train.experiments.workbench import Method
 from train.physics.sensor_noise import NAMES, Nuisances
 

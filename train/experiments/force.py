@@ -26,7 +26,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.data.paper_taps import PaperTaps, between_frames, windows
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet
-from train.experiments.paper_networks import classical_methods, compact_methods, mixed
+from train.experiments.paper_tables import classical_methods, compact_methods, mixed
 from train.experiments.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM

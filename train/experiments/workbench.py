@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -78,8 +79,9 @@ class Workbench:
             name = f"quick-{name}"
             world = replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
-        with quiet_workers():
-            return make_presses(world, self.data_folder / f"{name}.npz")
+        path = self.data_folder / f"{name}.npz"
+        with nullcontext() if path.exists() else quiet_workers():
+            return make_presses(world, path)
 
     def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
         """Return a shipped model, in the session of the runtime."""
