@@ -24,9 +24,17 @@ from edge.inference.contract import (
     POSES_NAME,
     TRACTION_NAME,
 )
-from export.errors import ExportError
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from train.networks.blocks import PatternNet
+
+
+class ExportError(Exception):
+    """Root of all errors of the export."""
+
+
+class ParityError(ExportError, ArithmeticError):
+    """Failed comparison: the ONNX graph does not compute what the network computes."""
+
 
 _ARGUMENTS: Final = {INPUT_NAME: "window", POSES_NAME: "poses", PAD_NAME: "pad"}
 """Argument of a network's forward for each input of its graph."""

@@ -22,8 +22,7 @@ from edge.inference.contract import (
     scheduled_rows,
 )
 from edge.inference.onnx_session import LOG_FATAL_ONLY
-from export.errors import ParityError
-from export.graph import outputs
+from export.graph import ParityError, outputs
 from train.networks.blocks import PatternNet
 from train.surfaces.poses import ANGLE_STEP_DEG
 

@@ -1,41 +1,42 @@
 """Checkpoints to ONNX: one file a model, the contract inside, parity checked before it is written.
 
-python -m export.to_onnx checkpoints/stsr.pt checkpoints/mtsr.pt --out edge/models
-python -m export.to_onnx checkpoints/stsr.pt --int8 data/gripped.npz --out edge/models
+python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --out edge/models
 python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --intervals data/gripped.npz
+python -m export.to_onnx checkpoints/stsr.pt --validation data/validation.npz --int8 data/gripped.npz
 
-A graph takes any number of windows in one run. With validation presses, deviations are corrected by region, so that
-their intervals hold; with --intervals, by window.
+A graph takes any number of windows in one run. Deviations are corrected by region on validation presses, so that their
+intervals hold; with --intervals, by window.
 """
 
 import argparse
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 
 from edge.errors import EdgeError
-from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error
+from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error, windows_of
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
+from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust import Trust
+from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from export.confidence import confidence_sets, judge_in_contract
-from export.errors import ExportError
-from export.graph import outputs, to_model
+from export.graph import ExportError, outputs, to_model
 from export.int8 import calibration_batch, convolutions, quantised
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
-from train.data.paper_taps import paper_taps
 from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import CheckpointError, TrainError
@@ -50,9 +51,7 @@ from train.surfaces.poses import ANGLE_STEP_DEG, REACH_MM
 from train.trust import load_trust
 
 MOST_LOSS_DB: Final = 0.1  # largest accepted loss by int8 on the frozen test set, in [dB]
-_COSTLY: Final = f"more than {MOST_LOSS_DB} dB"
 MOST_COVERAGE_CHANGE: Final = 0.02  # largest accepted change of the 90 % interval's coverage by int8
-_UNSURE: Final = f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}"
 
 
 def contract_of(net: PatternNet, report: dict[str, Any], frozen: FrozenSet) -> Contract:
@@ -122,8 +121,8 @@ def export(
     validation: Sequence[FrozenSet] = (),
     trust: Trust | None = None,
     intervals: IntervalData | None = None,
-) -> str:
-    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx, and return a line that describes it.
+) -> tuple[str, str]:
+    """Write NAME.onnx for NAME.pt, or NAME-int8.onnx; return a line that describes it, and the limits it exceeds.
 
     Parity is checked in float32, also for graphs that are then quantised; errors are those in the runtime's session.
     The model is for the pad of the test set `frozen`. Ranges of int8 are measured on the training taps `calibration`,
@@ -160,7 +159,7 @@ def export(
     session = _session(model, contract)
     facts = [*judge_in_contract(session, frozen, validation), *facts]
     contract = session.contract
-    facts += cost(float_error, contract.test_error.get(str(contract.taps), {}))
+    lost, exceeded = cost(float_error, contract.test_error.get(str(contract.taps), {}))
     # Several taps are checked by their poses: a model that takes none would be believed whatever they are.
     checkable = contract.taps == 1 or contract.takes_poses
     if trust is not None and checkable and contract.pad_inputs and contract.traction_scale:
@@ -168,7 +167,8 @@ def export(
     content = _content(model, contract, origin(report))
     Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})  # checked as in the runtime
     write_in_place(folder / f"{name}.onnx", lambda draft: draft.write_bytes(content), load_session)
-    return f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join(facts)}"
+    line = f"{name}.onnx: {len(content) / 1e6:.2f} MB, {', '.join([*facts, *lost])}"
+    return line, exceeded and f"{name}.onnx ({exceeded})"
 
 
 def _session(model: onnx.ModelProto, contract: Contract) -> ModelSession:
@@ -186,17 +186,97 @@ def _content(model: onnx.ModelProto, contract: Contract, stated: Mapping[str, st
     return model.SerializeToString(deterministic=True)
 
 
-def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> list[str]:
-    """Return the loss by int8 as text, with each exceeded limit; nothing of a float graph, or if none was judged."""
+def cost(in_float: Mapping[str, float], in_integers: Mapping[str, float]) -> tuple[list[str], str]:
+    """Return the loss by int8 as text, and which limits it exceeds; nothing of a float graph, or if none was judged."""
     if not in_float:
-        return []
+        return [], ""
     lost_db = in_float["psnr_db"] - in_integers["psnr_db"]
-    facts = [f"{lost_db:.3f} dB lost to quantisation"]
-    if lost_db > MOST_LOSS_DB:
-        facts.append(_COSTLY)
+    exceeded = [f"more than {MOST_LOSS_DB} dB"] * (lost_db > MOST_LOSS_DB)
     if "coverage_90" in in_float and abs(in_integers["coverage_90"] - in_float["coverage_90"]) > MOST_COVERAGE_CHANGE:
-        facts.append(_UNSURE)
-    return facts
+        exceeded.append(f"an interval changed by more than {MOST_COVERAGE_CHANGE:.0%}")
+    return [f"{lost_db:.3f} dB lost to quantisation"], " and ".join(exceeded)
+
+
+BINS: Final = 10
+
+
+def judge_in_contract(session: ModelSession, frozen: FrozenSet, validation: Collection[FrozenSet]) -> list[str]:
+    """Put errors on the test set and confidence into a model's contract, and return the errors as text.
+
+    A model of another scale than the frozen set's is not evaluated.
+    """
+    contract = session.contract
+    parts = [f"x{contract.scale}"]
+    if contract.scale == frozen.scale:
+        for given in tracked(range(1, contract.taps + 1), "judging", "run"):
+            contract.test_error[str(given)] = mean_error(judge_model(session, frozen, given))
+        error = contract.test_error[str(contract.taps)]
+        parts.append(f"{error['psnr_db']:.2f} dB, SSIM {error['ssim']:.3f}")
+        if "coverage_90" in error:
+            parts.append(f"interval covers {error['coverage_90']:.1%}")
+    else:
+        parts.append(f"not evaluated, the test set is of x{frozen.scale}")
+    fitting = [one for one in validation if one.scale == contract.scale]
+    if fitting and session.deviation is not None:
+        contract.confidence.update(fit_confidence(session, fitting))
+    return parts
+
+
+def fit_confidence(model: Model, sets: Collection[FrozenSet]) -> dict[str, dict[str, list[float]]]:
+    """Fit the table of edge.inference.intervals for a model with deviations.
+
+    Frames are sorted by their uncertainty into bins of equally many; a bin's gain is that of its frames together.
+    """
+    taps = model.contract.taps
+    parts = [
+        [doubts_and_errors(model, given, frozen) for given in range(1, taps + 1)]
+        for frozen in tracked(sets, "confidence", "set")
+    ]
+    found = [np.concatenate([part[given] for part in parts], axis=1) for given in range(taps)]
+    rows = {str(given): _row(found[given - 1 : given + 1]) for given in range(1, taps + 1)}
+    return {given: row for given, row in rows.items() if row["doubt"]}  # empty if no pattern exceeds zero
+
+
+def doubts_and_errors(model: Model, given: int, frozen: FrozenSet) -> NDArray[np.float64]:
+    """Return uncertainty, RMS error and RMS of the pattern for every frame, (3, n), with the newest `given` taps.
+
+    ValueError if the model gives no deviation.
+    """
+    rows, contract = [], model.contract
+    for window, truth in zip(windows_of(frozen, contract, given), frozen.patterns(), strict=True):
+        pattern, deviation = model.run(contract.scale_window(window)), model.deviation
+        if deviation is None:
+            raise ValueError(f"model '{model.name}' gives no deviation, so its error cannot be predicted")
+        about, size = doubt(pattern, deviation)
+        rows.append((about, float(np.sqrt(np.mean((pattern - truth) ** 2))), size))
+    return np.array(rows).T
+
+
+def _rising(bins: list[NDArray[np.intp]], about: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Join bins until each lies above the one before in its first four digits."""
+    joined: list[NDArray[np.intp]] = []
+    for part in bins:
+        if joined and float(f"{about[part].mean():.4g}") <= float(f"{about[joined[-1]].mean():.4g}"):
+            joined[-1] = np.concatenate([joined[-1], part])
+        else:
+            joined.append(part)
+    return joined
+
+
+def _row(found: list[NDArray[np.float64]]) -> dict[str, list[float]]:
+    about, error, size = found[0]
+    seen = size > 0  # a pattern of zeros has no uncertainty relative to its size
+    about, share = about[seen], error[seen] / size[seen]
+    bins = _rising([part for part in np.array_split(np.argsort(about), BINS) if part.size], about)
+    row = {
+        "doubt": [float(about[part].mean()) for part in bins],
+        "error": [float(share[part].mean()) for part in bins],
+        "gain": [],
+    }
+    if len(found) == 2:
+        later = found[1][1][seen] / size[seen]
+        row["gain"] = [float(1 - later[part].sum() / share[part].sum()) for part in bins]
+    return {name: [float(f"{value:.4g}") for value in values] for name, values in row.items()}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -205,17 +285,13 @@ def main(arguments: list[str] | None = None) -> None:
     add = parser.add_argument
     add("checkpoints", type=Path, nargs="+", help="NAME.pt, written by train.fit")
     add("--out", type=Path, default=Path(), help="folder for NAME.onnx (default: here)")
-    help_of_intervals = "training presses on which intervals are fitted"
-    add("--intervals", type=Path, nargs="+", metavar="DATA", help=help_of_intervals)
-    add("--trust", type=Path, metavar="FILE", help="checks of train.trust, with --validation, or those of a model")
-    add("--validation", type=Path, metavar="FILE", help="presses of the validation set, not used for training")
+    add("--intervals", type=Path, nargs="+", metavar="DATA", help="training presses on which intervals are fitted")
+    add("--trust", type=Path, metavar="FILE", help="checks of train.trust, or those of a model")
+    add("--validation", type=Path, required=True, metavar="FILE", help="presses of the validation set, not trained on")
     add("--test", type=Path, metavar="FILE", help="presses of a test set in place of the frozen one, for train.own")
-    help_of_int8 = "write NAME-int8.onnx too, with ranges from these taps"
-    add("--int8", type=Path, nargs="+", metavar="DATA", help=help_of_int8)
+    add("--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx, with ranges from these taps")
     options = parser.parse_args(arguments)
-    if options.intervals is not None and options.validation is None:
-        parser.error("--intervals needs --validation")
-    lines: list[str] = []
+    lossy: list[str] = []
     try:
         options.out.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(load_network(options.checkpoints[0])[1])
@@ -223,18 +299,14 @@ def main(arguments: list[str] | None = None) -> None:
         frozen = load_frozen_set(BUNDLE_DIR / "frozen.npz")
         if options.test is not None:
             frozen = freeze_presses(load_presses(options.test), SEED, nuisances).as_frozen_set()
+        presses = load_presses(options.validation)
+        training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
-        presses = intervals = None
-        if options.validation is None:
-            validation = confidence_sets(paper_taps("validation"), frozen.scale)
-        else:
-            presses = load_presses(options.validation)
-            validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
-            training = None if options.intervals is None else join_presses([*map(load_presses, options.intervals)])
-            intervals = IntervalData(presses, training, sensor=sensor)
         trust = None if options.trust is None else load_trust(options.trust, presses)
+        validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
+        intervals = IntervalData(presses, training, sensor=sensor)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
-            line = export(
+            line, exceeded = export(
                 checkpoint,
                 options.out,
                 frozen,
@@ -244,13 +316,11 @@ def main(arguments: list[str] | None = None) -> None:
                 intervals=intervals,
             )
             sys.stdout.write(line + "\n")
-            lines.append(line)
+            lossy += [exceeded] * bool(exceeded)
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"export: {error}")
     except OSError as error:
         sys.exit(f"export: {error.filename}: {error.strerror}")
-    costly = {line.partition(":")[0]: [one for one in (_COSTLY, _UNSURE) if one in line] for line in lines}
-    lossy = [f"{name} ({' and '.join(costs)})" for name, costs in costly.items() if costs]
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")
 

@@ -2,18 +2,17 @@
 
 python -m export.verify edge/models/*.onnx
 
-Every graph is run at every optimisation level of onnxruntime on the frozen test set, on real recordings if available,
-and on extreme windows. float32 graphs are compared with torch, int8 graphs with the torch network from which they were
-quantised. That network is restored from the float32 graph's own weights.
+Every graph is run at every optimisation level of onnxruntime on the frozen test set, on the real recordings of
+TACTILE_RECORDINGS, if it names a folder of TRIAL/xela_SENSOR.csv, and on extreme windows. float32 graphs are compared
+with torch, int8 graphs with the torch network from which they were quantised, which is restored from the float32 graph.
 """
 
 import argparse
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import onnx
@@ -21,14 +20,13 @@ import torch
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from edge.bench.provenance import provenance
 from edge.errors import EdgeError, ModelError
 from edge.evaluation.metrics import psnr_db
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import Contract
 from edge.terminal.progress_bar import tracked
-from export.errors import ExportError, ParityError
+from export.graph import ExportError, ParityError
 from export.parity import (
     EXTREME_TOLERANCE,
     LEVELS,
@@ -47,6 +45,7 @@ from train.data.real_grips import recorded_sets
 from train.errors import CheckpointError, TrainError
 from train.learning.checkpoint import network_of, origin_of
 from train.networks.blocks import PatternNet
+from train.report import Report, Row, markdown
 
 _SCANS_APART: Final = 20
 BOUNDS: Final = {"float32": (TOLERANCE, EXTREME_TOLERANCE), "int8": (0.25, 1.05)}
@@ -58,8 +57,7 @@ FROZEN: Final = BUNDLE_DIR / "frozen.npz"
 READINGS: Final = ("test set", "one tap", "recordings")
 
 
-@dataclass(frozen=True, slots=True)
-class Parity:
+class Parity(NamedTuple):
     """Comparison of one graph at one level on some windows: differences by output, and which bound is broken, or ""."""
 
     model: str
@@ -69,15 +67,18 @@ class Parity:
     psnr_change_db: float | None
     broken: str
 
-    def cells(self) -> list[str]:
+    def row(self) -> Row:
         """Return the comparison as cells of a table."""
-        largest = " ".join(f"{one.largest:.1e}" for one in self.differences) or "-"
-        relative = " ".join(f"{one.relative:.1e}" for one in self.differences) or "-"
         change = "-" if self.psnr_change_db is None else f"{self.psnr_change_db:+.4f}"
-        return [self.model, self.level, self.windows, largest, relative, change, self.broken or "holds"]
-
-
-COLUMNS: Final = ("model", "level", "windows", "largest", "relative", "PSNR change dB", "bound")
+        return {
+            "model": self.model,
+            "level": self.level,
+            "windows": self.windows,
+            "largest": " ".join(f"{one.largest:.1e}" for one in self.differences) or "-",
+            "relative": " ".join(f"{one.relative:.1e}" for one in self.differences) or "-",
+            "PSNR change dB": change,
+            "bound": self.broken or "holds",
+        }
 
 
 def verify(path: Path, frozen: FrozenSet, recordings: Path | None = None) -> Iterator[Parity]:
@@ -177,50 +178,38 @@ def _load(path: Path) -> onnx.ModelProto:
         raise ModelError(f"{path}: not an ONNX model") from error
 
 
-def table(rows: list[Parity]) -> str:
-    """Format rows in Markdown, with one line a level for extreme windows: the worst of them."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS), *(row.cells() for row in _worst(rows))]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def page(rows: list[Parity], models: Sequence[Path]) -> str:
-    """Return the report `parity`."""
-    command = "python -m export.verify edge/models/*.onnx --out reports/parity.md"
-    made = provenance(command, [__file__], [*models, FROZEN])
-    text = f"With torch {torch.__version__}. Of the extreme windows the worst one of each level is shown."
-    return f"# parity\n\n{made}\n\n{text}\n\n{table(rows)}\n"
-
-
-def _worst(rows: list[Parity]) -> list[Parity]:
+def worst(rows: Sequence[Parity]) -> list[Parity]:
     """Return all rows of readings; of extreme windows those that break a bound, or else the largest difference."""
-    shown: dict[tuple[str, str, str], list[Parity]] = {}
+    alike: dict[tuple[str, str, str], list[Parity]] = {}
     for row in rows:
-        shown.setdefault((row.model, row.level, row.windows if row.windows in READINGS else ""), []).append(row)
-    kept: list[Parity] = []
-    for same in shown.values():
-        kept += [row for row in same if row.broken] or [
-            max(same, key=lambda row: max(d.relative for d in row.differences))
-        ]
-    return kept
+        alike.setdefault((row.model, row.level, row.windows if row.windows in READINGS else ""), []).append(row)
+    return [
+        shown
+        for same in alike.values()
+        for shown in [row for row in same if row.broken]
+        or [max(same, key=lambda row: max(one.relative for one in row.differences))]
+    ]
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m export.verify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("models", type=Path, nargs="+", help="NAME.onnx or NAME-int8.onnx")
-    recordings = os.environ.get("TACTILE_RECORDINGS") or None
-    help_of_recordings = "folder of TRIAL/xela_SENSOR.csv (default: TACTILE_RECORDINGS, or none)"
-    parser.add_argument("--recordings", type=Path, default=recordings, help=help_of_recordings)
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the table as a report, too")
     options = parser.parse_args(arguments)
+    recordings = os.environ.get("TACTILE_RECORDINGS")
     try:
         frozen = load_frozen_set(FROZEN)
-        rows = [row for path in options.models for row in verify(path, frozen, options.recordings)]
+        folder = Path(recordings) if recordings else None
+        rows = [row for path in options.models for row in verify(path, frozen, folder)]
     except (ExportError, TrainError, EdgeError) as error:
         sys.exit(f"verify: {error}")
-    sys.stdout.write(table(rows) + "\n")
+    table = [row.row() for row in worst(rows)]
+    sys.stdout.write(markdown(table) + "\n")
     if options.out is not None:
-        options.out.write_text(page(rows, options.models), encoding="utf-8")
+        report = Report(options.out.stem, options.out.parent, __file__, [*options.models, FROZEN])
+        report.table(table, f"With torch {torch.__version__}. Of the extreme windows the worst of each level is shown.")
+        report.write()
     broken = sum(bool(row.broken) for row in rows)
     if broken:
         sys.exit(f"verify: {broken} of {len(rows)} comparisons break a bound")

@@ -1,8 +1,8 @@
 """Train the bundled networks on from their bundled weights, or one network by name; in one seeded run.
 
     python -m train.fit checkpoints --data data/gripped.npz data/taps7.npz --validation data/validation.npz
-    torchrun --nproc-per-node 2 -m train.fit checkpoints --data data/parts.npz --network compact-stsr --steps 5000
-    python -m train.fit checkpoints --data data/nominal4.npz --network mtsr2 --start-from seed-stsr --steps 5000
+
+With `torchrun --nproc-per-node 2 -m train.fit` two processes share each batch.
 
 The bundled networks are trained for as many steps, that of one tap and that of several taps, so that taps alone tell
 them apart. Older taps and the pads' constants are dropped at random in training, so that a network works with fewer
@@ -13,20 +13,16 @@ taps than it takes and without constants. An interrupted run resumes with the sa
 import argparse
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from train.data.frozen_presses import freeze_presses
-from train.data.paper_taps import paper_taps
 from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import DatasetError, TrainError
-from train.freeze import freeze
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
 from train.physics.pad_draws import KNOWN
-from train.physics.sensor_noise import Nuisances
 from train.surfaces.poses import MAX_TAPS
 
 GIVEN: Final = {1: (1.0,), 2: (0.3, 0.7), 4: (0.3, 0.15, 0.1, 0.45), 7: (0.3, 0.14, 0.1, 0.25, 0.04, 0.04, 0.13)}
@@ -55,20 +51,15 @@ def given_taps(taps: int) -> tuple[float, ...]:
     return (0.3, *[0.25 / (taps - 2)] * (taps - 2), 0.45)
 
 
-def bundled(data: PressSet, shorten: int = 1) -> list[Training]:
-    """Return the trainings of the bundled networks; `shorten` divides their steps, for tests.
-
-    DatasetError if no sequence has as many taps as they take.
-    """
+def bundled(data: PressSet) -> tuple[Training, ...]:
+    """Return the trainings of the bundled networks; DatasetError if no sequence has as many taps as they take."""
     most, needed = int(data.counts.any(axis=(2, 3, 4)).sum(axis=1).max()), max(len(one.recipe.given) for one in BUNDLED)
     if most < needed:  # before hours of training of those that come first
         raise DatasetError(
             f"the presses have at most {most} taps, the bundled networks take {needed}: add data/taps7.npz, or train "
             "one network with --network"
         )
-    if shorten < 1:
-        raise ValueError(f"--shorten is {shorten}, expected 1 or more")
-    return [replace(one, recipe=replace(one.recipe, steps=max(one.recipe.steps // shorten, 1))) for one in BUNDLED]
+    return BUNDLED
 
 
 def _line(report: dict[str, Any]) -> str:
@@ -91,15 +82,8 @@ def main(arguments: list[str] | None = None) -> None:
     started_s = time.monotonic()
     try:
         data = join_presses([*map(load_presses, options.data)])
-        validation = None if options.validation is None else load_presses(options.validation)
-        if options.network is None and validation is None:
-            raise ValueError("the bundled networks are calibrated on presses: give --validation")
-        trainings = bundled(data, options.shorten) if options.network is None else [_training(options)]
-        if validation is None:
-            frozen = freeze(paper_taps("validation"), Nuisances(), SEED, scale=options.scale)
-        else:
-            frozen = freeze_presses(validation, SEED).as_frozen_set()
-        for training in trainings:
+        frozen = freeze_presses(load_presses(options.validation), SEED).as_frozen_set()
+        for training in bundled(data) if options.network is None else (_training(options),):
             _say(_line(fit_network(training, data, frozen, options.folder)))
     except (TrainError, ValueError) as error:
         sys.exit(f"fit: {error}")
@@ -111,19 +95,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _training(options: argparse.Namespace) -> Training:
     *_, taps = options.network.rpartition("mtsr")
-    recipe = Recipe(
-        steps=options.steps,
-        batch=options.batch,
-        learning_rate=options.learning_rate,
-        given=given_taps(int(taps) if taps.isdigit() else 1),
-        bf16=options.bf16,
-        minutes=options.minutes,
-    )
+    recipe = Recipe(options.steps, given=given_taps(int(taps) if taps.isdigit() else 1), bf16=options.bf16)
     compact = options.network.startswith(_COMPACT)
     # A network of the paper must not overwrite a bundled one.
-    name = options.name or (options.network if compact else f"seed-{options.network}")
+    name = options.network if compact else f"seed-{options.network}"
     known, start, keep = _KNOWN if compact else {}, options.start_from, options.keep
-    return Training(name, options.network, recipe, options.scale, start, options.seed, known, keep)
+    return Training(name, options.network, recipe, start=start, seed=options.seed, options=known, keep=keep)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -131,17 +108,16 @@ def _parser() -> argparse.ArgumentParser:
     add, one = parser.add_argument, parser.add_argument_group("one network instead of the bundled ones").add_argument
     add("folder", type=Path, help="folder for the checkpoints")
     add("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
-    add("--validation", type=Path, help="presses of the validation set, not used for training")
-    add("--shorten", type=int, default=1, help="divide the steps of the bundled networks, for trials")
-    one("--network", choices=NETWORKS, metavar="NAME", help=", ".join(NETWORKS))
-    one("--name", help="name of the checkpoint (default: the network's; for those of the paper with the prefix seed-)")
+    add("--validation", type=Path, required=True, help="presses to calibrate on, not used for training")
+    one(
+        "--network",
+        choices=NETWORKS,
+        metavar="NAME",
+        help=", ".join(NETWORKS) + "; those of the paper are seed-NAME.pt",
+    )
     one("--start-from", metavar="NAME", help="checkpoint in the same folder, or bundled NAME.onnx, to start from")
     one("--keep", type=float, default=0.0, metavar="SHARE", help="share of its weights in the final ones (default: 0)")
-    one("--scale", type=int, default=10, help="pattern pixels per taxel pitch")
     one("--steps", type=int, default=9000)
-    one("--minutes", type=float, help="end after this time, if the steps take longer")
-    one("--batch", type=int, default=64, help="windows in a batch, shared by all devices")
-    one("--learning-rate", type=float, default=2e-3)
     one("--bf16", action="store_true", help="multiply in bfloat16")
     one("--seed", type=int, default=1)
     return parser

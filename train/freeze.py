@@ -24,9 +24,8 @@ from firmware_bridge.recording.formats import load_recording
 from train.data.paper_taps import PaperTaps, between_frames, paper_taps
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses
-from train.demo import demo_recording
+from train.demo import demo_recording, grip_recording
 from train.errors import TrainError
-from train.grip import grip_recording
 from train.networks.symmetric import moved_scans
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
 from train.physics.sensor_noise import Nuisances, apply_nuisances

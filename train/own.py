@@ -41,10 +41,9 @@ from train.data.frozen_presses import freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
-from train.data.real_grips import Grip, recorded_grips
+from train.data.real_grips import Grip, has_hole, play, recorded_grips
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError
-from train.experiments.sensor.real import has_hole, play
 from train.families.catalogue import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
@@ -274,7 +273,7 @@ def _train(options: argparse.Namespace) -> int:
         )
     families = dict(SHARES) | {mesh_name(path, options.unit_mm): 20.0 for path in options.mesh}
     world = World(families=families, ranges=knowledge.ranges, seed=options.seed)
-    plan = _plan(options, world, work)
+    plan = plan_of(options.minutes, world, work)
     even = replace(world, families=dict.fromkeys(families, 1.0), count=COMPARED, per_pad=6, begun=0.0)
     sets = {
         "validation": even,
@@ -284,7 +283,7 @@ def _train(options: argparse.Namespace) -> int:
         UNLIKE: replace(even, ranges=knowledge.widened()),
     }
     made = {}
-    with quiet_workers(-1):
+    with quiet_workers():
         presses = make_presses(replace(world, count=plan.presses), work / "presses.npz")
         for number, (what, of) in enumerate(sets.items(), 1):
             path = work / f"{what.replace(' ', '-')}.npz"
@@ -328,15 +327,15 @@ def _exported(work: Path, name: str) -> Path:
     return path
 
 
-def _plan(options: argparse.Namespace, world: World, work: Path) -> Plan:
-    """Return the plan of an earlier run with the same time, or one by the speed of this machine."""
-    path = work / "plan.json"
-    if path.exists() and (kept := json.loads(path.read_text()))["minutes"] == options.minutes:
+def plan_of(minutes: float, world: World, folder: Path) -> Plan:
+    """Return the plan that a folder has of an earlier run with the same time, or one by the speed of this machine."""
+    path = folder / "plan.json"
+    if path.exists() and (kept := json.loads(path.read_text()))["minutes"] == minutes:
         return Plan(kept["presses"], kept["steps"])
-    press_s, step_s = tried(world, work)
-    plan = planned(options.minutes, press_s, step_s)
+    press_s, step_s = tried(world, folder)
+    plan = planned(minutes, press_s, step_s)
     _say(plan.line(press_s, step_s))
-    text = json.dumps({"minutes": options.minutes, "presses": plan.presses, "steps": plan.steps}) + "\n"
+    text = json.dumps({"minutes": minutes, "presses": plan.presses, "steps": plan.steps}) + "\n"
     write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False)
     return plan
 

@@ -1,15 +1,11 @@
-"""Report of an experiment: tables as CSV and Markdown, a plot as PNG, and the command and machine that made them."""
+"""Report of an experiment: a page of paragraphs and tables, with the command and machine that made them."""
 
-import csv
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge.bench.provenance import provenance
@@ -20,7 +16,7 @@ Row = dict[str, Cell]
 
 
 class Report:
-    """Collector of an experiment's results, written as NAME.md, NAME.csv and, where it has a plot, NAME.png.
+    """Collector of an experiment's results, written as NAME.md.
 
     The head of the page names the experiment's source, and the models and frozen sets that it has used by then. A quick
     run was cut short for a test: said at the top of the page.
@@ -29,7 +25,7 @@ class Report:
     def __init__(
         self, name: str, folder: Path, source: str, models: Iterable[Path] = (), *, quick: bool = False
     ) -> None:
-        self._path = folder / name
+        self._path = folder / f"{name}.md"
         self._source = source
         self._models = models
         self._quick = quick
@@ -40,42 +36,24 @@ class Report:
         """Add a paragraph to the page."""
         self._parts.append(text)
 
-    def table(self, rows: Sequence[Row], caption: str, part: str = "") -> None:
-        """Add a table to the page, and write it as NAME.csv or NAME-PART.csv."""
-        self.show(rows, caption)
-        with self._file(".csv", part).open("w", newline="") as file:
-            writer = csv.DictWriter(file, _columns(rows), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-
-    def show(self, rows: Sequence[Row], caption: str) -> None:
+    def table(self, rows: Sequence[Row], caption: str) -> None:
         """Add a table to the page."""
-        columns = _columns(rows)
-        lines = [" | ".join(columns), " | ".join("---" for _ in columns)]
-        lines += [" | ".join(_shown(row.get(column)) for column in columns) for row in rows]
-        self._parts.append("\n".join([caption, "", *(f"| {line} |" for line in lines)]))
-
-    @contextmanager
-    def figure(self, size: tuple[float, float] = (8, 5)) -> Iterator[Figure]:
-        """Add a plot to the page, saved as NAME.png."""
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)
-        yield figure
-        path = self._file(".png")
-        figure.savefig(path, dpi=110, metadata={"Software": None})
-        self._parts.append(f"![{path.stem}]({path.name})")
+        self._parts.append(f"{caption}\n\n{markdown(rows)}")
 
     def write(self) -> Path:
-        """Write the page, and say where it lies."""
-        head = [f"# {self._path.name}", str(provenance(_command(), [self._source], self._models, SEED))]
+        """Write the page, and return its path."""
+        head = [f"# {self._path.stem}", str(provenance(_command(), [self._source], self._models, SEED))]
         if self._quick:
             head.append("**A quick run, for the tests: no figure here means anything.**")
-        page = self._file(".md")
-        page.write_text("\n\n".join(head + self._parts) + "\n")
-        return page
+        self._path.write_text("\n\n".join(head + self._parts) + "\n")
+        return self._path
 
-    def _file(self, suffix: str, part: str = "") -> Path:
-        return self._path.with_name(self._path.name + (f"-{part}" if part else "") + suffix)
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Return rows as a table in Markdown, with the columns of all of them."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    lines = [columns, ["---"] * len(columns), *([_shown(row.get(column)) for column in columns] for row in rows)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def bootstrap_interval(values: NDArray[np.floating], taps: NDArray[np.integer], seed: int = 0) -> tuple[float, float]:
@@ -94,10 +72,6 @@ def with_interval(values: NDArray[np.floating], taps: NDArray[np.integer], digit
     low, high = bootstrap_interval(values, taps)
     form = f"{sign}.{digits}f"
     return f"{float(np.mean(values)):{form}} ({low:{form}}..{high:{form}})"
-
-
-def _columns(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(column for row in rows for column in row))
 
 
 def _shown(cell: Cell) -> str:

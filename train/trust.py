@@ -36,8 +36,8 @@ _RIDGE: Final = 1e-6
 def load_trust(path: Path, validation: PressSet | None = None) -> Trust:
     """Return the forward model and checks of a file of this command, or those of NAME.onnx with their limits.
 
-    Limits of the file's are set by `validation`, presses of several taps on pads of their own.
-    CheckpointError if it is absent, damaged, or without presses to set limits by.
+    Limits of the file's are set by `validation`, presses of several taps on pads of their own. CheckpointError if it is
+    absent, damaged, or without presses to set limits by.
     """
     try:
         if path.suffix == ".onnx":
@@ -63,7 +63,7 @@ def _trust_of(model: onnx.ModelProto) -> Trust:
     return trust
 
 
-def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
+def fit_trust(presses: PressSet, seed: int, contact_steps: int = 40_000, tap_steps: int = 20_000) -> dict[str, Any]:
     """Fit forward model, check of contacts, and check of earlier taps by their poses; limits come at export.
 
     DatasetError if no sequence has several taps.
@@ -73,8 +73,8 @@ def fit_trust(presses: PressSet, seed: int, shorten: int = 1) -> dict[str, Any]:
         raise DatasetError("no sequences of several taps: add a file of 'make_presses --taps 4'")
     return {
         "forward": fit_forward_model(presses).to_json(),
-        "contact": fit_contact_network(presses, seed, max(40_000 // shorten, 1)).to_json(),
-        "tap": fit_tap_network(several, seed, max(20_000 // shorten, 1)).to_json(),
+        "contact": fit_contact_network(presses, seed, contact_steps).to_json(),
+        "tap": fit_tap_network(several, seed, tap_steps).to_json(),
         "data_sha256": presses.sha256(),
     }
 
@@ -111,12 +111,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m train.trust", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, metavar="OUT.json", help="trust.json in the folder of the checkpoints")
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
-    parser.add_argument("--shorten", type=int, default=1, help="divide the steps, to try things out (1)")
-    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     try:
         data = join_presses([*map(load_presses, options.data)])
-        text = json.dumps(fit_trust(data, options.seed, options.shorten)) + "\n"
+        text = json.dumps(fit_trust(data, seed=1)) + "\n"
         options.out.parent.mkdir(parents=True, exist_ok=True)
         write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))
     except TrainError as error:

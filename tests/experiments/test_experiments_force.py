@@ -6,8 +6,8 @@ from experiment_samples import quick_bench
 
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from train.data.paper_taps import between_frames
-from train.experiments.paper import force
-from train.experiments.paper.force import (
+from train.experiments import force
+from train.experiments.force import (
     CLAIM_N,
     HOLD,
     PRESS,
@@ -22,7 +22,7 @@ from train.experiments.paper.force import (
     pressed,
     training_presses,
 )
-from train.experiments.paper.protocol import mixed
+from train.experiments.paper_tables import mixed
 from train.experiments.workbench import Method
 from train.physics.sensor_noise import NAMES, Nuisances
 

@@ -1,51 +1,114 @@
-"""Reports of the shipped models on other pads, families and taps: their parts, and their pages in miniature."""
+"""Reports of the shipped models: parts of those on other pads, and the page on real grips in miniature."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from edge_samples import make_pad_contract, write_model
-from experiment_samples import quick_bench
+from experiment_samples import grip, quick_bench, save_recordings, tables_of
 
+from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.onnx_session import ModelSession
+from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
-from train.experiments.sensor import pads, shipped
+from train.data.real_grips import (
+    has_hole,
+    neighbours_mean,
+    play,
+    recorded_grips,
+    recorded_sets,
+    share_touched,
+    unevenness,
+)
+from train.errors import DatasetError
+from train.experiments.__main__ import run
+from train.experiments.families import NONE_OFF, OffPad
+from train.experiments.workbench import infer_presses
 from train.physics.pad_draws import NOMINAL
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    """Workbench with a model that makes squares of taxels, with pad, traction and intervals."""
-    folder = tmp_path_factory.mktemp("models")
-    levels = {"90": [1.6] * 4}
-    contract = make_pad_contract(taps=1, output_full_scale=0.5, interval_factor=1.6, interval_levels=levels)
-    write_model(folder / "stsr-int8.onnx", contract)
-    return replace(quick_bench(tmp_path_factory), models=folder)
+@pytest.fixture
+def recordings(tmp_path, monkeypatch):
+    save_recordings(tmp_path)
+    monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path))
+    return tmp_path
 
 
-@pytest.fixture(scope="module")
-def few():
-    return load_frozen_presses().pick(np.arange(5))
-
-
-def rows_of(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(bench, few):
-    model = bench.model()
-    found = {known: shipped.infer_presses(model, few, known).patterns for known in (shipped.NOTHING, shipped.ALL)}
-    known = [few.pad(index, gains=True) for index in range(5)]
+def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(tmp_path):
+    contract = make_pad_contract(taps=1, output_full_scale=0.5, interval_factor=1.6, interval_levels={"90": [1.6] * 4})
+    model = ModelSession(write_model(tmp_path / "stsr-int8.onnx", contract))
+    few = load_frozen_presses().pick(np.arange(5))
+    found = {known: infer_presses(model, few, known).patterns for known in (False, True)}
     scaled = [model.contract.scale_window(window) for window in few.windows(1, gains_known=True)]
-    by_hand = [model.run(one, model.contract.pad_row(pad)).copy() for one, pad in zip(scaled, known, strict=True)]
-    assert found[shipped.ALL] == pytest.approx(np.stack(by_hand), rel=1e-5)
-    assert not np.allclose(found[shipped.NOTHING], found[shipped.ALL])
+    rows = [model.contract.pad_row(few.pad(index, gains=True)) for index in range(5)]
+    by_hand = [model.run(one, row).copy() for one, row in zip(scaled, rows, strict=True)]
+    assert found[True] == pytest.approx(np.stack(by_hand), rel=1e-5)
+    assert not np.allclose(found[False], found[True])
 
 
 def test_one_constant_of_a_pad_is_off():
-    assert pads.OffPad("thickness_mm", -10).pad == replace(NOMINAL, thickness_mm=NOMINAL.thickness_mm * 0.9)
-    assert pads.OffPad("free_sides", 20).pad.free_sides == pytest.approx(0.2)
-    assert pads.NONE_OFF.pad == NOMINAL
-    assert not pads.OffPad("poisson", 20).can_be and not pads.OffPad("free_sides", -5).can_be
-    assert pads.OffPad("poisson", 10).can_be
+    assert OffPad("thickness_mm", -10).pad == replace(NOMINAL, thickness_mm=NOMINAL.thickness_mm * 0.9)
+    assert OffPad("free_sides", 20).pad.free_sides == pytest.approx(0.2)
+    assert NONE_OFF.pad == NOMINAL
+    assert not OffPad("poisson", 20).can_be and not OffPad("free_sides", -5).can_be
+    assert OffPad("poisson", 10).can_be
+
+
+def test_neighbours_give_a_plane_exactly_inside_the_rim():
+    row, col = np.mgrid[:4, :4]
+    plane = (100 + 30 * row - 50 * col).astype(float)
+    mean = neighbours_mean(plane.reshape(1, 16)).reshape(4, 4)
+    np.testing.assert_allclose(mean[1:3, 1:3], plane[1:3, 1:3])
+    np.testing.assert_allclose(mean[0, 0], (plane[0, 1] + plane[1, 0]) / 2)
+
+
+def test_recordings_are_zeroed_by_the_trial_that_lets_go(recordings):
+    sets = {(part.sensor, part.trial): part.counts for part in recorded_sets(recordings)}
+    assert set(sets) == {(f"xela_sensor{n}", f"trial-{t}") for n in (1, 2) for t in "ab"}
+    for trial, released in (("trial-a", False), ("trial-b", True)):
+        kept = grip(released)
+        again = np.zeros(len(kept), bool)
+        again[10:30:10] = True
+        if released:
+            again[30:] = True
+        np.testing.assert_array_equal(sets["xela_sensor1", trial], kept[~again])
+
+
+def test_a_damaged_recording_is_named(recordings):
+    (recordings / "trial-a" / "xela_sensor1.csv").write_text("nothing\n")
+    with pytest.raises(DatasetError, match=r"trial-a/xela_sensor1\.csv, line 1"):
+        recorded_sets(recordings)
+
+
+def test_measures_of_a_face_of_half_a_face_and_of_a_hole():
+    face, half, hole = np.ones((3, 40, 40))
+    half[:20] = 0
+    hole[15:20, 15:20] = 0
+    patterns = np.stack([face, half, hole])
+    np.testing.assert_allclose(share_touched(patterns), [1, 0.5, 1 - 25 / 1600])
+    np.testing.assert_allclose(unevenness(patterns)[:2], [0, 1])
+    assert has_hole(patterns).tolist() == [False, False, True]
+
+
+def test_a_hidden_taxel_is_not_seen_whatever_it_reads(recordings):
+    model = ModelSession(find_model(DEFAULT_MODEL))
+    held = recorded_grips(recordings)[0]
+    changed = held.counts.copy()
+    changed[:, :, 1, 2] += 700
+    other = replace(held, counts=changed)
+    before, after = (play(one, model, hidden=6) for one in (held, other))
+    assert np.isfinite(before.patterns[HOLD_SCANS:]).all() and len(before.believed) == len(before.patterns)
+    np.testing.assert_array_equal(before.patterns, after.patterns)
+    assert np.abs(play(held, model).patterns - play(other, model).patterns).max() > 0.01
+
+
+def test_the_report_compares_the_shipped_way_with_a_linear_one(recordings, tmp_path_factory):
+    page = run("real", quick_bench(tmp_path_factory), tmp_path_factory.mktemp("reports"))
+    methods, trials = tables_of(page)
+    assert [row["method"] for row in methods] == [DEFAULT_MODEL, "bilinear"]
+    for row in methods:
+        assert 0 < float(row["share of the pad"]) <= 1 and float(row["hidden taxel counts"].split()[0]) > 0
+    assert [(row["trial"], row["sensor"]) for row in trials] == [
+        (f"trial-{trial}", f"xela_sensor{sensor}") for sensor in (1, 2) for trial in "ab"
+    ]
+    assert str(recordings) not in page.read_text()

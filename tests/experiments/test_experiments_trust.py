@@ -1,20 +1,19 @@
 """Report of the checks: verdicts on wrong patterns, faults of sensors, foreign taps, and the page in miniature."""
 
-import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from edge_samples import FakeModel, make_pad_contract, write_model
-from experiment_samples import quick_bench, save_recordings
+from experiment_samples import quick_bench, save_recordings, tables_of
 from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from edge.inference.contract import ANY_BATCH
 from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
-from train.experiments.sensor import trust_checks
-from train.experiments.sensor.sensor_faults import FAULTS
-from train.experiments.sensor.shipped import PushedSensor
+from train.experiments import trust_checks
+from train.experiments.__main__ import run
+from train.experiments.sensor_faults import FAULTS, PushedSensor
 from train.families.catalogue import SHARES
 
 
@@ -111,19 +110,17 @@ class TestPage:
     def test_it_runs_in_miniature(self, tmp_path, tmp_path_factory, monkeypatch):
         save_recordings(tmp_path / "recordings")
         monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path / "recordings"))
-        page = trust_checks.run(quick_bench(tmp_path_factory), tmp_path).read_text()
-        assert page.startswith("# trust-checks\n") and "quick run" in page
-        parts = ("", "-models", "-grips", "-faults", "-taps", "-psnr")
-        rows = {part: list(csv.DictReader((tmp_path / f"trust-checks{part}.csv").open())) for part in parts}
-        assert [row["contacts of"] for row in rows[""]] == [*SHARES, "all", "light"]
-        assert any(float(row["stsr-int8 %"]) > 0 for row in rows["-grips"]), "noise is no grip"
-        assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in rows["-faults"]}
+        page = run("trust-checks", quick_bench(tmp_path_factory), tmp_path)
+        families, _, grips, faults, taps = tables_of(page)
+        assert page.read_text().startswith("# trust-checks\n") and "quick run" in page.read_text()
+        assert [row["contacts of"] for row in families] == [*SHARES, "all", "light"]
+        assert any(float(row["stsr-int8 %"]) > 0 for row in grips), "noise is no grip"
+        assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in faults}
         cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
-        for part in ("-taps", "-psnr"):
-            assert [row["earlier taps"] for row in rows[part]] == cases
+        assert [row["earlier taps"] for row in taps] == cases
 
     def test_a_model_without_checks_is_refused_in_a_line(self, tmp_path, tmp_path_factory):
         for name in ("stsr", "stsr-small", "mtsr"):
             write_model(tmp_path / f"{name}-int8.onnx", make_pad_contract(taps=1))
         with pytest.raises(CheckpointError, match="stsr-int8 has no checks"):
-            trust_checks.run(replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)
+            run("trust-checks", replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)

@@ -8,8 +8,17 @@ import pytest
 from edge.api import infer
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
-from train.data.real_grips import Grip, recorded_grips, recording_paths, recordings_folder
-from train.experiments.sensor.real import Played, has_hole, play, share_touched, unevenness
+from train.data.real_grips import (
+    Grip,
+    Played,
+    has_hole,
+    play,
+    recorded_grips,
+    recording_paths,
+    recordings_folder,
+    share_touched,
+    unevenness,
+)
 
 RECORDINGS = recordings_folder()
 PATHS = recording_paths(RECORDINGS)

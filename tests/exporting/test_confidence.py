@@ -8,7 +8,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
 from edge.inference.intervals import Expected, doubt, expect, is_confidence
 from edge.inference.onnx_session import ModelSession
-from export.confidence import BINS, doubts_and_errors, fit_confidence
+from export.to_onnx import BINS, doubts_and_errors, fit_confidence
 from train.data.frozen_presses import load_frozen_presses
 
 IN_INTEGERS = [path for path in bundled_models() if path.stem.endswith("-int8")]

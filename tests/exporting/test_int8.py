@@ -4,12 +4,12 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from export_samples import PRESSES, made_once, published_model, small_models
+from export_samples import PRESSES, made_once, small_models
 from onnx import numpy_helper
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
-from export.errors import ExportError
+from export.graph import ExportError
 from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
 from train.data.press_batches import Batch
 
@@ -47,14 +47,6 @@ def test_the_largest_grid_is_done_in_integers_but_for_what_gives_the_outputs(mod
     trunk = {f"trunk.0.body.{layer}.weight" for layer in (0, 2)}
     assert chosen == trunk | {"leave.0.weight", "uncertainty.0.weight"}
     assert (convolutions(model), convolutions(integers)) == ((0, 16), (4, 16)), "once optimised"
-
-
-@pytest.mark.night
-def test_of_a_published_network_all_but_the_last(seen, tmp_path_factory):
-    model = onnx.load(made_once(tmp_path_factory, published_model) / "peer.onnx")
-    count = sum(node.op_type == "Conv" for node in model.graph.node)
-    whole = quantised(model, Batch(seen.window[:4, :3], seen.pattern[:4]))
-    assert convolutions(whole) == (count - 1, count)
 
 
 def test_weights_have_a_scale_for_each_channel_and_activations_are_unsigned(integers):

@@ -14,7 +14,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from export.errors import ParityError
+from export.graph import ParityError
 from export.parity import (
     LEVELS,
     GraphRun,
@@ -24,7 +24,7 @@ from export.parity import (
     read_windows,
 )
 from export.to_onnx import MOST_LOSS_DB
-from export.verify import Parity, judged, main, table, verify
+from export.verify import Parity, judged, main, verify, worst
 from train.errors import CheckpointError
 from train.learning.checkpoint import network_of
 
@@ -217,13 +217,14 @@ def test_windows_are_of_every_force_and_stiff_ones_beside():
     assert not stiff["rest to full load in one scan"][:, 3:].any()
 
 
-def test_the_table_shows_of_extreme_windows_the_worst():
+def test_of_extreme_windows_the_worst_is_shown():
     row = Parity(
         "one", "all", "zeros", differences(["pattern"], *[[np.ones((1, 2, 2), np.float32)]] * 2, 0.5), None, ""
     )
-    other = replace(row, windows="full range", differences=(replace(row.differences[0], relative=1e-6),))
-    lines = table([row, replace(row, windows="test set", psnr_change_db=-0.01), other]).splitlines()
-    assert len(lines) == 4 and "-0.0100" in lines[3] and "full range" in lines[2] and "zeros" not in "".join(lines)
+    other = row._replace(windows="full range", differences=(replace(row.differences[0], relative=1e-6),))
+    shown = worst([row, row._replace(windows="test set", psnr_change_db=-0.01), other])
+    assert [one.windows for one in shown] == ["full range", "test set"]
+    assert shown[1].row()["PSNR change dB"] == "-0.0100" and shown[0].row()["bound"] == "holds"
 
 
 @pytest.mark.parametrize(

@@ -33,3 +33,18 @@ def grip(released: bool) -> np.ndarray:
         pressed[30:] = 0
     pressed[10:30:10] = pressed[9:29:10]
     return pressed
+
+
+def tables_of(page: Path) -> list[list[dict[str, str]]]:
+    """Return the tables of a report, each as rows by column."""
+    tables, columns = [], None
+    for line in page.read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("| ") else None
+        if cells is None:
+            columns = None
+        elif columns is None:
+            columns = cells
+            tables.append([])
+        elif set(cells) != {"---"}:
+            tables[-1].append(dict(zip(columns, cells, strict=True)))
+    return tables

@@ -6,7 +6,7 @@ pytest.importorskip("felupe", reason="the FEM reference is an extra: pip install
 
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import FemPad, Mesh, MooneyRivlin, NoEquilibriumError, press_or_recall
+from train.physics.fem_reference import FemPad, Mesh, MooneyRivlin, NoEquilibriumError, press_surface
 
 NOTHING_MM = 1e3
 
@@ -87,18 +87,8 @@ def test_a_leap_too_far_is_named():
         pad.press(disc(pad.nodes_mm, 3.0), np.array([0.1, 4.4]))
 
 
-def test_a_verdict_is_kept_and_recalled_unless_anything_that_it_depends_on_is_another(tmp_path):
-    steps_mm, coarse = np.array([0.1, 0.2]), Mesh(2, 1)
-    first = press_or_recall("large circle", coarse, steps_mm, tmp_path)
-    assert first.patterns_mm.shape == (2, 40, 40) and first.force_n[1] > 2 * first.force_n[0] > 0
-    assert first.patterns_mm[:, 20, 20] == pytest.approx(steps_mm, rel=1e-3)
-    again = press_or_recall("large circle", coarse, steps_mm, tmp_path)
-    assert all(np.array_equal(*pair) for pair in zip(vars_of(again), vars_of(first), strict=True)), "its run time too"
-    for other in (("small circle", coarse, steps_mm), ("large circle", Mesh(2, 2), steps_mm)):
-        press_or_recall(*other, tmp_path)
-    press_or_recall("large circle", coarse, steps_mm / 2, tmp_path)
-    assert len(list(tmp_path.glob("fem-*.npz"))) == 4
-
-
-def vars_of(verdict):
-    return verdict.patterns_mm, verdict.force_n, verdict.run_s
+def test_a_named_surface_is_pressed_to_its_indentation():
+    steps_mm = np.array([0.1, 0.2])
+    found = press_surface("large circle", Mesh(2, 1), steps_mm)
+    assert found.patterns_mm.shape == (2, 40, 40) and found.force_n[1] > 2 * found.force_n[0] > 0
+    assert found.patterns_mm[:, 20, 20] == pytest.approx(steps_mm, rel=1e-3)

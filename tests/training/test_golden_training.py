@@ -12,11 +12,11 @@ from train.data.paper_taps import paper_taps, windows
 from train.data.press_batches import PosedBatches, PressBatches, read_presses, stated_poses
 from train.data.presses import join_presses
 from train.data.world import World, solve_pad
-from train.experiments.sensor.sensor_faults import FAULTS
+from train.experiments.sensor_faults import FAULTS
 from train.families.catalogue import SHARES
 from train.learning.checks import moved, spoiled
-from train.physics.resample import resample
 from train.physics.sensor_noise import Nuisances
+from train.physics.tpsf import resample
 
 GOLDEN = Path(__file__).with_name("golden_training.npz")
 WORLD = World(count=42, per_pad=14, taps=2, families=dict.fromkeys(SHARES, 1.0), seed=5)

@@ -20,7 +20,7 @@ from train.physics.gripped import (
     GrippedPad,
 )
 from train.physics.pad_draws import NOMINAL
-from train.physics.resample import resample, resample_touching
+from train.physics.tpsf import resample, resample_touching
 from train.surfaces.depth_image import Pose
 
 PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE

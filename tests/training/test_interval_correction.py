@@ -17,8 +17,7 @@ from train.learning.interval_fit import (
     interval_coverage,
     readings_of_presses,
 )
-from train.networks.compact import CompactNet
-from train.networks.interval_correction import LOG_RANGE
+from train.networks.compact import LOG_RANGE, CompactNet
 from train.physics.pad_draws import KNOWN
 
 LEVEL = 0.3

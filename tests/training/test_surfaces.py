@@ -1,9 +1,13 @@
+"""Surfaces by name, and their depth under the pad."""
+
 import numpy as np
 import pytest
 import shapely
 import trimesh
+from scipy.spatial import Delaunay
 
 from train.errors import SurfaceError
+from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
 from train.surfaces.named_surfaces import (
     AREA_MM2,
     FIGURE_HEIGHT_MM,
@@ -13,6 +17,7 @@ from train.surfaces.named_surfaces import (
     POLYGON_REACH_MM,
     SURFACES,
     figure,
+    relief,
     surface_mesh,
 )
 
@@ -57,20 +62,6 @@ def test_a_users_file_is_a_surface_like_any_other(tmp_path):
 SEEDS = range(100)
 REACH_MM = {"glyph": GLYPH_REACH_MM, "polygon": POLYGON_REACH_MM}
 
-# Area, and centre x and y, of the first seeds.
-GLYPHS_MM = [
-    (74.12, -0.66, -0.59),
-    (40.48, -1.81, -0.75),
-    (123.62, 0.77, 0.35),
-    (18.24, 1.78, 3.45),
-]
-POLYGONS_MM = [
-    (37.08, -2.03, 1.72),
-    (34.96, 2.28, -1.97),
-    (19.06, 1.28, 2.38),
-    (13.52, 0.81, -2.37),
-]
-
 
 @pytest.fixture(scope="module")
 def drawn():
@@ -90,19 +81,91 @@ def test_every_random_figure_is_valid_within_bounds_and_coarse_enough_to_feel(dr
 
 
 @pytest.mark.parametrize("kind", REACH_MM)
-def test_a_seed_gives_one_figure_in_whole_micrometres_and_another_seed_another(drawn, kind):
-    for seed in SEEDS[::25]:
-        outline = figure(f"{kind}:{seed}")
-        assert outline.equals_exact(drawn[kind][seed])
-        corners_um = shapely.get_coordinates(outline) * 1000
-        assert np.abs(corners_um - corners_um.round()).max() < 1e-6
+def test_a_figure_has_its_corners_on_whole_micrometres_and_each_seed_has_another(drawn, kind):
+    corners_um = shapely.get_coordinates(drawn[kind]) * 1000
+    assert np.abs(corners_um - corners_um.round()).max() < 1e-6
     assert len({outline.wkb for outline in drawn[kind]}) == len(SEEDS)
 
 
-@pytest.mark.parametrize("kind", REACH_MM)
-def test_seeds_mean_the_same_figures_as_when_models_were_trained(drawn, kind):
-    # Other versions of the libraries may place a round corner's points elsewhere, but not change the figure.
-    known = GLYPHS_MM if kind == "glyph" else POLYGONS_MM
-    for seed, (area_mm2, x_mm, y_mm) in enumerate(known):
-        centre = drawn[kind][seed].centroid
-        assert [drawn[kind][seed].area, centre.x, centre.y] == pytest.approx([area_mm2, x_mm, y_mm], abs=0.05)
+SIZE, CELL_MM = 42, 0.47
+CENTRE = Pose(0, 0, 0)
+
+
+def along_mm(size=SIZE, cell_mm=CELL_MM):
+    return (np.arange(size) - (size - 1) / 2) * cell_mm
+
+
+def ball(radius_mm):
+    """A fine ball whose top is the origin."""
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=radius_mm)
+    return Relief("ball", mesh.apply_translation([0, 0, -radius_mm]))
+
+
+def field(height, x_mm, y_mm):
+    """A mesh of the function `height` over scattered points."""
+    faces = Delaunay(np.stack([x_mm, y_mm], axis=1)).simplices
+    return trimesh.Trimesh(np.stack([x_mm, y_mm, height(x_mm, y_mm)], axis=1), faces, process=False)
+
+
+def scattered(half_mm, count, seed=0):
+    rng = np.random.default_rng(seed)
+    corners = half_mm * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    return np.concatenate([corners, rng.uniform(-half_mm, half_mm, (count, 2))]).T
+
+
+def image(name, pose, size=41):
+    return depth_image(relief(name), pose, size, 0.5) < FIGURE_HEIGHT_MM / 2
+
+
+@pytest.mark.parametrize("angle_deg", [0, 37, 90])
+def test_a_slope_is_exact_at_every_pixel(angle_deg):
+    surface = Relief("slope", field(lambda x, y: 0.1 * x - 0.03 * y, *scattered(20, 500)))
+    pose = Pose(1.3, -2.1, angle_deg)
+    depth = depth_image(surface, pose, SIZE, CELL_MM)
+    right, down = along_mm()[None, :], along_mm()[:, None]
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    height = 0.1 * (cosine * right + sine * down) - 0.03 * (sine * right - cosine * down)
+    assert np.allclose(depth - depth.min(), height.max() - height, atol=1e-5)
+    # First contact is at the footprint's corner, half a cell beyond the highest pixel.
+    assert 0 <= depth.min() <= 0.13 * np.sqrt(2) * CELL_MM / 2
+
+
+def test_a_dome_is_as_deep_as_a_sphere_wherever_it_stands():
+    rng = np.random.default_rng(3)
+    poses = [Pose(*rng.uniform(-1, 1, 2), rng.uniform(0, 360)) for _ in range(8)]
+    dome = ball(8.0)
+    for pose in poses:
+        depth = depth_image(dome, pose, SIZE, CELL_MM)
+        cosine, sine = np.cos(np.radians(pose.angle_deg)), np.sin(np.radians(pose.angle_deg))
+        x_mm = pose.x_mm + cosine * along_mm()[None, :] + sine * along_mm()[:, None]
+        y_mm = pose.y_mm + sine * along_mm()[None, :] - cosine * along_mm()[:, None]
+        expected = 8 - np.sqrt(np.maximum(64 - x_mm**2 - y_mm**2, 0))
+        cap = expected < 1
+        assert np.abs(depth - expected)[cap].max() < 2e-3  # facets
+
+
+def test_what_is_finer_than_a_cell_is_not_felt():
+    slab = trimesh.creation.box([20, 20, 1])
+    needle = trimesh.creation.box([0.2, 0.2, 3])
+    seen = depth_image(Relief("needle", slab + needle), CENTRE, SIZE, CELL_MM)
+    assert np.allclose(seen, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_the_image_shows_the_figures_area(name):
+    mesh = surface_mesh(name)
+    top = mesh.area_faces[(mesh.triangles[:, :, 2] > -1e-9).all(axis=1)].sum()
+    seen = depth_image(Relief(name, mesh), Pose(0.03, 0.02, 20), 200, 0.1)
+    assert (seen < FIGURE_HEIGHT_MM / 2).sum() * 0.1**2 == pytest.approx(top, rel=0.01)
+    assert set(np.unique(seen.round(5))) <= {0.0, FIGURE_HEIGHT_MM, NOTHING_MM}
+
+
+def test_a_pose_beside_the_surface_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"surface 'I' lies under the pad at Pose\(x_mm=50"):
+        depth_image(relief("I"), Pose(50, 0, 0), SIZE, CELL_MM)
+
+
+def test_a_letter_stands_upright_as_seen_through_the_pad():
+    letter = image("F", CENTRE)
+    assert letter[:20].sum() > letter[21:].sum()
+    assert letter[:, :20].sum() > letter[:, 21:].sum()

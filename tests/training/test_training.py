@@ -48,8 +48,6 @@ def test_a_run_is_repeatable_and_its_configuration_lies_beside_the_weights(folde
     kept = json.loads((folder / "small.json").read_text())
     assert kept["training_sha256"] == report["training_sha256"] == TRAINING.sha256(data.sha256())
     assert kept["config"]["recipe"]["steps"] == 20
-    assert [point["step"] for point in kept["course"]] == [4, 8, 12, 16, 20]
-    assert kept["course"][-1]["validation PSNR dB"] == pytest.approx(kept["validation_psnr_db"])
     assert kept["device"]
     assert not (folder / "small.resume").exists()
 
@@ -144,22 +142,18 @@ def test_windows_of_every_number_of_taps_are_drawn(taps):
 
 
 def test_the_bundled_networks_need_presses_of_as_many_taps_as_they_take(data):
-    assert [(one.name, one.recipe.steps) for one in bundled(make_press_set(taps=7), 1000)] == [
-        *(("stsr", 10), ("stsr-small", 10), ("mtsr", 10)),
-    ]
+    assert [one.name for one in bundled(make_press_set(taps=7))] == ["stsr", "stsr-small", "mtsr"]
     with pytest.raises(DatasetError, match="at most 2 taps, the bundled networks take 7"):
         bundled(data)
-    with pytest.raises(ValueError, match="--shorten is 0"):
-        bundled(make_press_set(taps=7), 0)
 
 
 def test_one_network_by_the_command(data, tmp_path, capsys):
     data.save(tmp_path / "data.npz")
     files = ["--data", str(tmp_path / "data.npz"), "--validation", str(tmp_path / "data.npz")]
-    options = [*files, "--network", "compact-mtsr2", "--name", "mine", "--steps", "2"]
-    main([str(tmp_path), *options, "--batch", "4", "--bf16"])
-    assert capsys.readouterr().out.startswith("mine: validation ")
-    assert load_network(tmp_path / "mine.pt")[1]["config"]["recipe"]["bf16"] is True
+    options = [*files, "--network", "compact-mtsr2", "--steps", "2"]
+    main([str(tmp_path), *options, "--bf16"])
+    assert capsys.readouterr().out.startswith("compact-mtsr2: validation ")
+    assert load_network(tmp_path / "compact-mtsr2.pt")[1]["config"]["recipe"]["bf16"] is True
 
 
 @pytest.mark.parametrize(
@@ -169,7 +163,6 @@ def test_one_network_by_the_command(data, tmp_path, capsys):
         (["--network", "compact-mtsr4"], "no sequences of 4 taps"),
         (["--network", "fusion-mtsr4"], "no sequences of 3 taps"),
         (["--network", "compact-stsr", "--start-from", "absent"], "absent.pt"),
-        (["--network", "compact-stsr", "--scale", "7"], "scale is 7"),
         (["--network", "compact-stsr", "--start-from", "absent", "--keep", "1"], "keep is 1"),
         (["--network", "compact-stsr", "--keep", "0.2"], "no weights to start from"),
     ],

@@ -11,18 +11,27 @@ from press_samples import make_press_set
 from trust_samples import make_trusted_contract
 
 from edge.inference.trust import small_network
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.poses import PadPose
 from train import trust
+from train.data.press_batches import stated_poses
+from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.checks import (
     contact_check,
     drawn_readings,
     features_of,
+    fit_tap_network,
     in_contact,
+    pair_features,
+    relative,
+    strong_taps,
+    tap_check,
 )
 from train.physics.pad_draws import INPUTS, input_scale
 from train.trust import fit_forward_model, fit_trust, load_trust
 
-SHORTEN = 1000
+STEPS = (40, 20)
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +42,7 @@ def presses():
 @pytest.fixture(scope="module")
 def path(presses, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trust")
-    presses.save(folder / "presses.npz")
-    trust.main([str(folder / "trust.json"), "--data", str(folder / "presses.npz"), "--shorten", str(SHORTEN)])
+    (folder / "trust.json").write_text(json.dumps(fit_trust(presses, 1, *STEPS)))
     return folder / "trust.json"
 
 
@@ -69,8 +77,7 @@ class TestFile:
         assert load_trust(model).to_json() == loaded.to_json()
         with pytest.raises(CheckpointError, match="its limits are set by presses: give --validation"):
             load_trust(path)
-        again = fit_trust(presses, seed=1, shorten=SHORTEN)
-        assert again == fitted
+        assert fit_trust(presses, 1, *STEPS) == fitted
 
     @pytest.mark.parametrize(
         "damage",
@@ -104,3 +111,61 @@ class TestLimits:
         met = in_contact(counts)
         scores = np.array(network(features_of(counts[met], pads[met])))
         assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share
+
+
+TAPS = 4
+WIDE_MM = 4.0
+FALSE_ALARMS = 0.05
+FLAT = np.array([0.0, 0.0, 1.0])[:, None, None]
+
+
+def bumps(count: int, seed: int) -> PressSet:
+    """Return sequences of taps at any poses over bumps, newest first."""
+    rng = np.random.default_rng([seed, 1])
+    made = make_press_set(count, TAPS, seed)
+    poses = np.concatenate([rng.uniform(-3, 3, (count, TAPS, 2)), rng.uniform(-45, 45, (count, TAPS, 1))], axis=2)
+    poses[:, 0] = 0
+    along = (np.arange(4) - 1.5) * USPA44.pitch_mm
+    turn = np.radians(poses[..., 2])[..., None, None]
+    x = poses[..., 0, None, None] + np.cos(turn) * along - np.sin(turn) * along[:, None]
+    y = poses[..., 1, None, None] + np.sin(turn) * along + np.cos(turn) * along[:, None]
+    bump = rng.uniform(-5, 5, (2, count, 1, 1, 1))
+    z = 3000 * np.exp(-((x - bump[0]) ** 2 + (y - bump[1]) ** 2) / (2 * WIDE_MM**2))
+    return replace(made, counts=(z[:, :, None] * FLAT).astype(np.float32), poses=poses.astype(np.float32))
+
+
+def test_relative_poses_are_those_that_a_pad_is_seen_at():
+    rng = np.random.default_rng(3)
+    newest, earlier = (np.stack([*rng.uniform(-5, 5, (2, 20)), rng.uniform(-200, 200, 20)], axis=1) for _ in "ab")
+    seen = [PadPose(*one.tolist()).seen_from(PadPose(*new.tolist())) for new, one in zip(newest, earlier, strict=True)]
+    assert relative(newest, earlier) == pytest.approx(
+        np.array([(one.x_mm, one.y_mm, one.turn_deg) for one in seen]), abs=1e-4
+    )
+
+
+@pytest.fixture(scope="module")
+def network():
+    return fit_tap_network(bumps(300, 0), seed=0, steps=300)
+
+
+def shares_caught(network, presses, spoil):
+    """Return the share of earlier taps that a check at a share of false alarms catches, after `spoil` of a pair."""
+    check = tap_check(network, bumps(300, 1), FALSE_ALARMS, seed=2)
+    rng = np.random.default_rng(5)
+    readings, poses = strong_taps(presses, 5)
+    pose = poses[:, 1]
+    stated = stated_poses(rng, np.stack([np.zeros_like(pose), pose], axis=1), (0.2, 1.0))
+    pair, stated = spoil(readings[:, :2], stated)
+    return float((np.array(network(pair_features(pair, stated))) > check.limit).mean())
+
+
+def test_right_taps_are_seldom_dropped_and_wrong_ones_mostly(network):
+    presses = bumps(300, 9)
+
+    def off_by(x_mm, turn_deg):
+        return lambda pair, stated: (pair, stated + np.array([[0] * 5, [x_mm, 0, turn_deg, 0, 0]], np.float32))
+
+    assert shares_caught(network, presses, lambda pair, stated: (pair, stated)) < 2 * FALSE_ALARMS
+    assert shares_caught(network, presses, off_by(5.0, 0.0)) > 0.5
+    foreign = shares_caught(network, presses, lambda pair, stated: (np.stack([pair[:, 0], pair[::-1, 1]], 1), stated))
+    assert foreign > 0.5

@@ -28,15 +28,14 @@ from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import SHARES
-from train.physics.gripped import SCALE
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
 
 _AT_ONCE: Final = 16
 
 
-def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
-    """Solve the presses of a world, and write them; an interrupted call resumes.
+def make_presses(world: World, path: Path) -> PressSet:
+    """Solve the presses of a world, within `quiet_workers` on all cores, and write them; an interrupted call resumes.
 
     DatasetError if files there were made otherwise or cannot be written.
     """
@@ -52,7 +51,7 @@ def make_presses(world: World, path: Path, jobs: int = -1) -> PressSet:
         raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
     missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
     with Progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
-        pool = joblib.Parallel(n_jobs=jobs)
+        pool = joblib.Parallel()
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
             solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, one) for one in numbers))
@@ -75,18 +74,18 @@ def _part(folder: Path, number: int) -> Path:
 
 
 @contextmanager
-def quiet_workers(jobs: int) -> Iterator[None]:
-    """Start joblib's processes with SIGINT ignored, because Ctrl-C reaches them too and each would print a traceback.
+def quiet_workers() -> Iterator[None]:
+    """Start joblib's processes, one on each core, with SIGINT ignored.
 
-    They inherit what is ignored; a mask is not enough, since joblib's tracker of resources lifts it. joblib replaces a
-    process that has grown by 300 MB by another, which inherits nothing and sets for itself what it ignores; its warning
-    of that is left out. Enter from the main thread.
+    Ctrl-C reaches them too, and each would print a traceback. They inherit what is ignored; a mask is not enough, since
+    joblib's tracker of resources lifts it. joblib replaces a process that has grown by 300 MB by another, which
+    inherits nothing and sets for itself what it ignores; its warning of that is left out. Enter from the main thread.
     """
-    with joblib.parallel_config("loky", initializer=_begin_quietly), warnings.catch_warnings():
+    with joblib.parallel_config("loky", n_jobs=-1, initializer=_begin_quietly), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
         try:
-            joblib.Parallel(n_jobs=jobs)(joblib.delayed(int)() for _ in range(2))
+            joblib.Parallel()(joblib.delayed(int)() for _ in range(2))
         finally:
             signal.signal(signal.SIGINT, before)
         yield
@@ -101,8 +100,6 @@ def _begin_quietly() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
     options = _parser().parse_args(arguments)
-    if options.jobs == 0:
-        _parser().error("--jobs is 0, expected a number of processes, or -1 for one on each core")
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
     started_s = time.monotonic()
     try:
@@ -111,8 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name.startswith(MESH):
                 sys.stdout.write(f"{size_of(name)}\n")
         sys.stdout.flush()  # before the simulation, which takes long
-        with quiet_workers(options.jobs) if world.chunks > 1 else nullcontext():
-            made = make_presses(world, options.out, options.jobs)
+        with quiet_workers() if world.chunks > 1 else nullcontext():
+            made = make_presses(world, options.out)
     except TrainError as error:
         sys.stderr.write(f"train.data.make_presses: {error}\n")
         return 1
@@ -135,7 +132,7 @@ def _world(options: argparse.Namespace) -> World:
         names = [name for name in options.families.split(",") if name != "none"]
         families = {name: SHARES.get(name, 1.0) for name in names}
     families |= {mesh_name(path, options.unit_mm): options.mesh_share for path in options.mesh}
-    same = ("count", "taps", "schedule", "begun", "per_pad", "spread", "seed", "scale", "pad")
+    same = ("count", "taps", "schedule", "begun", "per_pad", "spread", "seed", "pad")
     return World(families=families, **{name: getattr(options, name) for name in same})
 
 
@@ -158,10 +155,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--mesh-share", type=float, default=20.0, help="frequency of each mesh; all families: 117 (20)")
     add("--spread", type=float, default=1.0, help="spread of the pads' constants; 0: the nominal pad (1)")
     add("--seed", type=int, default=1, help="seed of pads, shapes and drags (1)")
-    add("--scale", type=int, default=SCALE, help=f"pattern pixels per taxel pitch ({SCALE})")
     models = ", ".join(pad.name for pad in PADS)
     add("--pad", default=USPA44.name, help=f"model of the pads: {models} ({USPA44.name})")
-    add("--jobs", type=int, default=-1, help="processes; -1: one on each core (-1)")
     return parser
 
 

@@ -23,8 +23,8 @@ from train.data.presses import SEED, one_thread
 from train.families.catalogue import heights_of
 from train.physics.gripped import FINE_SCALE, FRAMES, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
-from train.physics.resample import resample, resample_touching
 from train.physics.sensor_noise import Nuisances, Seed, jitter_poses, read_windows
+from train.physics.tpsf import resample, resample_touching
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG, Split

@@ -20,7 +20,7 @@ from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_recording import read_npz
 from train.errors import DatasetError
-from train.physics.resample import resample, resample_touching
+from train.physics.tpsf import resample, resample_touching
 
 SEED: Final = 20240228
 """Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""

@@ -1,16 +1,24 @@
-"""Recordings of real grips, and the mean of a taxel's neighbours."""
+"""Recordings of real grips, played through the shipped runtime, and how well patterns show the flat faces they hold."""
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
 
+from edge.inference.bundled import TAXELS
+from edge.inference.onnx_session import ModelSession
+from edge.perception.contact_options import RuntimeOptions
+from edge.perception.dead_taxel_fill import load_estimator
+from edge.perception.runtime import Runtime
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.pad_constants import Pad
+from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.zeroing.baseline import LOAD_LIMIT_COUNTS, Baseline, deformation
 from train.errors import DatasetError
 from train.physics.sensor_noise import neighbours
@@ -95,3 +103,55 @@ def neighbours_mean(z: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the mean of each taxel's edge neighbours, (n, taxels): bilinear at its place, with fewer at the rim."""
     beside = neighbours(USPA44.rows, USPA44.cols) > 0
     return z @ (beside / beside.sum(axis=0))
+
+
+class Played(NamedTuple):
+    """Output of the runtime for the scans of one grip that are under load: zeroed counts without a hidden taxel.
+
+    Patterns are (n, H, W) in [mm], NaN where there was none; believed (n,) unless any reason spoke against it.
+    """
+
+    zeroed: NDArray[np.float32]
+    patterns: NDArray[np.float32]
+    believed: NDArray[np.bool_]
+
+
+def play(grip: Grip, model: ModelSession, hidden: int | None = None, pad: Pad | None = None) -> Played:
+    """Play a whole recording through a runtime that is set up as shipped, except that every scan is inferred."""
+    name = grip.free.sensor
+    estimator = load_estimator(TAXELS, (USPA44.rows, USPA44.cols))
+    options, free = RuntimeOptions(every_scan=True), {name: grip.free}
+    runtime = Runtime(model, source="replay", estimator=estimator, baselines=free, pad=pad, options=options)
+    series = ScanSeries(name, USPA44)
+    none = np.full(model.contract.pattern_shape, np.nan, dtype=np.float32)
+    patterns, believed = [], []
+    for number, raw in enumerate(grip.counts.astype(np.int32)):
+        if hidden is not None:
+            raw.reshape(3, -1)[:, hidden] = ABSENT
+        result = runtime.push(series.close(raw, number * 16_750_000))
+        patterns.append(none if result.pattern is None else result.pattern)
+        believed.append(result.trusted is not False)
+    zeroed = (grip.counts - grip.free.counts).astype(np.float32)
+    here = loaded(zeroed)
+    return Played(zeroed[here], np.stack(patterns)[here], np.array(believed)[here])
+
+
+def share_touched(patterns: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the share of the pad above half of the pattern's 95th percentile, (n,) of patterns (n, H, W)."""
+    return _above_half(patterns).mean(axis=(1, 2))
+
+
+def unevenness(patterns: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return standard deviation over mean in the inner 80 % of the pad, (n,) of patterns (n, H, W)."""
+    rim = patterns.shape[1] // 10
+    inner = patterns[:, rim:-rim, rim:-rim]
+    return inner.std(axis=(1, 2)) / inner.mean(axis=(1, 2))
+
+
+def has_hole(patterns: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return True where pixels below half of the 95th percentile are enclosed, (n,) of patterns (n, H, W)."""
+    return np.array([(binary_fill_holes(above) & ~above).any() for above in _above_half(patterns)], dtype=bool)
+
+
+def _above_half(patterns: NDArray[np.floating]) -> NDArray[np.bool_]:
+    return patterns > 0.5 * np.quantile(patterns, 0.95, axis=(1, 2), keepdims=True)

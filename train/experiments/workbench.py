@@ -1,11 +1,13 @@
-"""Workbench of the experiments: datasets and networks made once and kept, and errors and cost of methods."""
+"""Workbench of the experiments: datasets and networks made once and kept, and methods with their cost."""
 
+import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from timeit import repeat
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -16,21 +18,23 @@ from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
-from train.data.make_presses import make_presses
+from train.data.make_presses import make_presses, quiet_workers
 from train.data.paper_taps import PaperTaps, paper_taps
 from train.data.presses import SEED, PressSet, one_thread
 from train.data.world import World
 from train.freeze import freeze
-from train.learning.checkpoint import Training, fit_network, infer, load_network
+from train.learning.checkpoint import Training, fit_network, load_network
+from train.learning.checkpoint import infer as infer_network
 from train.networks.blocks import PatternNet
 from train.physics.gripped import FRAMES
 from train.physics.sensor_noise import Nuisances
-from train.report import Row
+from train.report import Report, Row
 from train.surfaces.named_surfaces import SURFACES
 from train.surfaces.poses import ANGLE_STEP_DEG, Split
 
-_TIMED_RUNS: Final = 12
+_TIMED_RUNS: Final = 12  # of which the first third is left out
 _QUICK_PRESSES: Final = 42
 _tapped = cache(paper_taps)  # which takes minutes, and several experiments want the same
 
@@ -75,7 +79,9 @@ class Workbench:
             name = f"quick-{name}"
             world = replace(world, count=_QUICK_PRESSES, taps=quick_taps, per_pad=_QUICK_PRESSES // 2)
         self.data_folder.mkdir(parents=True, exist_ok=True)
-        return make_presses(world, self.data_folder / f"{name}.npz")
+        path = self.data_folder / f"{name}.npz"
+        with nullcontext() if path.exists() else quiet_workers():
+            return make_presses(world, path)
 
     def model(self, name: str = DEFAULT_MODEL) -> ModelSession:
         """Return a shipped model, in the session of the runtime."""
@@ -102,7 +108,7 @@ class Workbench:
             _, report = load_network(self.checkpoints / f"{start}.pt")
             steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
         cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
-        return Method(path.stem, net.taps, level, partial(infer, net), _cost_of_network(net), cells)
+        return Method(path.stem, net.taps, level, partial(infer_network, net), _cost_of_network(net), cells)
 
     def held_out(
         self, split: Split, surfaces: Sequence[str] = SURFACES, angle_step_deg: float = ANGLE_STEP_DEG
@@ -136,7 +142,7 @@ def median_ms(run: Callable[[], object]) -> float:
 
 def _quick(training: Training) -> Training:
     """Return the training in miniature, under its own name."""
-    recipe = replace(training.recipe, steps=1, batch=2, minutes=None)
+    recipe = replace(training.recipe, steps=1, batch=2)
     options = {"channels": 16, "blocks": 1} if training.network.startswith("compact") else {}
     start = training.start and f"quick-{training.start}"
     return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
@@ -147,3 +153,59 @@ def macs(net: PatternNet) -> int:
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         net.eval()(torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:]))
     return counter.get_total_flops() // 2
+
+
+SHORT: Final = {False: "model", True: "model, all known"}
+"""Names of a model that is told nothing of a sensor, and of one that is told its pad's constants and its gains."""
+
+
+class Inferred(NamedTuple):
+    """Patterns and deviations (n, H, W) in [mm], zeros if the model gives none, and the median run time in [us]."""
+
+    patterns: NDArray[np.float32]
+    deviations: NDArray[np.float32]
+    run_time_us: float
+
+
+def known_pads(frozen: FrozenPresses, known: bool) -> list[Pad | None]:
+    """Return all that can be known of each press's sensor, or nothing."""
+    return [frozen.pad(index, gains=True) if known else None for index in range(len(frozen))]
+
+
+def infer(
+    model: ModelSession,
+    windows: NDArray[np.float32],
+    pads: Sequence[Pad | None],
+    poses: NDArray[np.float32] | None = None,
+) -> Inferred:
+    """Run a model as the runtime does, on each window of as many taps as it takes, (n, taps, 3, rows, cols) as read.
+
+    `pads` are the constants that are known of each sensor; poses are (n, taps, 5), None for the paper's schedule.
+    """
+    contract = model.contract
+    patterns, deviations, times_s = [], [], []
+    for number, (window, pad) in enumerate(zip(windows, pads, strict=True)):
+        gains = None
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(window.shape[1:])
+        row = contract.pad_row(pad)
+        started_s = time.perf_counter()
+        pattern = model.run(contract.scale_window(window, gains), row, None if poses is None else poses[number])
+        times_s.append(time.perf_counter() - started_s)
+        patterns.append(pattern.copy())
+        deviations.append(np.zeros_like(pattern) if model.deviation is None else model.deviation.copy())
+    return Inferred(np.stack(patterns), np.stack(deviations), 1e6 * float(np.median(times_s)))
+
+
+def infer_presses(model: ModelSession, frozen: FrozenPresses, known: bool) -> Inferred:
+    """Run a model on frozen presses, with all or nothing known of their sensors."""
+    return infer(model, frozen.windows(model.contract.taps), known_pads(frozen, known))
+
+
+def name_of(model: ModelSession) -> str:
+    """Return a model's name and training, as reports begin."""
+    return f"`{model.name}` (training {model.contract.training_sha256[:12]})"
+
+
+Experiment = Callable[[Workbench, Report], None]
+"""Function that measures with a workbench, and adds to a report what it says and its tables."""

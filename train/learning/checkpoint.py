@@ -71,11 +71,7 @@ class Training:
 
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
-        config = asdict(self)
-        for name in ("keep", "sensor"):  # keeps the hash of networks that were trained before these existed
-            if not config[name]:
-                del config[name]
-        return hashlib.sha256(json.dumps([config, data_sha256], sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([asdict(self), data_sha256], sort_keys=True).encode()).hexdigest()
 
 
 def fit_network(training: Training, data: PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
@@ -106,7 +102,7 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
-    done = train(
+    elapsed_s = train(
         net,
         _objective(net, device, seed),
         batches,
@@ -114,7 +110,6 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
         (resume_path := folder / f"{training.name}.resume"),
         identity=f"{training_sha256} {start_sha256}",
         log_folder=folder / "logs" / training.name,
-        validate=lambda net: {"validation PSNR dB": _psnr(infer(net, validation.windows(net.taps))[0], validation)},
     )
     net.cpu()
     if training.keep:
@@ -130,9 +125,8 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
         "config": asdict(training),
         "data_sha256": data_sha256,
         **made_of,
-        "steps": done.steps,
-        "elapsed_s": round(done.elapsed_s, 1),
-        "course": done.course,
+        "steps": recipe.steps,
+        "elapsed_s": round(elapsed_s, 1),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} processor",
         "processes": world,
         "threads": torch.get_num_threads(),
@@ -159,7 +153,7 @@ def batches_of(
     """
     if scale != data.scale:
         raise DatasetError(
-            f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others with --scale"
+            f"patterns at x{scale} asked for, these presses have them at x{data.scale}: make others at that scale"
         )
     if posed:
         return PosedBatches(data, recipe.given, recipe.batch, seed)
@@ -254,17 +248,13 @@ def _objective(net: PatternNet, device: torch.device, seed: int) -> Objective:
     return SrganObjective(device, seed=seed) if isinstance(net, TactileSRGAN) else RelativeError()
 
 
-def _psnr(patterns: NDArray[np.float32], validation: FrozenSet) -> float:
-    return float(psnr_db(patterns, validation.patterns(), validation.full_scale_mm).mean())
-
-
 def _evaluated(net: PatternNet, validation: FrozenSet) -> dict[str, float]:
     """Return figures on the validation set, and set the factor of the deviations."""
     patterns, deviations = infer(net, validation.windows(net.taps))
     truth = validation.patterns()
     figures = {
         "contact_level": best_contact_level(patterns, validation.touching()),
-        "validation_psnr_db": _psnr(patterns, validation),
+        "validation_psnr_db": float(psnr_db(patterns, truth, validation.full_scale_mm).mean()),
         "validation_ssim": float(ssim(patterns, truth, validation.full_scale_mm).mean()),
     }
     if deviations is not None and isinstance(net, CompactNet):

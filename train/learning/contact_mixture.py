@@ -21,7 +21,7 @@ from scipy.special import softmax
 from edge.perception.gain_learning import LARGEST_COUNTS, LEAST_COUNTS, ContactModel, GainLearner
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import LEVEL_90
-from train.data.make_presses import make_presses
+from train.data.make_presses import make_presses, quiet_workers
 from train.data.presses import PressSet, load_presses
 from train.data.world import World
 from train.errors import DatasetError, TrainError
@@ -263,7 +263,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         mixture = fit_mixture(load_presses(options.presses))
-        presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
+        with quiet_workers():
+            presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
     except TrainError as error:
         sys.stderr.write(f"train.learning.contact_mixture: {error}\n")

@@ -25,8 +25,7 @@ from edge.terminal.progress_bar import tracked
 from train.data.frozen_presses import freeze_presses
 from train.data.press_batches import OneSensor, PosedBatches, PressBatches, network_input, stated_poses
 from train.data.presses import SEED, PressSet
-from train.networks.compact import CompactNet
-from train.networks.interval_correction import IntervalCorrection
+from train.networks.compact import CompactNet, IntervalCorrection
 from train.physics.sensor_noise import Nuisances
 
 LEVEL: Final = 0.9

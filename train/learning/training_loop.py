@@ -33,9 +33,7 @@ from train.errors import TrainError
 from train.networks.blocks import Objective, PatternNet
 
 Batches = Callable[[int], Batch]  # function from a number to its batch; the same number always gives the same batch
-Course = list[dict[str, float]]  # validation figures at some steps of a training
 
-_VALIDATIONS: Final = 5  # number of validations over a run
 _WARM_UP: Final = 0.1
 _FIRST_SHARE: Final = 1 / 25
 _LAST_SHARE: Final = 1e-5
@@ -69,22 +67,11 @@ class Recipe:
     clip_norm: float = 1.0  # largest norm of a gradient
     given: tuple[float, ...] = (1.0,)  # share of windows with 1, 2, ... K taps; older taps are dropped
     bf16: bool = False  # multiply in bfloat16 and add in float32, on a device where that is faster
-    minutes: float | None = None  # after which the cycle ends if that comes first; weights then depend on the machine
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "learning_rate", "minutes"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
+        for name in ("steps", "batch", "learning_rate"):
+            if not (value := getattr(self, name)) > 0:
                 raise ValueError(f"{name} is {value}, expected more than 0")
-
-
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """Result of a run."""
-
-    steps: int
-    elapsed_s: float  # over all its parts
-    course: Course
 
 
 def rank_and_world() -> tuple[int, int]:
@@ -152,14 +139,13 @@ def train(
     *,
     identity: str = "",
     log_folder: Path | None = None,
-    validate: Callable[[PatternNet], Mapping[str, float]] | None = None,
     keep_every_s: float = 60.0,
-) -> Trained:
-    """Train a network in place, and leave it in evaluation mode; an interrupted run resumes when this is called again.
+) -> float:
+    """Train a network in place, leave it in evaluation mode, and return the seconds that all parts of the run took.
 
-    It resumes with the same `identity`, of network and data, from the state in `resume_path`, which the caller deletes
-    when the result is safe. `validate` returns figures to log and to keep. ValueError if a batch cannot be shared
-    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
+    An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
+    in `resume_path`, which the caller deletes when the result is safe. ValueError if a batch cannot be shared evenly by
+    the processes, DivergedError if the loss is not finite; the network is then as before that step.
     """
     rank, world = rank_and_world()
     if recipe.batch % world:
@@ -172,17 +158,15 @@ def train(
     recipe_sha256 = hashlib.sha256(json.dumps([asdict(recipe), identity], sort_keys=True).encode()).hexdigest()
     state = _restored(resume_path, parts, recipe_sha256, device)
     wait_for_all()  # the first process to finish may delete the state
-    step, course = state["step"], state["course"]
-    kept_s = time.monotonic()
+    first, kept_s = state["step"], time.monotonic()
     started_s = kept_s - state["elapsed_s"]
-    logged = _Log(resume_path.stem, step, recipe.steps, log_folder if rank == 0 else None)
-    check_at = {round(recipe.steps * (i + 1) / _VALIDATIONS) for i in range(_VALIDATIONS)} if validate else set()
-    with closing(logged) as log, closing(drawn_ahead(batches, step, recipe.steps)) as drawn:
-        while (progress := _progress(recipe, step, time.monotonic() - started_s)) < 1:
-            rate = recipe.learning_rate * learning_rate_share(progress)
+    logged = _Log(resume_path.stem, first, recipe.steps, log_folder if rank == 0 else None)
+    with closing(logged) as log, closing(drawn_ahead(batches, first, recipe.steps)) as drawn:
+        for step, whole in enumerate(drawn, first + 1):
+            rate = recipe.learning_rate * learning_rate_share((step - 1) / recipe.steps)
             for group in optimizer.param_groups:
                 group["lr"] = rate
-            batch = next(drawn).share(rank, world, device)
+            batch = whole.share(rank, world, device)
             with torch.autocast(device.type, torch.bfloat16, enabled=recipe.bf16 and gains_by_bf16(device)):
                 descended = objective.loss(parallel, batch)
             optimizer.zero_grad()
@@ -190,24 +174,17 @@ def train(
             norm = float(nn.utils.clip_grad_norm_(net.parameters(), recipe.clip_norm))
             loss = float(descended.detach())
             if not (isfinite(norm) and isfinite(loss)):
-                raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step}: lower the learning rate")
+                raise DivergedError(f"{resume_path.stem}: loss {loss} at step {step - 1}: lower the learning rate")
             optimizer.step()
             objective.after_step()
-            step += 1
             log.step(step, loss, rate)
-            if validate and step in check_at and rank == 0:
-                net.eval()
-                figures = validate(net)
-                log.figures(step, figures)
-                course.append({"step": step, **figures})
-                net.train()
             now_s = time.monotonic()
             if rank == 0 and now_s - kept_s > keep_every_s:
-                figures = {"step": step, "elapsed_s": now_s - started_s, "course": course}
-                _keep(resume_path, parts, {"recipe": recipe_sha256} | figures)
+                facts = {"recipe": recipe_sha256, "step": step, "elapsed_s": now_s - started_s}
+                _keep(resume_path, parts, facts)
                 kept_s = time.monotonic()
     net.eval()
-    return Trained(step, time.monotonic() - started_s, course)
+    return time.monotonic() - started_s
 
 
 Drawn = TypeVar("Drawn")
@@ -243,12 +220,9 @@ class _Log:
         self._bar.advance()
         if step % 50 == 0:
             self._bar.note(f"loss {loss:.4f}")
-            self.figures(step, {"loss": loss, "learning rate": rate})
-
-    def figures(self, step: int, values: Mapping[str, float]) -> None:
-        if self._writer:
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+            if self._writer:
+                self._writer.add_scalar("loss", loss, step)
+                self._writer.add_scalar("learning rate", rate, step)
 
     def close(self) -> None:
         self._bar.close()
@@ -256,21 +230,10 @@ class _Log:
             self._writer.close()
 
 
-def _progress(recipe: Recipe, step: int, elapsed_s: float) -> float:
-    """Return the share of a run that is over, by its steps or by its time, the same in all processes."""
-    by_steps = step / recipe.steps
-    if recipe.minutes is None:
-        return by_steps
-    by_time = torch.tensor(elapsed_s / (60 * recipe.minutes), dtype=torch.float64)
-    if distributed.is_initialized():
-        distributed.broadcast(by_time, src=0)
-    return max(by_steps, float(by_time))
-
-
 def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: torch.device) -> dict[str, Any]:
-    """Return steps, seconds and figures of an interrupted run, whose parts are restored; those of a new run if none."""
+    """Return steps and seconds of an interrupted run, whose parts are restored; those of a new run if none."""
     if not path.exists():
-        return {"step": 0, "elapsed_s": 0.0, "course": []}
+        return {"step": 0, "elapsed_s": 0.0}
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except DAMAGES as error:
@@ -279,7 +242,7 @@ def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: 
         raise NotResumableError(f"{path} is of a run with another recipe or on other data: delete it to start again")
     for name, part in parts.items():
         part.load_state_dict(state[name])
-    return {"course": []} | state
+    return state
 
 
 def _keep(path: Path, parts: Mapping[str, Any], facts: Mapping[str, Any]) -> None:

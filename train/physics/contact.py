@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.elastic_layer import Layer, PadGrid, surface_compliance, waves
-from train.physics.side_correction import FreeSides, SideGive
+from train.physics.elastic_layer import FreeSides, Layer, PadGrid, SideGive, surface_compliance, waves
 
 
 @dataclass(frozen=True, slots=True)

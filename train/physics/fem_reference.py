@@ -5,17 +5,13 @@ and condensed) avoid locking as the rubber becomes incompressible. Contact is fr
 touching node stays at the surface's height above the node's initial place, and is free in the plane. An active set
 determines the touching nodes: no node may be pulled, and none may overlap the surface.
 
-Each surface takes minutes, so results are kept in a folder. FElupe is required, which is GPL and therefore a separate
-extra; only this module imports it.
+Each surface takes minutes. FElupe is required, which is GPL and so a separate extra; only this module imports it.
 
 Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (the split of shape and volume).
 """
 
-import hashlib
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
@@ -46,7 +42,6 @@ LAYER: Final = replace(Layer(), poisson=0.495)
 """Layer of rubber: the solver's own Poisson's ratio is lower to account for free sides, which the elements have."""
 C2_SHARE: Final = 0.2
 """Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
-_EDITION: Final = 1  # edition of kept results; raise it when the results of the elements change
 _SLACK: Final = 1e-4
 """Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
 
@@ -74,33 +69,14 @@ class Verdict:
 
     patterns_mm: NDArray[np.float32]
     force_n: NDArray[np.float32]
-    run_s: NDArray[np.float32]
+    run_s: NDArray[np.float64]
 
 
-def press_or_recall(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating], folder: Path) -> Verdict:
-    """Press a named surface into the middle of the pad at rising indentations (s,), or load the kept result."""
-    question = {
-        "edition": _EDITION,
-        "surface": surface,
-        "mesh": mesh,
-        "pose": CENTRE._asdict(),
-        "indentation_mm": np.round(indentation_mm, 6).tolist(),
-        "layer": asdict(LAYER),
-        "c2_share": C2_SHARE,
-        "geometry": asdict(USPA44),
-    }
-    path = folder / f"fem-{hashlib.sha256(json.dumps(question).encode()).hexdigest()[:16]}.npz"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        pad = FemPad(*mesh)
-        found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
-        pattern, forces, times = pad.pattern(found.displacement_mm), found.force_n, found.run_s
-        unfinished = path.with_suffix(".part.npz")  # a run that is stopped leaves no half result under the name
-        # Half precision is 0.05 % of a displacement, a tenth of the mesh's own error.
-        np.savez_compressed(unfinished, patterns_mm=pattern.astype(np.float16), force_n=forces, run_s=times)
-        unfinished.rename(path)
-    with np.load(path, allow_pickle=False) as kept:
-        return Verdict(*(kept[name].astype(np.float32) for name in ("patterns_mm", "force_n", "run_s")))
+def press_surface(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating]) -> Verdict:
+    """Press a named surface into the middle of the pad at rising indentations (s,)."""
+    pad = FemPad(*mesh)
+    found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
+    return Verdict(pad.pattern(found.displacement_mm), found.force_n.astype(np.float32), found.run_s)
 
 
 class FemPresses(NamedTuple):

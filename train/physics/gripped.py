@@ -16,9 +16,8 @@ from train.errors import SurfaceError
 from train.physics.contact import BARE, REACH, ContactSolver, Cover
 from train.physics.friction import FrictionSolver
 from train.physics.pad_draws import Pad
-from train.physics.resample import resample, resample_touching
 from train.physics.taxel_response import Skin, on_pad
-from train.physics.tpsf import heights_pattern
+from train.physics.tpsf import heights_pattern, resample, resample_touching
 from train.surfaces.depth_image import NOTHING_MM
 
 MAX_INDENTATION_MM: Final = 0.5  # largest indentation, in [mm]: beyond a tenth of its thickness the layer is not linear

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44, SensorGeometry
-from train.physics.elastic_layer import Layer
+from train.physics.elastic_layer import FreeSides, Layer
 from train.physics.magnets import Magnet
-from train.physics.side_correction import FreeSides
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085  # by the data sheet, for the sum of z
 

@@ -8,6 +8,7 @@ each plane spreads its indentation, and deeper planes spread further. Convolutio
 Source: Wu and Liu 2024, Eq. 4-6; Section VII names curved surfaces as future work without a method.
 """
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -88,3 +89,35 @@ def _curve(length: int, beta_mm: Tensor, pixel_mm: float) -> Tensor:
     place_mm = torch.arange(length, dtype=beta_mm.dtype, device=beta_mm.device) * pixel_mm
     distance_mm = place_mm[:, None] - place_mm[None, :]
     return torch.exp(-((distance_mm / beta_mm[:, None, None]) ** 2))
+
+
+def resample(
+    patterns: NDArray[np.floating] | NDArray[np.bool_], from_scale: float, to_scale: float
+) -> NDArray[np.float32]:
+    """Resample maps (n, H, W) from one number of pixels per pitch to another: (n, H', W'), in the same unit.
+
+    Towards a finer scale a pixel is repeated: no detail is added. Of a mask, the share of each pixel that is set.
+    """
+    maps = np.asarray(patterns, dtype=np.float32)
+    if from_scale == to_scale:
+        return maps.copy()
+    down, right = (_shares(length, from_scale, to_scale) for length in maps.shape[1:])
+    return np.matmul(down, maps @ right.T)
+
+
+def resample_touching(touching: NDArray[np.bool_], from_scale: float, to_scale: float) -> NDArray[np.bool_]:
+    """Resample masks (n, H, W): a pixel touches if at least half of its area does."""
+    # Shares are sums of rounded fractions: half an area may come out slightly below 0.5.
+    return resample(touching, from_scale, to_scale) >= 0.5 - 1e-5
+
+
+@lru_cache
+def _shares(length: int, from_scale: float, to_scale: float) -> NDArray[np.float32]:
+    """Return the share of each old pixel in each new one along a line, (new, old); rows sum to 1."""
+    count = round(length * to_scale / from_scale)
+    new = np.arange(count + 1) / count
+    old = np.arange(length + 1) / length
+    overlap = np.minimum(new[1:, None], old[None, 1:]) - np.maximum(new[:-1, None], old[None, :-1])
+    shares = (np.maximum(overlap, 0.0) * count).astype(np.float32)
+    shares.setflags(write=False)
+    return shares

@@ -21,13 +21,11 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.presses import SEED
-from train.data.real_grips import recorded_grips, recording_paths, recordings_folder
+from train.data.real_grips import play, recorded_grips, recording_paths, recordings_folder
 from train.data.world import World
 from train.errors import CheckpointError
-from train.experiments.sensor.real import play
-from train.experiments.sensor.sensor_faults import FAULTS, FIELDS
-from train.experiments.sensor.shipped import ALL, NOTHING, PushedSensor, known_pads
-from train.experiments.workbench import Workbench
+from train.experiments.sensor_faults import FAULTS, FIELDS, PushedSensor
+from train.experiments.workbench import Workbench, known_pads
 from train.families.catalogue import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, bootstrap_interval, with_interval
@@ -36,11 +34,10 @@ JUDGED: Final = World(count=8000, per_pad=4, families=dict.fromkeys(SHARES, 1.0)
 _MODELS: Final = ("stsr", "mtsr", "stsr-small")
 
 
-def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `trust-checks`; CheckpointError if a shipped model has no checks."""
+def trust_checks(bench: Workbench, report: Report) -> None:
+    """Judge the verdicts on right and wrong patterns; CheckpointError if a shipped model has no checks."""
     model = bench.model()
-    names = _MODELS[:2] if bench.quick else _MODELS
-    models = [bench.model(f"{name}{INT8_SUFFIX}") for name in names]
+    models = [bench.model(f"{name}{INT8_SUFFIX}") for name in (_MODELS[:2] if bench.quick else _MODELS)]
     for one in models:
         if one.contract.read_trust() is None:
             raise CheckpointError(f"{one.name} has no checks: export it with --trust")
@@ -48,21 +45,19 @@ def run(bench: Workbench, folder: Path) -> Path:
     wide = wide.pick(np.arange(12)) if bench.quick else wide
     # A third of the sensors is enough for the faults, and half of the presses to compare models.
     sensors = of_one_sensor_each(wide.pick(wide.presses.pad % 3 == 0))
-    report = Report("trust-checks", folder, __file__, bench.used, quick=bench.quick)
     fresh = freeze_presses(bench.presses("judged", JUDGED), SEED)
-    verdicts = judged(model, fresh, known_pads(fresh, NOTHING))
+    verdicts = judged(model, fresh, known_pads(fresh, False))
     report.say(_METHOD)
     family = fresh.presses.family[verdicts.index]
     which = {name: (family == name) & ~verdicts.light for name in SHARES}
     which |= {"all": ~verdicts.light, "light": verdicts.light}
     report.table([{"contacts of": name} | verdicts.cells(here) for name, here in which.items()], _FAMILIES)
-    text = "Half of these contacts by model, one tap each, of all families."
-    report.table(_by_model(models, fresh.pick(np.arange(0, len(fresh), 2))), text, "models")
+    half = fresh.pick(np.arange(0, len(fresh), 2))
+    report.table(_by_model(models, half), "Half of these contacts by model, one tap each, of all families.")
     if recording_paths(recordings_folder()):
-        report.table(_grips(models), _GRIPS, "grips")
-    report.table(_detected(model, sensors), _DETECTED, "faults")
-    _tap_tables(report, model, bench.models / f"{_MODELS[1]}{INT8_SUFFIX}.onnx", sensors)
-    return report.write()
+        report.table(_grips(models), _GRIPS)
+    report.table(_detected(model, sensors), _DETECTED)
+    report.table(_taps(model, bench.models / f"{_MODELS[1]}{INT8_SUFFIX}.onnx", firm(sensors)), _GUARDED)
 
 
 _METHOD: Final = (
@@ -90,9 +85,9 @@ _DETECTED: Final = (
 def _by_model(models: Sequence[ModelSession], presses: FrozenPresses) -> list[Row]:
     rows: list[Row] = []
     for model in tracked(models, "models", "model"):
-        for known in (NOTHING, ALL) if model is models[0] else (NOTHING,):
+        for known in (False, True) if model is models[0] else (False,):
             one = judged(model, presses, known_pads(presses, known))
-            rows.append({"model": model.name, "known": known} | one.cells(~one.light))
+            rows.append({"model": model.name, "known": "pad and gains" if known else "nothing"} | one.cells(~one.light))
     return rows
 
 
@@ -230,41 +225,33 @@ def judged(model: Model, presses: FrozenPresses, pads: Sequence[Pad | None]) -> 
 
 
 _DEPTHS: Final = (0.85, 1.15)
-_DROPPED: Final = (
-    "Earlier taps of windows of four: share that the runtime finds not to belong, by tap, newest first, and windows of "
-    "which it drops some, and all. In the row `right`, these are false alarms, wanted at most 1 %; in the others at "
-    "least 95 % are wanted. The order reversed leaves the middle tap right."
-)
 _GUARDED: Final = (
-    "PSNR in dB of the same windows, by the model of one tap, and by that of four without and with the guard. "
-    "Wanted: with the guard, never more than 0.3 dB below one tap. Intervals are by sensor; guard and options are as "
-    "shipped, and every tap is used."
+    "Windows of four taps: share of each earlier one that the runtime finds not to belong, newest first; of windows of "
+    "which it drops some, and all. In the row `right` these are false alarms, wanted at most 1 %; in the others at "
+    "least 95 % are wanted. The order reversed leaves the middle tap right. Then the PSNR in dB by the model of one "
+    "tap, and by that of four without and with the guard. Wanted: with it, never more than 0.3 dB below one tap. "
+    "Intervals are by sensor; guard and options are as shipped, and every tap is used."
 )
 
 
-def _tap_tables(report: Report, single: ModelSession, several: Path, sensors: FrozenPresses) -> None:
+def _taps(single: ModelSession, several: Path, sensors: FrozenPresses) -> list[Row]:
     guarding, unguarded = (ModelSession(several, taps=4) for _ in range(2))
     unguarded.contract = replace(unguarded.contract, trust={})
-    taps, name_of = guarding.contract.taps, guarding.name
-    sensors = firm(sensors)
-    pads = sensors.presses.pad
-    dropped: list[Row] = []
-    losses: list[Row] = []
-    for name, (counts, truth) in tracked(cases(sensors).items(), "tapping", "case"):
+    taps, name = guarding.contract.taps, guarding.name
+    pads, rows = sensors.presses.pad, list[Row]()
+    for case, (counts, truth) in tracked(cases(sensors).items(), "tapping", "case"):
         alone_db, _, _ = guarded(single, counts, truth, 1)
         off_db, _, _ = guarded(unguarded, counts, truth, taps)
         on_db, used, foreign = guarded(guarding, counts, truth, taps)
-        row: Row = {"earlier taps": name, "windows": len(counts)}
-        by_tap: Row = {f"tap {number} %": share(foreign[:, number - 1], pads) for number in range(1, taps)}
-        some, every = share(np.logical_or.reduce(foreign, axis=1), pads), share(used == 1, pads)
-        dropped.append(row | by_tap | {"some dropped %": some, "all dropped %": every})
-        row[single.name] = round(float(alone_db.mean()), 2)
+        row: Row = {"earlier taps": case, "windows": len(counts)}
+        row |= {f"tap {number} %": share(foreign[:, number - 1], pads) for number in range(1, taps)}
+        row["some dropped %"] = share(np.logical_or.reduce(foreign, axis=1), pads)
+        row |= {"all dropped %": share(used == 1, pads), single.name: round(float(alone_db.mean()), 2)}
         for how, found_db in (("no guard", off_db), ("guard", on_db)):
-            row[f"{name_of}, {how}"] = round(float(found_db.mean()), 2)
+            row[f"{name}, {how}"] = round(float(found_db.mean()), 2)
             row[f"{how}, over one tap"] = with_interval(found_db - alone_db, pads, sign="+")
-        losses.append(row)
-    report.table(dropped, _DROPPED, "taps")
-    report.table(losses, _GUARDED, "psnr")
+        rows.append(row)
+    return rows
 
 
 def firm(sensors: FrozenPresses) -> FrozenPresses:

@@ -3,8 +3,8 @@
 No choice depended on these presses: network and limits were settled on other pads and figures.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -20,8 +20,7 @@ from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.press_batches import stated_poses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
-from train.experiments.sensor.shipped import ALL, NOTHING, infer, known_pads
-from train.experiments.workbench import Workbench
+from train.experiments.workbench import Workbench, infer, known_pads, name_of
 from train.families.catalogue import FIGURES, SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
@@ -34,19 +33,16 @@ PAPER: Final = World(
 """The paper's own comparison: its figures, the nominal pad, turned by 5 degrees from tap to tap.
 
 Source: Wu and Liu 2024, Fig. 13."""
-_WAYS: Final = ((DEFAULT_MODEL, 1), (POSED_MODEL, 2), (POSED_MODEL, 4), (POSED_MODEL, MAX_TAPS))
 USUAL: Final = (PLACE_ERROR_MM, TURN_ERROR_DEG)  # errors of poses, in [mm] and [deg], where a robot states none
 _WINDOW: Final = 4
 
 
-def run(bench: Workbench, folder: Path) -> Path:
-    """Evaluate the model that takes poses and write the report `posed-taps`."""
-    models = {name: bench.model(name) for name, _ in _WAYS}
-    model = models[POSED_MODEL]
+def posed_taps(bench: Workbench, report: Report) -> None:
+    """Evaluate the model that takes poses, by schedule and number of taps."""
+    model = bench.model(POSED_MODEL)
     sets = {name: freeze_presses(presses_of(bench, name, figures=True), SEED) for name in SCHEDULES}
-    report = Report("posed-taps", folder, __file__, bench.used, quick=bench.quick)
     report.say(
-        f"`{model.name}` (training {model.contract.training_sha256[:12]}) through the runtime's session. Figures that "
+        f"{name_of(model)} through the runtime's session. Figures that "
         "nothing was trained on, on pads of their own, presses of 0.03 to 0.5 mm, seven taps each: "
         + "; ".join(f"{name} {len(one)} (sha256 {one.presses.sha256()[:12]})" for name, one in sets.items())
         + f". All nuisances, gains N(1, 0.075); stated and true errors of the poses {PLACE_ERROR_MM} mm and "
@@ -54,40 +50,26 @@ def run(bench: Workbench, folder: Path) -> Path:
         "with the newest tap alone, paired, 95 % intervals by figure. Run time of the model: median of a scan, one "
         "thread."
     )
-    rows = [row for name, one in tracked(sets.items(), "taps", "set") for row in _rows(model, name, one, NOTHING)]
-    report.table(rows, "By schedule and number of taps, nothing known of pad and gains.", "schedules")
-    known = [row for name in SCHEDULES[:3] for row in _rows(model, name, sets[name], ALL, (1, 4, 7))]
-    report.table(known, "The same with the pad's constants and the gains known.", "known")
+    rows = [row for name, one in tracked(sets.items(), "taps", "set") for row in _posed(model, name, one)]
+    report.table(rows, "By schedule and number of taps, nothing known of pad and gains.")
+    rows = [row for name in SCHEDULES[:3] for row in _posed(model, name, sets[name], (1, 4, 7), known=True)]
+    report.table(rows, "The same with the pad's constants and the gains known.")
     wide = freeze_presses(presses_of(bench, "mixed", figures=False), SEED)
     report.table(
-        _rows(model, "mixed", wide, NOTHING, (1, 2, 4, 7)),
+        _posed(model, "mixed", wide, (1, 2, 4, 7)),
         f"Every family, as many presses of each ({len(wide)}, sha256 {wide.presses.sha256()[:12]}), in schedules of "
         "all kinds.",
-        "families",
     )
     report.table(
         _wrong(model, sets["near"]),
         f"{_WINDOW} taps near the newest one, whose poses are all off by so much in a random direction; stated: the "
         "model gets the size of the error. As in the runtime, taps are left out that do not belong by the readings and "
         "the stated poses.",
-        "wrong-poses",
     )
     paper = freeze_presses(bench.presses("paper", PAPER, quick_taps=MAX_TAPS), SEED)
     text = f"Several taps over one in the paper's own comparison ({len(paper)} sequences), no poses stated."
-    report.table(paper_rows(models, paper), text, "paper")
-    return report.write()
-
-
-def paper_rows(models: dict[str, ModelSession], frozen: FrozenPresses) -> list[Row]:
-    """Return a row for each model and number of taps, with its gain over the default with one tap."""
-    each, rows = np.arange(len(frozen)), list[Row]()
-    alone, _ = _psnr(models[DEFAULT_MODEL], frozen, 1, NOTHING)
-    for name, taps in _WAYS:
-        found, run_time_us = _psnr(models[name], frozen, taps, NOTHING)
-        row: Row = {"model": name, "taps": taps, "PSNR dB": with_interval(found, each)}
-        row["over one tap"] = with_interval(found - alone, each) if taps > 1 else None
-        rows.append(row | {"run time us": run_time_us})
-    return rows
+    ways = [(bench.model(DEFAULT_MODEL), 1), *((model, taps) for taps in (2, 4, MAX_TAPS))]
+    report.table(_rows({}, ways, paper), text)
 
 
 def presses_of(bench: Workbench, schedule: str, *, figures: bool) -> PressSet:
@@ -98,31 +80,47 @@ def presses_of(bench: Workbench, schedule: str, *, figures: bool) -> PressSet:
     return bench.presses(f"test-{schedule}", world, quick_taps=MAX_TAPS)
 
 
-def _rows(
-    model: ModelSession, schedule: str, frozen: FrozenPresses, known: str, numbers: tuple[int, ...] = (1, 2, 3, 4, 7)
+def _posed(
+    model: ModelSession,
+    schedule: str,
+    frozen: FrozenPresses,
+    numbers: Sequence[int] = (1, 2, 3, 4, 7),
+    *,
+    known: bool = False,
 ) -> list[Row]:
-    """Return a row for each number of taps."""
     poses = stated_poses(np.random.default_rng(SEED), frozen.presses.poses, USUAL)
+    return _rows({"schedule": schedule}, [(model, taps) for taps in numbers], frozen, known, poses)
+
+
+def _rows(
+    head: Row,
+    ways: Sequence[tuple[ModelSession, int]],
+    frozen: FrozenPresses,
+    known: bool = False,
+    poses: NDArray[np.float32] | None = None,
+) -> list[Row]:
+    """Return a row for each model and number of taps, with its gain over the first one, which has one tap."""
     each, rows = np.arange(len(frozen)), list[Row]()
-    alone, _ = _psnr(model, frozen, 1, known, poses)
-    for taps in numbers:
+    alone = np.empty(0)
+    for model, taps in ways:
         found, run_time_us = _psnr(model, frozen, taps, known, poses)
-        row: Row = {"schedule": schedule, "taps": taps, "model dB": with_interval(found, each)}
-        row["over one tap"] = with_interval(found - alone, each) if taps > 1 else None
+        alone = alone if rows else found
+        row: Row = head | {"model": model.name, "taps": taps, "PSNR dB": with_interval(found, each)}
+        row["over one tap"] = with_interval(found - alone, each) if rows else None
         rows.append(row | {"run time us": run_time_us})
     return rows
 
 
 def _wrong(model: ModelSession, frozen: FrozenPresses) -> list[Row]:
     true, each = frozen.presses.poses[:, :_WINDOW], np.arange(len(frozen))
-    alone, _ = _psnr(model, frozen, 1, NOTHING, stated_poses(np.random.default_rng(SEED), true[:, :1], (0, 0)))
+    alone, _ = _psnr(model, frozen, 1, False, stated_poses(np.random.default_rng(SEED), true[:, :1], (0, 0)))
     rows: list[Row] = []
     for error_mm, error_deg in ((0.2, 0.0), (0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (0.0, 3.0), (0.0, 5.0)):
         row: Row = {"off mm": error_mm, "off deg": error_deg}
         for name, stated in (("stated", (error_mm, error_deg)), ("not stated", USUAL)):
             poses = _off(true, (error_mm, error_deg), stated)
             windows, left_out = _guarded(model, frozen.windows(_WINDOW), poses)
-            done = infer(model, windows, known_pads(frozen, NOTHING), np.where(left_out[..., None], 0, poses))
+            done = infer(model, windows, known_pads(frozen, False), np.where(left_out[..., None], 0, poses))
             found = psnr_db(done.patterns, frozen.patterns(), MAX_INDENTATION_MM)
             row[f"over one tap, {name}"] = with_interval(found - alone, each)
             row[f"left out %, {name}"] = round(100 * float(left_out[:, 1:].mean()), 1)
@@ -154,7 +152,7 @@ def _off(true: NDArray[np.float32], error: tuple[float, float], stated: tuple[fl
 
 
 def _psnr(
-    model: ModelSession, frozen: FrozenPresses, taps: int, known: str, poses: NDArray[np.float32] | None = None
+    model: ModelSession, frozen: FrozenPresses, taps: int, known: bool, poses: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.float64], int]:
     """Return the PSNR (n,) with so many taps, at these poses or by the paper's schedule, and the run time in [us]."""
     given = None if poses is None else poses[:, :taps]

@@ -12,7 +12,6 @@ Source: Wu and Liu 2024, Figs. 14 and 15.
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import log
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.data.paper_taps import PaperTaps, between_frames, windows
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet
-from train.experiments.paper.protocol import classical_methods, compact_methods, mixed
+from train.experiments.paper_tables import classical_methods, compact_methods, mixed
 from train.experiments.workbench import Figures, Method, Workbench
 from train.freeze import SCALE, TEST_FORCE_N
 from train.physics.gripped import MAX_INDENTATION_MM
@@ -51,20 +50,16 @@ class Bin(NamedTuple):
     tap: NDArray[np.int64]
 
 
-def run_force(bench: Workbench, folder: Path) -> Path:
-    """Write the report `force`; the full run takes a few minutes once the networks are there."""
+def small_forces(bench: Workbench, report: Report) -> None:
+    """Measure errors by contact force; a few minutes once the networks are there."""
     data = mixed(bench)
     methods = compact_methods(bench, data, ("stsr", "mtsr2", "mtsr4"))
     methods += classical_methods(bench, data, ("linear map", "bilinear"))
     sequences = bench.held_out("test").at_scale(SCALE)
     draws = 1 if bench.quick else 4
-    bins = [
-        scans
-        for number, bounds in enumerate(pairwise(EDGES_N))
-        if (scans := scans_between(sequences, bounds, draws, [SEED, number]))
-    ]
+    found = [scans_between(sequences, bounds, draws, [SEED, number]) for number, bounds in enumerate(pairwise(EDGES_N))]
+    bins = [scans for scans in found if scans is not None]
     rows = [_row(method, scans) for scans in tracked(bins, "forces", "range") for method in methods]
-    report = Report("force", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"The {len(sequences)} test taps, newest scan somewhere on its press, earlier taps at their ends of "
         f"{TEST_FORCE_N:g} N; forces drawn evenly over their logarithm, {draws} a tap and "
@@ -74,7 +69,6 @@ def run_force(bench: Workbench, folder: Path) -> Path:
         "the truth's RMS, and SSIM at own scale has each truth's peak as full scale: they measure errors of shape."
     )
     report.table(rows, "Errors by contact force, with 95 % intervals by tap.")
-    return report.write()
 
 
 def scans_between(sequences: PaperTaps, force_n: tuple[float, float], draws: int, seed: Sequence[int]) -> Bin | None:
@@ -220,8 +214,8 @@ _TAPS: Final = 4
 _ZEROED: Final = Nuisances().without("thermal_drift_counts", "earth_field_counts")
 
 
-def run_recovery(bench: Workbench, folder: Path) -> Path:
-    """Write the report `force-recovery`; the full run takes some minutes once the networks are there."""
+def recovery(bench: Workbench, report: Report) -> None:
+    """Measure the force that patterns state through press, hold and release; some minutes with the networks there."""
     data = mixed(bench)
     course = Course(20.0 if bench.quick else 100.0)
     known = training_presses(data, 50 if bench.quick else 600)
@@ -238,7 +232,6 @@ def run_recovery(bench: Workbench, folder: Path) -> Path:
     sequences = sequences.pick(np.arange(1, len(sequences), len(TARGET_ANGLES_DEG)))  # at 30 degrees, as in the paper
 
     rows: list[Row] = []
-    by_surface: list[Row] = []
     for condition, nuisances in {"just zeroed": _ZEROED, "drifted": Nuisances()}.items():
         figures: dict[str, list[dict[str, float]]] = {name: [] for name in measures}
         for number in tracked(range(len(sequences)), condition, "press"):
@@ -252,11 +245,6 @@ def run_recovery(bench: Workbench, folder: Path) -> Path:
             for label in presses[0]:
                 row[label] = with_interval(np.array([press[label] for press in presses]), np.arange(len(presses)))
             rows.append(row | {"N per unit": newtons_per_unit[name]} | costs[name])
-        for number, surface in enumerate(sequences.surfaces):
-            cells: Row = {f"{name} error %": round(presses[number]["error %"], 2) for name, presses in figures.items()}
-            by_surface.append({"nuisances": condition, "surface": str(surface)} | cells)
-
-    report = Report("force-recovery", folder, __file__, bench.used, quick=bench.quick)
     report.say(
         f"{len(sequences)} surfaces at the held-out position, each pressed to {TEST_FORCE_N:g} N (or as deep as may "
         f"be) in {PRESS_S:g} s, held {HOLD_S:g} s, released in {RELEASE_S:g} s, then {REST_S:g} s at no load, at "
@@ -273,8 +261,6 @@ def run_recovery(bench: Workbench, folder: Path) -> Path:
         "z), below which no pattern is made; that threshold misses loaded scans, too."
     )
     report.table(rows, "Force recovery, means over presses with 95 % intervals.")
-    report.table(by_surface, "RMS errors over the course in % of the range, by surface.", "surfaces")
-    return report.write()
 
 
 def training_presses(data: PressSet, presses: int) -> Scans:

@@ -6,7 +6,6 @@ indentation; the report states the conversion of each to millimetres.
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from timeit import repeat
 from typing import Final, NamedTuple
 
@@ -20,7 +19,7 @@ from firmware_bridge.pad_geometry import USPA44
 from train.experiments.workbench import Workbench
 from train.physics.contact import ContactSolver
 from train.physics.elastic_layer import Layer
-from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_or_recall
+from train.physics.fem_reference import CENTRE, FINEST, LAYER, SCALE, Mesh, press_surface
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.tpsf import BETA_MM, spread, tpsf_pattern
 from train.report import Report, Row
@@ -58,32 +57,22 @@ class Method(NamedTuple):
         return rmse_percent(np.maximum(self.against(pressed), 0), pressed, 100.0)
 
 
-def run(bench: Workbench, folder: Path) -> Path:
-    """Write the report `fig7`; finite elements are kept in the data folder.
-
-    The full run takes about half an hour on one core, nearly all of it for the finite elements.
-    """
+def fig7(bench: Workbench, report: Report) -> None:
+    """Compare the methods with finite elements, which take half an hour on one core."""
     surfaces, meshes, steps = (LETTERS[:2], (Mesh(4, 2), Mesh(3, 2)), 2) if bench.quick else (LETTERS, MESHES, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
-    verdicts = {
-        mesh: [
-            press_or_recall(name, mesh, indentation_mm, bench.data_folder)
-            for name in tracked(surfaces, f"FEM {mesh}", "surface")
-        ]
-        for mesh in meshes
-    }
-    by_fem = {
-        f"FEM {mesh}": Method(
-            np.stack([one.patterns_mm for one in found]), float(np.mean([one.run_s.sum() for one in found]))
-        )
-        for mesh, found in verdicts.items()
-    }
+    by_fem: dict[str, Method] = {}
+    forces_n: list[NDArray[np.float32]] = []
+    for mesh in meshes:
+        names = tracked(surfaces, f"FEM {mesh}", "surface")
+        found = [press_surface(name, mesh, indentation_mm) for name in names]
+        maps = np.stack([one.patterns_mm for one in found])
+        by_fem[f"FEM {mesh}"] = Method(maps, float(np.mean([one.run_s.sum() for one in found])))
+        forces_n.append(np.stack([one.force_n for one in found]))
     truth = by_fem[f"FEM {meshes[0]}"].maps
-    force_n = np.stack([one.force_n for one in verdicts[meshes[0]]])
-    methods, beta_mm = _methods(surfaces, indentation_mm, force_n, truth)
+    methods, beta_mm = _methods(surfaces, indentation_mm, forces_n[0], truth)
     methods |= by_fem
 
-    report = Report("fig7", folder, __file__, bench.used, quick=bench.quick)
     report.say(_how(len(surfaces), steps, beta_mm))
     layer = methods["layer"].maps
     report.table(
@@ -92,17 +81,9 @@ def run(bench: Workbench, folder: Path) -> Path:
         "surfaces and steps, in brackets the best and the worst surface. What heaps up around the contact counts as 0, "
         "as no PSF pulls, except in the column that is named so.",
     )
-    report.table(_by_step(methods, truth, indentation_mm, force_n), "RMS error by step, in [um].", "steps")
-    fem: list[Row] = [
-        {
-            "mesh": str(mesh),
-            "force, % of the finest's": float(100 * (np.stack([one.force_n for one in found]) / force_n).mean()),
-            "s a surface": by_fem[f"FEM {mesh}"].time_s,
-        }
-        for mesh, found in verdicts.items()
-    ]
-    report.table(fem, "The finite elements.", "fem")
-    return report.write()
+    shares = [100 * float((one / forces_n[0]).mean()) for one in forces_n]
+    listed = "; ".join(f"{mesh} {share:.1f}" for mesh, share in zip(meshes, shares, strict=True))
+    report.say(f"Forces of the finite elements in % of the finest's: {listed}.")
 
 
 def _methods(
@@ -154,20 +135,6 @@ def _cells(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.
     }
 
 
-def _by_step(
-    methods: dict[str, Method], truth: Maps, indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating]
-) -> list[Row]:
-    errors = {name: 1e3 * method.rms_mm(truth).mean(axis=0) for name, method in methods.items()}
-    return [
-        {
-            "indentation mm": float(depth_mm),
-            "force N": float(force_n[:, step].mean()),
-            **{name: float(error[step]) for name, error in errors.items() if error.any()},
-        }
-        for step, depth_mm in enumerate(indentation_mm)
-    ]
-
-
 def _how(surfaces: int, steps: int, beta_mm: float) -> str:
     return (
         f"{surfaces} letters at p5 r0, {steps} indentations up to {MAX_INDENTATION_MM} mm, all methods on the same "
@@ -178,6 +145,6 @@ def _how(surfaces: int, steps: int, beta_mm: float) -> str:
         "x force, as the paper has it: one factor fitted in the same way. layer: bonded layer without sides, "
         f"Polonsky-Keer, Poisson's ratio {Layer().poisson:g}. FEM: Mooney-Rivlin, large strain, free sides, Poisson's "
         f"ratio {LAYER.poisson:g}; the nodes of the two finer meshes are the pixels, those of the coarser two lie next "
-        "to them, so that a sharp edge is theirs to half a node only. Run times are one process's; FEM's from when it "
-        "was worked out."
+        "to them, so that a sharp edge is theirs to half a node only. Run times are one "
+        "process's."
     )

@@ -14,7 +14,6 @@ Source: Wu and Liu 2024, Fig. 4 and 5, Section IV-C, Eq. 4-10.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -28,8 +27,7 @@ from train.data.paper_taps import tap
 from train.experiments.workbench import Workbench
 from train.physics.gripped import FINE_SCALE, FRAMES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
-from train.physics.resample import resample
-from train.physics.tpsf import spread
+from train.physics.tpsf import resample, spread
 from train.report import Report, Row
 from train.surfaces.poses import random_poses
 
@@ -176,8 +174,8 @@ def fit_psf_net(
     return losses
 
 
-def run(bench: Workbench, folder: Path) -> Path:
-    """Tap, train, and write both tables."""
+def fig5(bench: Workbench, report: Report) -> None:
+    """Tap, train, and compare alpha and beta with the force."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
     places = random_poses(np.random.default_rng(5), len(names))
@@ -211,13 +209,12 @@ def run(bench: Workbench, folder: Path) -> Path:
             {"surface": name, "parameter": key} | _line(force_n[mine], value[mine]) for key, value in seen.items()
         ]
 
-    report = Report("fig5", folder, __file__, bench.used, quick=bench.quick)
     report.table(
         rows,
         "Alpha and beta by contact force at poses that the network has not seen: means, and the median of the betas "
         "found by search.",
     )
-    report.table(lines, "Straight lines through them.", "lines")
+    report.table(lines, "Straight lines through them.")
     error = np.sqrt(np.mean((reach - indentation_mm) ** 2)) / indentation_mm.max()
     report.say(
         f"Training loss {losses[0]:.4g} at first, {losses[-1]:.4g} at last. On the held-out taps "
@@ -225,7 +222,6 @@ def run(bench: Workbench, folder: Path) -> Path:
         f"{100 * error:.1f} % of the largest. gamma = {float(read.gamma):.3g} mm^0.5, "
         f"k_scale = {float(net.k_scale):.3g} mm per (100 counts/mm^2)."
     )
-    return report.write()
 
 
 def _scans(taps: Taps, which: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1,1 +1,0 @@
-"""The shipped models and the simulated sensor, evaluated on other pads and real recordings."""
