@@ -95,11 +95,7 @@ RESULTS: Final = (
         _runtime("every_scan", bool),
     ),
 )
-PROCESSOR: Final = Group("processor",
-    Option("--realtime", bool, "run before other processes, on a processor of its own and in locked memory, as far as "
-           "permitted"),
-)
-RUN: Final = (_READ, *RESULTS, PROCESSOR)
+RUN: Final = (_READ, *RESULTS)
 DEMO: Final = Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)"))
 RECORD: Final = Group("file", Option("file FILE", str, "new file, .mcap"))
 REPLAY: Final = Group("recording",

@@ -271,10 +271,6 @@ def run(
                 from edge.api import open_poses
 
                 closing.callback(open_poses(text, commands.poses).close)
-            if options.realtime:  # last, so that it does not affect what the page and the sinks have started
-                from edge.cli.realtime import realtime
-
-                closing.enter_context(realtime(_tell, source.thread_ids))
             pump(source, runtime, sinks, statistics, stop=stop, duration_s=options.duration_s, commands=commands)
         # A run that its user ends before the first scan was due is no fault of the sensor.
         if not statistics.scans and (statistics.events or not stop.is_set()):

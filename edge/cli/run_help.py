@@ -177,7 +177,7 @@ HELP: Final = {
         "[options]",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
-        (of.DEMO, *of.RESULTS, of.PROCESSOR),
+        (of.DEMO, *of.RESULTS),
         "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
     ),
     "record": Help(
@@ -230,7 +230,7 @@ HELP: Final = {
 
 _FIXED: Final[dict[str, dict[str, Any]]] = {
     "demo": {"sensor": None, "id_map": None, "force": False, "baseline": None, "poses": [], "give_up_s": None},
-    "replay": {"source": [], "id_map": None, "give_up_s": None, "realtime": False, "poses": []},
+    "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},
 }
 """Options of a run that a command of its kind does not have, with the values that they have there."""
 

@@ -160,7 +160,7 @@ def check_latency(facts: LineFacts, held_back_ms: float, line_full: bool) -> Fin
         return Finding("latency timer", "wrong", measured, norm, remedy)
     if line_full:
         return Finding("latency timer", "not known", measured, norm, "the line is full: see baud rate")
-    remedy = "this machine is too busy to read in time: end what else runs, or use --realtime"
+    remedy = "this machine is too busy to read in time: end what else runs"
     if facts.latency_ms is None:
         remedy = f"the adapter holds bytes back: of an FTDI chip, echo 1 | sudo tee {shown}; or {remedy}"
     return judged("latency timer", "wrong" if held_back_ms > HELD_BACK_LIMIT_MS else "ok", measured, norm, remedy)

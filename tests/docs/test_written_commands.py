@@ -48,7 +48,6 @@ PARSED = {
     r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr --source demo:loop --sink ros2:.*": "goes on until it is ended; test_ros2 subscribes to its topics",
     r"edge-sr map .*": "is of poses that a robot sends, and without them writes nothing; test_poses_stdin runs it",
-    r"edge-sr .*--realtime.*": "takes a processor from the other tests; test_realtime runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python tests/system/chaos\.py .*": "takes minutes; test_chaos runs it, shortened",

@@ -41,7 +41,7 @@ class TestHelp:
 
     def test_options_are_in_groups_and_those_of_the_demo_are_its_own(self):
         text = run("--help").stdout
-        groups = "options, sensor, model, outputs, live page, contact, checks of patterns and sensor, processor"
+        groups = "options, sensor, model, outputs, live page, contact, checks of patterns and sensor"
         at = [text.index(f"\n{group}:\n") for group in groups.split(", ")]
         assert at == sorted(at)
         for name in cli.COMMANDS:
