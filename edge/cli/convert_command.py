@@ -2,14 +2,13 @@
 
 import argparse
 from collections.abc import Iterator
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TextIO
 
 from edge.errors import SinkError, UsageError
 from edge.pipeline.sink import RunFacts, check_new
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses import TimedPose
@@ -87,10 +86,10 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
 def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
     """Yield the scans of a recording, each with the poses that it was made with first."""
     total = sum(len(track.counts) for track in replay.recordings[0].tracks)
-    with closing(Progress("convert", total, "scan")) as bar:
+    with progress("convert", total, "scan") as bar:
         while not replay.ended:
             for scan in replay.read(0.0):
-                bar.advance(1)
+                bar.update()
                 yield scan, replay.poses()
 
 

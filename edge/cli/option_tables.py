@@ -156,7 +156,4 @@ BENCH: Final = Group(None,
     Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
     Option("--models DIR", Path, "folder of your own models, measured as well"),
     Option("--only NAME", str, "measure only these methods", nargs="+"),
-    Option("--system", bool, "measure the whole program only: 2 minutes with 3000 ticks"),
-    Option("--sensors N", whole(1), "measure the whole program with so many sensors (default 1)"),
-    Option("--against COMMIT", str, "measure the whole program in turn with that of another commit"),
 )

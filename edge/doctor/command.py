@@ -19,7 +19,7 @@ from edge.doctor.write_sensor_file import check_writable, keep
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
-from edge.terminal.progress_bar import SECONDS, Progress
+from edge.terminal.progress_bar import progress
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
@@ -96,12 +96,12 @@ class Visit:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with Progress("watching", length_s, SECONDS, stream=self._err) as bar:
+        with progress("watching", length_s, "s", stream=self._err) as bar:
 
             def show(scans: int, passed_s: float) -> None:
                 if passed_s > 0:
-                    bar.note(f"{scans / passed_s:.0f} scans/s")
-                bar.reach(min(passed_s, length_s))
+                    bar.set_postfix_str(f"{scans / passed_s:.0f} scans/s", refresh=False)
+                bar.update(min(passed_s, length_s) - bar.n)
 
             watch(self._link, watched, length_s, self._stop, tell=show)
 

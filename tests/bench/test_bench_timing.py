@@ -1,14 +1,17 @@
 """Run times on a clock of its own, the front, and the cost of a scan's way against an earlier commit."""
 
+import re
 import shutil
 
 import hot_path
 import numpy as np
+import program_cost
 import pytest
 from hot_path import ROOT, compare, main, report, slower
+from program_cost import Ratio, ratio_of
+from program_cost import main as cost
 
 from edge.bench.command import front
-from edge.bench.system import Ratio, ratio_of
 from edge.bench.timing import back_to_back, paced, summary
 
 
@@ -136,3 +139,13 @@ def test_blocks_that_cannot_be_compared_are_refused():
         ratio_of([1, 2, 3], [1, 2])
     with pytest.raises(ValueError, match="0 blocks over 0"):
         ratio_of([], [])
+
+
+def test_the_cost_of_the_program_is_a_line_for_rest_and_contact_of_each_tree(limits, capsys):
+    limits(program_cost, SETTLE_S=0.5, ROUNDS=1)
+    assert cost(["--sensors", "5", "--round-s", "0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["at rest, 5 sensors, now", "in contact, 5 sensors, now"]
+    assert all(float(re.search(r"cpu_percent ([\d.]+)", line)[1]) > 0 for line in lines)
+    p50_us = re.search(r"p50_us ([\d.]+)", lines[1])  # none where a busy machine lost frames
+    assert p50_us is None or float(p50_us[1]) > 50

@@ -115,7 +115,7 @@ def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
 def closing(empty, tmp_path):
     """A gripper that closes on nothing, and the emulator whose cable can be pulled."""
     options = known(tmp_path)
-    command = [sys.executable, "-m", "edge.bench.emulated_buses"]
+    command = [sys.executable, str(ROOT / "tests/support/emulated_buses.py")]
     with subprocess.Popen(
         [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as emulator:
