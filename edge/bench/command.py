@@ -4,6 +4,7 @@ import argparse
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -73,12 +74,14 @@ class Page:
         stream.flush()
 
 
-def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
 
     Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
     """
-    page = Page(out, err)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
+    page, command = Page(out, err), options.typed
     try:
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)

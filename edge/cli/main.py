@@ -4,8 +4,6 @@ import contextlib
 import errno
 import importlib
 import os
-import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from typing import Final
@@ -20,10 +18,11 @@ from edge.api import (
     UsageError,
     unfinished_load,
 )
-from edge.cli.run_help import parsed_options
+from edge.cli.run_help import TABLE, parsed_options
 from edge.cli.standard_streams import guarded_streams, open_closed_streams
 from edge.terminal.argument_types import EXIT_USAGE
 
+COMMANDS: Final = (*filter(None, TABLE),)
 _EXIT_CODES: Final = {DeviceError: 3, BaselineRefusedError: 3, ModelError: 4, SinkError: 5}
 """Exit codes of errors; of all others it is that of wrong usage."""
 
@@ -62,51 +61,23 @@ def _command(arguments: Sequence[str]) -> int | None:
     """Do a command, or run without one; return its exit code, or None for 0."""
     named = bool(arguments) and not arguments[0].startswith("-")
     name, rest = (arguments[0], arguments[1:]) if named else ("", arguments)
-    if name == "bench":
-        return _bench(rest)
-    if named and name not in COMMANDS:
+    if name not in TABLE:
         from difflib import get_close_matches
 
         near = get_close_matches(name, COMMANDS, n=1)
-        meant = (
-            f"did you mean {near[0]}?" if near else f"commands are {', '.join(COMMANDS)}; to run, give options alone"
-        )
-        raise UsageError(f"no command {name!r}: {meant}")
-    options, (module, function) = parsed_options(name, rest), _PLACES[name]
-    return getattr(importlib.import_module(module), function)(options, sys.stdout, sys.stderr)
-
-
-def _bench(arguments: Sequence[str]) -> int:
+        all_ = f"commands are {', '.join(COMMANDS)}; to run, give options alone"
+        raise UsageError(f"no command {name!r}: {f'did you mean {near[0]}?' if near else all_}")
+    options = parsed_options(name, rest)
+    module, _, function = TABLE[name].does.partition(":")
     try:
-        import edge.bench  # noqa: F401
+        does = getattr(importlib.import_module(module), function)
     except ModuleNotFoundError as error:
+        if name != "bench":
+            raise
         raise UsageError(
             "edge-sr bench is in another wheel, which is not installed: install tactile-edge-sr-train as well"
         ) from error
-
-    options = parsed_options("bench", arguments)
-    from edge.bench.command import run
-
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
-    return run(options, shlex.join(["edge-sr", "bench", *arguments]), sys.stdout, sys.stderr)
-
-
-_RUN: Final = "edge.cli.run_command"
-_PLACES: Final = {
-    "": (_RUN, "follow"),
-    "demo": (_RUN, "show_demo"),
-    "record": (_RUN, "record"),
-    "replay": (_RUN, "replay"),
-    "convert": ("edge.cli.convert_command", "run"),
-    "map": (_RUN, "map_object"),
-    "models": ("edge.cli.listings", "show_models"),
-    "baseline": (_RUN, "baseline"),
-    "devices": ("edge.cli.listings", "show_devices"),
-    "doctor": ("edge.doctor.command", "run"),
-}
-"""Module and function of each command, which is loaded when it is used."""
-COMMANDS: Final = (*filter(None, _PLACES), "bench")
+    return does(options, sys.stdout, sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Help of `edge-sr` and its commands, their parsers, and the options of a run as they were typed."""
 
 import argparse
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final, NamedTuple
 
@@ -9,20 +10,27 @@ from edge.cli import option_tables as of
 from edge.cli.option_tables import Group
 from edge.errors import UsageError
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
+from edge.sinks.registry import FORMS as SINKS
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import Parser
+from firmware_bridge.links.registry import FORMS as SOURCES
 
 
-class Help(NamedTuple):
-    """Help of a command: what follows its name, what it does, its options, and what stands below them."""
+class Command(NamedTuple):
+    """Command: what does it, and its help: what follows its name, what it does, its options, and what is below them."""
 
+    does: str  # module and function, loaded when it is used
     usage: str
     about: str
     groups: tuple[Group, ...]
-    more: str
+    more: str = ""
 
 
-_RUN: Final = """\
+def _lines(forms: Mapping[str, str]) -> str:
+    return "".join(f"{form}\t{meaning}\n" for form, meaning in forms.items())
+
+
+_RUN: Final = f"""\
 commands (each has its own --help):
 demo\tan emulated sensor; no hardware needed
 devices\tlist what is plugged in, and what to type to read it
@@ -36,31 +44,17 @@ models\tlist the bundled models
 bench\tmeasure error and run time on this machine
 
 sources, SRC (found by itself if one adapter is plugged in):
-slcan:/dev/ttyUSB0[@BAUD]\tserial CAN adapter, such as VScom or CANable
-slcan:serial=D30BL366[@BAUD]\tthe same, by its serial number
-gs_usb[:SERIAL]\tUSB CAN adapter with candleLight firmware
-gs_usb:BUS-PORT\tthe one at this bus and socket, such as gs_usb:1-2.3
-can:socketcan:can0\tadapter that python-can knows
-xela-server:ws://HOST[:5000]\tthe vendor's server
-replay:FILE[,FILE]\trecording: .mcap, .npz or .csv
-demo[:loop]\temulated sensor
-
+{_lines(SOURCES)}
 outputs, S:
-status\tone live line (default on a terminal)
-jsonl:FILE\tone JSON record a line; jsonl:- is stdout
-mcap:FILE.mcap\trecording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it
-shm:NAME\tlatest values in shared memory
-zenoh:KEY\tmessages over zenoh; to a router with ?connect=tcp/HOST:7447
-ros2:TOPIC\tROS 2 messages
-
+{_lines(SINKS)}
 keys on a terminal:
 r\tforget earlier taps, as for a new object
 z\tzero again: the pad must be free; Z even in contact
 
 lines on stdin, where it is no terminal:
-{"cmd": "reset"}\tlike key r
-{"cmd": "zero"}\tlike key z; "sensor": "4" for one sensor, "force": true even in contact
-{"cmd": "pose", "x_mm": 1, "y_mm": 0}\twhere the pad is
+{{"cmd": "reset"}}\tlike key r
+{{"cmd": "zero"}}\tlike key z; "sensor": "4" for one sensor, "force": true even in contact
+{{"cmd": "pose", "x_mm": 1, "y_mm": 0}}\twhere the pad is
 
 The signal SIGUSR1 is like key z.
 
@@ -113,7 +107,8 @@ examples:
 
 _CONVERT: Final = """\
 Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
-several a file each). What the new file cannot hold is printed. Nothing is computed, and no file is replaced.
+several a file each); the last two are made of an .mcap. What the new file cannot hold is printed. Nothing is \
+computed, and no file is replaced.
 
 examples:
   edge-sr convert press.mcap press.npz
@@ -165,61 +160,78 @@ examples:
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """
 
-HELP: Final = {
-    "": Help(
+TABLE: Final = {
+    "": Command(
+        "edge.cli.run_command:follow",
         "[options]\n       edge-sr COMMAND [options]",
         "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
         "pattern: a fine map of how deep an object presses into the pad, in mm.",
         of.RUN,
         _RUN,
     ),
-    "demo": Help(
+    "demo": Command(
+        "edge.cli.run_command:show_demo",
         "[options]",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (of.DEMO, *of.RESULTS),
         "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
     ),
-    "record": Help(
+    "record": Command(
+        "edge.cli.run_command:record",
         "FILE [options]",
         "Runs like edge-sr, and records scans, patterns and events.",
         (of.RECORD, *of.RUN),
         _RECORD,
     ),
-    "replay": Help("FILE... [options]", "Computes the patterns of a recording.", (of.REPLAY, *of.RESULTS), _REPLAY),
-    "convert": Help(
+    "replay": Command(
+        "edge.cli.run_command:replay",
+        "FILE... [options]",
+        "Computes the patterns of a recording.",
+        (of.REPLAY, *of.RESULTS),
+        _REPLAY,
+    ),
+    "convert": Command(
+        "edge.cli.convert_command:run",
         "FILE NEW",
         "Writes a recording in another format: that of the ending of the new name.",
         (of.CONVERT,),
         _CONVERT,
     ),
-    "map": Help(
+    "map": Command(
+        "edge.cli.run_command:map_object",
         "[options]",
         "Runs like edge-sr, and fuses the patterns into a map of the object.",
         (of.MAP, *of.RUN),
         _MAP,
     ),
-    "models": Help("[--measure]", "Lists the bundled models, with their error.", (of.MODELS,), ""),
-    "baseline": Help(
+    "models": Command(
+        "edge.cli.listings:show_models", "[--measure]", "Lists the bundled models, with their error.", (of.MODELS,)
+    ),
+    "baseline": Command(
+        "edge.cli.run_command:baseline",
         "--out FILE",
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
         of.BASELINE,
         _BASELINE,
     ),
-    "devices": Help(
+    "devices": Command(
+        "edge.cli.listings:show_devices",
         "[--json]",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
         (of.DEVICES,),
         "Exit code: 3 if there is no adapter.",
     ),
-    "doctor": Help(
+    "doctor": Command(
+        "edge.doctor.command:run",
         "[options]",
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
         of.DOCTOR,
         _DOCTOR,
     ),
-    "bench": Help(
+    "bench": Command(
+        "edge.bench.command:run",
         "[options]",
         "Measures error against run time of the bundled models and of methods without a network.",
         (of.BENCH,),
@@ -237,7 +249,7 @@ _FIXED: Final[dict[str, dict[str, Any]]] = {
 
 def parser(command: str = "") -> argparse.ArgumentParser:
     """Return the parser of a command, or of `edge-sr` without one."""
-    name, help_ = f"edge-sr {command}".rstrip(), HELP[command]
+    name, help_ = f"edge-sr {command}".rstrip(), TABLE[command]
     made = Parser(prog=name, usage=f"{name} {help_.usage}", description=help_.about, epilog=help_.more)
     for listed in help_.groups:
         group = made if listed.title is None else made.add_argument_group(listed.title, listed.about)
@@ -252,6 +264,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the options of a command, and check of a run all that can be checked before anything is opened."""
     options = parser(command).parse_args(arguments)
+    options.typed = shlex.join(["edge-sr", command, *arguments])
     if "sink" not in options:
         return options
     for text in options.sink:

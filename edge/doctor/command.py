@@ -15,7 +15,7 @@ from typing import TextIO
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
-from edge.doctor.write_sensor_file import check_writable, keep
+from edge.doctor.write_sensor_file import check_writable, keep, refuse_device
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
@@ -185,8 +185,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     with stop_on_signals() as stop:
         link, known, watched = prepare(options.source, known, before, options.rate_hz)
         emulated = "emulated" in (link.kind, link.origin)
-        if options.out is not None:
-            check_writable(options.out, known, emulated=emulated)
+        if options.out is not None and emulated:
+            refuse_device(options.out, known)
         visit = Visit(options, link, known, err, stop)
         start_s = time.monotonic()
         failed: BridgeError | None = None

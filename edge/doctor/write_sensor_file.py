@@ -15,26 +15,28 @@ from firmware_bridge.zeroing.baseline import Baseline
 _AS_WIRED = frozenset({"mounting"})
 
 
-def check_writable(path: Path, known: SensorFile, *, emulated: bool = False) -> None:
+def check_writable(path: Path, known: SensorFile) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
     It is a new one, or that of `known`, of which all is kept that is not measured again. Raises SensorFileError for
-    another, for one that cannot be written, and for that of a device where the sensor is `emulated`.
+    another, and for one that cannot be written.
     """
     try:
         in_place.check_writable(path)
     except OSError as error:
         why = error.strerror or error
         raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
-    if not path.exists():
-        return
-    if known.path is None or known.path.resolve() != path.resolve():
+    if path.exists() and (known.path is None or known.path.resolve() != path.resolve()):
         raise SensorFileError(
             f"{path}: left as it is, because what it holds would be lost: pass --sensor {path} as well, to keep what "
             "is not measured again, or another --out"
         )
+
+
+def refuse_device(path: Path, known: SensorFile) -> None:
+    """Raise a SensorFileError where an emulated sensor would be written into the file of a device."""
     measured = (one for one in known.sensors.values() if one.baseline is not None or "mounting" not in one.assumed)
-    if emulated and not all(one.emulated for one in measured):
+    if path.exists() and not all(one.emulated for one in measured):
         raise SensorFileError(
             f"{path}: left as it is, because it is of a device, and this one is emulated: another --out"
         )

@@ -161,7 +161,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
         asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
         done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     assert "taxel order: turned" in done.out, done.out
-    shown = (done.out + done.err).replace(str(file), "").replace(emulator.port, "").splitlines()
+    shown = re.sub(re.escape(str(file)) + r"|\x1b\[K|" + emulator.port, "", done.out + done.err).splitlines()
     # One word alone may be longer: the path of the latency timer, which a reader that comes late is told of.
     assert [line for line in shown if len(line) > 40 and len(line.split()) > 1] == []
     assert f"python -m train.own {file} --recordings FOLDER --out mine" in " ".join(done.out.split())
