@@ -23,7 +23,6 @@ from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.terminal.progress_bar import progress
 
-STARTS: Final = 5  # number of starts whose median is the start-up
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
 _Thing = TypeVar("_Thing")
 
@@ -164,7 +163,8 @@ def _run_times(
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
     for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
         job = {"subject": subject._asdict(), "threads": count}
-        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count)
+        starts = 5 if options.ticks >= 300 else 1
+        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count, starts)
         answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
@@ -195,14 +195,14 @@ def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
     return json.loads(output)
 
 
-def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
-    """Return the median time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
+def start_up(job: dict[str, Any], threads: int = 1, starts: int = 5) -> tuple[float, float | None]:
+    """Return the time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
 
-    The memory is the most resident until then, median, in [MB]; None where the system does not show it.
+    Both are medians of so many starts; the memory is the most resident until then, in [MB], None where it is not shown.
     """
     took_ms: list[float] = []
     resident_mb: list[float] = []
-    for _ in range(STARTS):
+    for _ in range(starts):
         spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
         answer = measured(job, threads)
         took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)

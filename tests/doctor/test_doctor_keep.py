@@ -10,7 +10,6 @@ from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
-from edge.cli import main as cli
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
@@ -136,16 +135,6 @@ class TestUse:
             with Source(FakeLink([], kind=kind), sensor_file=EMULATED):
                 pass
         refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
-
-    @pytest.mark.parametrize("command", [["doctor", "--drift-s", "0.1"], ["baseline", "--out", "zero.json"], []])
-    def test_on_the_command_line_it_is_2_and_one_line(self, tmp_path, monkeypatch, capsys, command):
-        monkeypatch.chdir(tmp_path)
-        save_sensor_file(tmp_path / "s.toml", EMULATED)
-        for module in ("edge.api", "edge.doctor.examine"):
-            monkeypatch.setattr(f"{module}.links_to", lambda *_, **__: [FakeLink([], kind="device")])
-        code = cli.main([*command, "--sensor", "s.toml"])
-        lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
-        assert code == 2 and len(lines) == 1
 
 
 WELL = as_scans(healthy_counts(200))

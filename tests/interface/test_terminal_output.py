@@ -23,7 +23,7 @@ from hypothesis.extra.numpy import arrays
 
 from edge.cli import main as cli
 from edge.terminal import progress_bar
-from edge.terminal.heatmap import HALF_BLOCK, SHADES, Panel, choose_palette, draw, resample
+from edge.terminal.heatmap import HALF_BLOCK, Panel, choose_palette, draw, resample
 from edge.terminal.progress_bar import progress
 
 RATE = re.compile(r"scan/s|s/scan")
@@ -175,24 +175,6 @@ def test_no_line_is_wider_than_the_terminal(palette):
         assert max(map(len, visible(draw(panels, columns, palette)))) <= min(columns, 124)
 
 
-def test_side_by_side_where_there_is_room_else_below_each_other():
-    panels = [panel(title=name) for name in ("one", "two", "three")]
-    wide, narrow = visible(draw(panels, 76, "plain")), visible(draw(panels, 75, "plain"))
-    assert wide[0].split() == ["one", "two", "three"] and len(wide) == 1 + 12 + 1
-    assert [line.strip() for line in narrow if line.strip() in ("one", "two", "three")] == ["one", "two", "three"]
-    assert len(narrow) == 3 * (1 + 20 + 1) + 2
-
-
-def test_plain_is_ascii_denser_where_larger():
-    values = np.array([[0.0, 0.25], [0.5, 1.0]])
-    lines = draw([panel(values)], 40, "plain").splitlines()
-    assert "".join(lines).isascii() and "\x1b" not in "".join(lines)
-    body = [line.ljust(40) for line in lines[1:-1]]
-    assert len(body) == 20
-    corners = [body[0][0], body[0][-1], body[-1][0], body[-1][-1]]
-    assert corners == [SHADES[0], SHADES[2], SHADES[5], SHADES[-1]]
-
-
 @pytest.mark.parametrize("palette", ["truecolor", "256"])
 def test_a_cell_shows_the_upper_pixel_over_the_lower(palette):
     values = np.zeros((40, 40))
@@ -200,14 +182,6 @@ def test_a_cell_shows_the_upper_pixel_over_the_lower(palette):
     line = draw([panel(values)], 40, palette).splitlines()[1]
     low, high = ("2;68;1;84", "2;253;231;37") if palette == "truecolor" else ("5;53", "5;220")
     assert line == f"\x1b[38;{high};48;{low}m{HALF_BLOCK * 40}\x1b[0m"
-
-
-@pytest.mark.parametrize(
-    ("high", "text"), [(0.0123, "0.0123"), (1.234, "1.23"), (99.96, "100"), (1613.4, "1613"), (12345.6, "12346")]
-)
-def test_the_scale_names_both_ends_shortly_and_the_unit(high, text):
-    last = draw([panel(high=high)], 40, "plain").splitlines()[-1]
-    assert last.startswith("0 ") and last.endswith(f"{SHADES[-1]} {text} mm") and len(last) == 40
 
 
 @pytest.mark.parametrize(

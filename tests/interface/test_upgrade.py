@@ -67,14 +67,14 @@ def test_a_file_that_is_replaced_stays_and_the_user_reads_where(tmp_path, capsys
     former = (FILES / "zero.json").read_bytes()
     zero, known = tmp_path / "zero.json", tmp_path / "sensor.toml"
     zero.write_bytes(former)
-    known.write_text("[no sensor file")
+    known.write_bytes((FILES / "sensor.toml").read_bytes())
     recording = ("--source", f"replay:{FILES / 'press.npz'}")
     assert cli.main(["baseline", *recording, "--out", str(zero), "--scans", "30"]) == 0
     assert f"the former file is now {zero}.bak" in capsys.readouterr().out
     assert (tmp_path / "zero.json.bak").read_bytes() == former
-    cli.main(["doctor", *recording, "--drift-s", "1.05", "--out", str(known)])
+    cli.main(["doctor", *recording, "--drift-s", "1.05", "--sensor", str(known), "--out", str(known)])
     assert f"the former file is now {known}.bak" in capsys.readouterr().out
-    assert (tmp_path / "sensor.toml.bak").read_text() == "[no sensor file"
+    assert (tmp_path / "sensor.toml.bak").read_bytes() == (FILES / "sensor.toml").read_bytes()
 
 
 GRIP = np.zeros((3, 4, 4))
