@@ -18,7 +18,7 @@ from edge_samples import FakeLink
 
 from edge.api import USPA44, load_sensor_file
 from edge.cli import main as cli
-from edge.cli.run_help import parser
+from edge.cli.main import parser
 from edge.doctor import command, examine
 from edge.doctor.guided_press import CORNERS, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator

@@ -12,7 +12,7 @@ from trust_samples import make_posed_trust
 from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
 from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
-from edge.cli.run_help import parsed_options
+from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
