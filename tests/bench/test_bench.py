@@ -197,10 +197,6 @@ def test_a_head_that_lacks_or_is_damaged_is_none(page):
     assert read_provenance(page) is None
 
 
-def test_a_report_just_made_is_fresh(made, tmp_path, capsys):
-    assert listed(tmp_path, made, capsys) == f"mine.md: fresh ({made.commit})\n"
-
-
 @pytest.mark.parametrize(
     ("change", "why"),
     [
@@ -212,12 +208,6 @@ def test_a_report_just_made_is_fresh(made, tmp_path, capsys):
 def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys, change, why):
     line = listed(tmp_path, replace(made, **change), capsys, "load/mine.md")
     assert line == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
-
-
-def test_a_report_without_a_head_is_named(tmp_path, capsys):
-    (tmp_path / "old.md").write_text("# old\n")
-    reports.main([str(tmp_path)])
-    assert capsys.readouterr().out == "old.md: no head: make it again with its command\n"
 
 
 def test_every_report_has_a_head():

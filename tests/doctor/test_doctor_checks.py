@@ -8,7 +8,6 @@ from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, t
 from edge_samples import ROOT
 
 from edge.doctor.examine import Watched, judge
-from edge.doctor.findings import Finding, page
 from edge.doctor.link_checks import LineFacts, capacity_hz, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
@@ -273,21 +272,6 @@ class TestIdMap:
         finding = check_id_map(frozenset(ids), model, half_silent)
         assert finding is not None and finding.verdict == verdict and words in finding.measured
         assert check_id_map(frozenset(), model, half_silent) is None, "a link without ids says nothing of maps"
-
-
-def test_the_page_fits_any_width_and_tells_verdict_norm_and_remedy():
-    findings = [
-        Finding("link", "ok", "fine"),
-        Finding(
-            "noise", "wrong", "9.9 counts", "2 counts", "keep the motors away from the pad, and keep it still", "4"
-        ),
-        Finding("load", "not known", "nothing to compare with", sensor="4"),
-    ]
-    for columns in (40, 80):
-        text = page(findings, columns)
-        assert max(map(len, text.splitlines())) <= columns
-    assert text.splitlines()[0] == "link" and "WRONG noise: 9.9 counts (norm: 2 counts)" in text
-    assert "-> keep the motors away" in text and "?     load: nothing" in text
 
 
 def test_each_finding_has_a_row():

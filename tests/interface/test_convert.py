@@ -117,12 +117,6 @@ def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp
     assert not load_recording(files["left/6"]).poses
 
 
-def test_what_a_file_is_called_cannot_colour_the_terminal(tmp_path, capsys):
-    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=100)
-    assert convert(path, tmp_path / "\x1b[31mred.mcap") == 0
-    assert "red.mcap: 20 scans" in (said := capsys.readouterr().out) and "\x1b" not in said
-
-
 def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):
     scans = [make_scan(number, sensor=name) for number in range(3) for name in ("a/b", "a-b")]
     path = record_into(tmp_path / "press.mcap", make_results(scans))

@@ -11,7 +11,7 @@ from trust_samples import make_posed_trust
 
 from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
-from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
+from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore
 from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
@@ -142,21 +142,6 @@ def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
     assert set(foreign[foreign > 0]) == {1}, "of the foreign surface there is one tap"
     assert set(again[again > 0]) == {5}, "the first surface's four serve its fifth tap, without the foreign one"
     assert max(used[scene == 1]) == 1
-
-
-def test_the_table_has_a_line_a_tap_and_says_what_the_taps_are_worth(recording):
-    scores = [
-        dataclasses.replace(s, psnr_db=-12.301, rmse_percent=99.99, alone_percent=88.88, pose=(-7.05, 2.35, -15))
-        for s in play(recording).scores()
-    ]
-    *lines, verdict = score_table(scores).splitlines()
-    assert len(lines) == 2 + 2 and max(map(len, lines)) <= 50
-    assert "did not fall: 99.99 % of full scale, 88.88 % with it alone" in verdict and "rose" not in verdict
-    scores[1] = dataclasses.replace(scores[1], rmse_percent=88, alone_percent=99)
-    assert "error fell: 88.00" in score_table(scores)
-    scores[1] = dataclasses.replace(scores[1], rmse_percent=99.995)
-    assert "rose at tap 2" in score_table(scores)
-    assert score_table(scores[:1]).splitlines()[-1].startswith("Each pattern is of one tap")
 
 
 @pytest.fixture(scope="module")

@@ -252,17 +252,6 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
     assert set(gripper.done) == {"stop"} and grip.why.startswith("it never began: ")
 
 
-@pytest.mark.parametrize(
-    "wrong", ["--area-mm2=nan", "--most-counts=-1", "--oldest-ms=0", "--duration-s=much", "--area-mm2=inf"]
-)
-def test_a_limit_is_a_positive_number(stop_on_area, argv, capsys, wrong):
-    argv(["stop_on_area.py", "--area-mm2", "20", wrong])
-    with pytest.raises(SystemExit, match="2"):
-        stop_on_area.main()
-    limit, _, value = wrong.partition("=")
-    assert f"argument {limit}: invalid positive value: '{value}'" in capsys.readouterr().err
-
-
 class Live(FakeLink):
     """Link of scans of this moment, with notices after ten reads."""
 
