@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_samples import write_recording
-from edge_samples import BASELINE, ROOT, write_model
+from edge_samples import BASELINE, ROOT, wait_for, write_model
 
 from edge.cli.user_commands import user_commands
 from edge.pipeline.commands import RESET, Command, CommandLines, Commands, carry_out, read_stdin
@@ -26,8 +26,14 @@ OPEN = []
 def lines_of(descriptor):
     commands = Commands()
     OPEN.append(CommandLines(commands, descriptor))
-    commands.ask(OPEN[-1].read)
     return commands
+
+
+def taken(commands, count):
+    """Return the commands once so many came or were refused."""
+    got = []
+    wait_for(lambda: got.extend(commands.poll()) or len(got) + commands.refused >= count)
+    return got
 
 
 def polled_stdin():
@@ -49,14 +55,10 @@ def pipe():
 
 def test_commands_come_as_lines_however_they_are_cut(pipe):
     commands = lines_of(pipe[0])
-    assert commands.poll() == []
-    for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"'):
+    for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"', b':"reset"}\r\n'):
         os.write(pipe[1], piece)
-        got = commands.poll()
-    assert got == [RESET, RESET]
-    os.write(pipe[1], b':"reset"}\r\n')
-    assert commands.poll() == [RESET]
-    assert commands.refused == 0
+        time.sleep(0.01)
+    assert taken(commands, 3) == [RESET] * 3 and commands.refused == 0
 
 
 @pytest.mark.parametrize(
@@ -73,29 +75,22 @@ def test_commands_come_as_lines_however_they_are_cut(pipe):
 def test_other_lines_are_counted(pipe, line):
     commands = lines_of(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
-    assert commands.poll() == [RESET]
-    assert commands.refused == 1
+    assert taken(commands, 2) == [RESET] and commands.refused == 1
 
 
 def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
     commands = lines_of(pipe[0])
     for _ in range(20):
         os.write(pipe[1], b"x" * 4000)
-        assert commands.poll() == []
     os.write(pipe[1], b'{"cmd": "reset"}\n{"cmd": "reset"}\n')
-    assert commands.poll() == [RESET]
-    assert commands.refused == 1
+    assert taken(commands, 2) == [RESET] and commands.refused == 1
 
 
 def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
     commands = lines_of(pipe[0])
     os.write(pipe[1], b'{"cmd": "zero", "sensor": null, "force": true}')
-    assert commands.poll() == []
     os.close(pipe[1])
-    assert commands.poll() == [Command("zero", None, True)]
-    assert commands.poll() == []
-    os.close(pipe[0])
-    assert commands.poll() == [], "a pipe that has ended is not touched again"
+    assert taken(commands, 1) == [Command("zero", None, True)]
 
 
 def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
