@@ -322,16 +322,8 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                 received = ", ".join(f"{name} {count}" for name, count in source.counters().items() if count)
                 print(f"received: {received or 'nothing'}", file=sys.stderr)
                 if source.unix_offset_ns and statistics.scans:
-                    print(recorded_text(source.unix_time_s(), time.time()), file=sys.stderr)
-
-
-def recorded_text(made_s: float, now_s: float) -> str:
-    """Return when a recording was made, both in [s] since 1970: a pad wears, and its rest level moves."""
-    days = max(now_s - made_s, 0.0) / 86_400
-    ago = (
-        f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
-    )
-    return f"recorded on {time.strftime('%Y-%m-%d at %H:%M', time.localtime(made_s))}, {ago}"
+                    made = time.localtime(source.unix_time_s())  # a pad wears, and its rest level moves
+                    print(time.strftime("recorded on %Y-%m-%d at %H:%M", made), file=sys.stderr)
 
 
 def _tell(line: str) -> None:

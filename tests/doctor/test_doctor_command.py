@@ -109,7 +109,7 @@ def look(port, *arguments, drift_s=0.7, people=()):
     return SimpleNamespace(code=code, out=out.getvalue(), err=err.getvalue())
 
 
-BY_THE_CLOCK = {"rate", "lost scans", "latency timer", "torn scans"}
+BY_THE_CLOCK = {"rate", "lost scans", "torn scans"}
 """Findings that a busy machine makes as well as a bad sensor: not asserted where nothing is wrong with them."""
 
 
@@ -132,7 +132,7 @@ def test_a_healthy_sensor_is_0_and_ok_in_every_line():
     told = {"stopped": False, "kind": "emulated", "sensor_file": None, "id_map": "uSPa44"}
     assert document | told == document
     names = [one["name"] for one in document["findings"]]
-    of_link = "link, baud rate, latency timer, id map"
+    of_link = "link, baud rate, id map"
     of_sensor = "rate, torn scans, lost scans, silent taxels, stuck taxels, noise, rest levels, drift, baseline, load"
     assert names == f"{of_link}, {of_sensor}, guided press".split(", ")
     assert "stdin is not a terminal" in document["findings"][-1]["remedy"]
@@ -162,8 +162,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
         done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     assert "taxel order: turned" in done.out, done.out
     shown = re.sub(re.escape(str(file)) + r"|\x1b\[K|" + emulator.port, "", done.out + done.err).splitlines()
-    # One word alone may be longer: the path of the latency timer, which a reader that comes late is told of.
-    assert [line for line in shown if len(line) > 40 and len(line.split()) > 1] == []
+    assert [line for line in shown if len(line) > 40] == []
     assert f"python -m train.own {file} --recordings FOLDER --out mine" in " ".join(done.out.split())
     known = load_sensor_file(file)
     entry = known.sensors["4"]
