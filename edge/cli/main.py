@@ -105,7 +105,7 @@ def parser(command: str = "") -> argparse.ArgumentParser:
 def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the options of a command, and check of a run all that can be checked before anything is opened."""
     options = parser(command).parse_args(arguments)
-    options.typed = shlex.join(["edge-sr", command, *arguments])
+    options.typed = shlex.join([*f"edge-sr {command}".split(), *arguments])
     if "sink" not in options:
         return options
     for text in options.sink:

@@ -12,7 +12,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 END_S: Final = 5.0  # time from the signal to the end by force
 EXIT_FORCED: Final = 6
@@ -62,16 +62,18 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 
 def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
-    """End the process by force if it goes on for END_S after one of these signals."""
-    terminal = _terminal_settings()
-    while received := waking.recv(64):
-        if not set(numbers) & set(received):
-            continue
-        waking.settimeout(END_S)
+    """End the process by force if it goes on for END_S after one of these signals, and after any that come later."""
+    terminal, stopping = _terminal_settings(), False
+    while True:
         try:
-            waking.recv(64)
+            received = waking.recv(64)
         except TimeoutError:
             _force(terminal)
+        if not received:
+            return
+        if not stopping and set(numbers) & set(received):
+            stopping = True
+            waking.settimeout(END_S)
 
 
 def _terminal_settings() -> list[Any] | None:
@@ -82,7 +84,7 @@ def _terminal_settings() -> list[Any] | None:
     return None
 
 
-def _force(terminal: list[Any] | None) -> None:
+def _force(terminal: list[Any] | None) -> NoReturn:
     if terminal is not None:  # a shell does not restore it after a program that exits
         import termios
 
