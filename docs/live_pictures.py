@@ -12,14 +12,14 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 from edge.inference.bundled import demo_recording
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
 from train.demo import MAGNET_SCENE
@@ -95,13 +95,13 @@ def look(browser: Browser, url: str, size: tuple[int, int], scheme: str) -> Page
     return page
 
 
-def keep(page: Page, name: str, bar: Progress) -> None:
+def keep(page: Page, name: str, bar: Any) -> None:
     """Save a screenshot of the page."""
     path = PICTURES / f"live-{name}.png"
     page.screenshot(path=path)
-    bar.advance()
-    with bar.aside():
-        sys.stdout.write(f"{path}: {path.stat().st_size / 1024:.0f} KB\n")
+    bar.update()
+    bar.clear()
+    sys.stdout.write(f"{path}: {path.stat().st_size / 1024:.0f} KB\n")
 
 
 def await_hold(page: Page) -> None:
@@ -119,7 +119,7 @@ def main() -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         sync_playwright() as engine,
-        Progress("pictures", TAKEN, "picture") as bar,
+        progress("pictures", TAKEN, "picture") as bar,
     ):
         browser = engine.chromium.launch(executable_path=shutil.which("chromium"))
         with emulator(Path(folder), counts) as bus, live_page(bus.port) as (run, url):

@@ -20,8 +20,7 @@ from argparse_manpage.manpage import Manpage
 from hatchling.builders.wheel import WheelBuilder
 
 from edge import __version__
-from edge.cli.main import COMMANDS
-from edge.cli.run_help import parser
+from edge.cli.main import COMMANDS, parser
 from edge.inference.bundled import bundled_models
 
 ROOT: Final = Path(__file__).resolve().parents[1]

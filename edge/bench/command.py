@@ -4,13 +4,14 @@ import argparse
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any, Final, TextIO, TypeVar
 
 import numpy as np
 
@@ -18,20 +19,68 @@ from edge.bench import contenders
 from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
 from edge.bench.contenders import Subject
 from edge.bench.provenance import provenance, this_machine, with_head
-from edge.bench.system import BenchError, Page, line, show_system
 from edge.errors import EdgeError, UsageError
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
+from edge.terminal.progress_bar import progress
 
-STARTS: Final = 5  # number of starts whose median is the start-up
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
+_Thing = TypeVar("_Thing")
 
 
-def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> int:
+class BenchError(EdgeError, RuntimeError):
+    """Error of a measurement that could not be made, or of a page that cannot be written."""
+
+
+class Page:
+    """Page of `lines` that are shown at once and kept; a progress bar makes room for them."""
+
+    def __init__(self, out: TextIO, err: TextIO) -> None:
+        self.lines: list[str] = []
+        self._out, self._err = out, err
+        self._bar: Any = None
+
+    def say(self, text: str) -> None:
+        """Show a line, or several, and keep it."""
+        self.lines.append(text)
+        self._write(self._out, text)
+
+    def row(self, cells: Iterable[str]) -> None:
+        """Show a row of the table, and keep it."""
+        self.say(f"| {' | '.join(cells)} |")
+
+    def section(self, title: str, text: str, columns: Sequence[str]) -> None:
+        """Begin a section and its table."""
+        self.say(f"\n## {title}\n\n{text}\n")
+        self.row(columns)
+        self.say("|---" * len(columns) + "|")
+
+    def warn(self, text: str) -> None:
+        """Show a line on stderr."""
+        self._write(self._err, f"edge-sr: {text}")
+
+    def tracked(self, things: Sequence[_Thing], what: str) -> Iterator[_Thing]:
+        """Yield the things, one after the other, with a progress bar."""
+        with progress(what, len(things), "row", stream=self._err) as self._bar:
+            for thing in things:
+                yield thing
+                self._bar.update()
+        self._bar = None
+
+    def _write(self, stream: TextIO, text: str) -> None:
+        if self._bar is not None:
+            self._bar.clear()
+        stream.write(text + "\n")
+        stream.flush()
+
+
+def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     """Measure, show on `out` and write, with progress and warnings on `err`; returns the exit code.
 
     Raises EdgeError where an input cannot be used or a measurement failed; those so far are written first.
     """
-    page = Page(out, err)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
+    page, command = Page(out, err), options.typed
     try:
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
@@ -40,7 +89,6 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
     frozen = load_frozen_set(contenders.FROZEN_FILE)
     everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
-    system = options.system or options.sensors is not None or options.against is not None
     threads = sorted(set(options.threads))
     # With fewer p99.9 rests on the longest few.
     few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
@@ -51,12 +99,9 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     )
     lines: list[dict[str, Any]] = []
     try:
-        if system:
-            lines += show_system(options.ticks, options.sensors or 1, options.against, page)
-        else:
-            errors = _errors(everyone, frozen, lines, page)
-            _run_times(everyone, threads, options, frozen, lines, page)
-            _front(errors, lines, threads[0], page)
+        errors = _errors(everyone, frozen, lines, page)
+        _run_times(everyone, threads, options, frozen, lines, page)
+        _front(errors, lines, threads[0], page)
     except KeyboardInterrupt:
         kept = f": what was measured is in {options.out}" if options.out else ""
         page.warn(f"bench stopped before its end{kept}")
@@ -64,7 +109,7 @@ def run(options: argparse.Namespace, command: str, out: TextIO, err: TextIO) -> 
     finally:
         if lines and options.out is not None:  # an earlier bench is not replaced by an empty one
             models = [Path(subject.path) for subject in everyone if subject.path]
-            _write(options.out, command, page, lines, models, system=system)
+            _write(options.out, command, page, lines, models)
     return 0
 
 
@@ -78,19 +123,18 @@ def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str
     page.section("Error", text, (*columns, "force error %"))
     rows: list[ErrorRow] = []
     for subject in page.tracked(everyone, "error"):
-        page.progress(f"error of {subject.name}")
         try:
             for row in error_rows(subject, frozen):
                 rows.append(row)
                 lines.append({"method": row.name, "taps_given": row.given} | row.error)
-                page.say(_error_line(row.name, row.given, row.error))
+                page.row((row.name, str(row.given), *_error_cells(row.error)))
         except EdgeError as error:
             page.warn(f"run time only of {subject.name}: {error}")
     return rows
 
 
-def _error_line(name: str, given: int, error: dict[str, float]) -> str:
-    cells = (
+def _error_cells(error: dict[str, float]) -> tuple[str, ...]:
+    return (
         f"{error['psnr_db']:.2f}",
         f"{error['rmse_percent']:.2f}",
         *(f"{error[name]:.3f}" for name in ("ssim", "ssim_global", "contact_iou")),
@@ -98,7 +142,6 @@ def _error_line(name: str, given: int, error: dict[str, float]) -> str:
         f"{100 * error['coverage_90']:.1f}" if "coverage_90" in error else "-",
         f"{error['force_percent']:.2f}",
     )
-    return line((name, str(given), *cells))
 
 
 def _run_times(
@@ -119,14 +162,14 @@ def _run_times(
     page.section("Run time", text, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
     for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
-        page.progress(f"run time of {subject.name}, {count} thread{'s' * (count > 1)}")
         job = {"subject": subject._asdict(), "threads": count}
-        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count)
+        starts = 5 if options.ticks >= 300 else 1
+        start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count, starts)
         answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
         paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
         cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}", f"{start_up_ms:.0f}"]
-        page.say(line((subject.name, str(count), *cells, "-" if resident_mb is None else f"{resident_mb:.0f}")))
+        page.row((subject.name, str(count), *cells, "-" if resident_mb is None else f"{resident_mb:.0f}"))
         figures = {f"{how}_{figure}": times[figure] for how, times in both.items() for figure in _FIGURES}
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
         about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
@@ -152,14 +195,14 @@ def measured(job: dict[str, Any], threads: int = 1) -> dict[str, Any]:
     return json.loads(output)
 
 
-def start_up(job: dict[str, Any], threads: int = 1) -> tuple[float, float | None]:
-    """Return the median time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
+def start_up(job: dict[str, Any], threads: int = 1, starts: int = 5) -> tuple[float, float | None]:
+    """Return the time from the spawn of a process to its first pattern in [ms], imports and all, and its memory.
 
-    The memory is the most resident until then, median, in [MB]; None where the system does not show it.
+    Both are medians of so many starts; the memory is the most resident until then, in [MB], None where it is not shown.
     """
     took_ms: list[float] = []
     resident_mb: list[float] = []
-    for _ in range(STARTS):
+    for _ in range(starts):
         spawned_ns = time.monotonic_ns()  # one clock for all processes of a machine
         answer = measured(job, threads)
         took_ms.append((answer["first_ns"] - spawned_ns) / 1e6)
@@ -184,7 +227,7 @@ def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads:
     best = front([(row.error["rmse_percent"], paced_us[row.name]) for row in rows])
     for row, is_best in zip(rows, best, strict=True):
         figures = (f"{row.error['rmse_percent']:.2f}", f"{row.error['psnr_db']:.2f}", f"{paced_us[row.name]:.0f}")
-        page.say(line(("*" if is_best else "", row.name, str(row.given), *figures)))
+        page.row(("*" if is_best else "", row.name, str(row.given), *figures))
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[bool]:
@@ -192,10 +235,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
     return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
 
 
-def _write(
-    folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path], *, system: bool
-) -> None:
-    sources = [f"edge/bench/{name}.py" for name in (("system",) if system else ("accuracy", "timing"))]
+def _write(folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path]) -> None:
+    sources = ("edge/bench/accuracy.py", "edge/bench/timing.py")
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:

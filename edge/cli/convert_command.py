@@ -2,14 +2,13 @@
 
 import argparse
 from collections.abc import Iterator
-from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Final, TextIO
 
 from edge.errors import SinkError, UsageError
 from edge.pipeline.sink import RunFacts, check_new
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.poses import TimedPose
@@ -23,9 +22,7 @@ _WITHOUT: Final = {
     (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
     (".mcap", ".csv"): "all but counts, times and poses: patterns, events, baselines and the mounting",
     (".npz", ".mcap"): "what was computed (edge-sr replay computes it), the device's times, later baselines",
-    (".npz", ".csv"): "all but counts, times and poses: patterns, baselines and the mounting",
     (".csv", ".mcap"): "the time of day, which the file does not state",
-    (".csv", ".npz"): "the vendor's newtons",
 }
 """Parts of a recording that are not in the new file, by the endings of both."""
 
@@ -41,6 +38,11 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         raise UsageError(f"{target}: expected a name that ends in {', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}")
     if was == ending:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
+    if was in _ENDINGS and (was, ending) not in _WITHOUT:
+        made = source.with_suffix(".mcap").name
+        raise UsageError(
+            f"{source} becomes no {ending}: edge-sr convert {source} {made}; edge-sr convert {made} {target}"
+        )
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
     check_new(target)
@@ -87,10 +89,10 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
 def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
     """Yield the scans of a recording, each with the poses that it was made with first."""
     total = sum(len(track.counts) for track in replay.recordings[0].tracks)
-    with closing(Progress("convert", total, "scan")) as bar:
+    with progress("convert", total, "scan") as bar:
         while not replay.ended:
             for scan in replay.read(0.0):
-                bar.advance(1)
+                bar.update()
                 yield scan, replay.poses()
 
 
@@ -99,17 +101,7 @@ def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
     recording = replay.recordings[0]
     origin, geometry = recording.origin or "replay", recording.tracks[0].geometry
-    rows: Iterator[dict[str, Any]] = recorded_rows(recording.path, geometry, origin)
-    poses = recording.poses
-    if recording.path.suffix.lower() == ".csv":
-        read = list(_scans(replay))
-        facts = {"source": origin, "origin": origin}
-        rows = (
-            {"time_ns": scan.time_ns, "sensor": scan.sensor, "scan": scan.number, "counts": scan.counts} | facts
-            for scan, _ in read
-        )
-        poses = [pose for _, some in read for pose in some]
-    write_npz(path, rows, recording.mountings, poses)
+    write_npz(path, recorded_rows(recording.path, geometry, origin), recording.mountings, recording.poses)
 
 
 def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:

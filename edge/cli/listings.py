@@ -9,7 +9,7 @@ from typing import Final, TextIO
 import numpy as np
 
 from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from edge.terminal.text_wrap import columns, wrapped
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.discovery import Found, devices
@@ -68,7 +68,7 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
     """
     rng = np.random.default_rng(1)
     took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
-    with Progress("run times", took_us.size, "run") as bar:
+    with progress("run times", took_us.size, "run") as bar:
         for round_ in range(ROUNDS):
             for index, model in enumerate(models):
                 contract = model.contract
@@ -80,7 +80,7 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
                     start_ns = time.perf_counter_ns()
                     model.run(contract.scale_window(windows[tick % len(windows)]))
                     took_us[index, round_, tick] = (time.perf_counter_ns() - start_ns) / 1e3
-                bar.advance(ROUND_TICKS)  # not while it measures
+                bar.update(ROUND_TICKS)  # not while it measures
     both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
     return [(float(p50), float(p99)) for p50, p99 in both.T]
 

@@ -1,17 +1,16 @@
 """Options of `edge-sr` and its commands, one row each."""
 
+import argparse
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
-from edge.mapping.evidence import PX_PER_MM, SIZE_MM
-from edge.perception.contact_options import RuntimeOptions
+from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS
-from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
 _SETTINGS: Final[dict[Any, dict[str, Any]]] = {
     bool: {"action": "store_true"},
@@ -43,7 +42,7 @@ class Group:
 
 
 # fmt: off
-_SENSOR: Final = (
+SENSOR: Final = (
     Option("--source SRC", list, "where scans come from (default: the adapter plugged in); for two fingers repeated, "
            "as NAME=SRC; edge-sr --help lists all"),
     Option("--sensor FILE", Path, "sensor file, which edge-sr doctor writes: how the pad is wired and mounted, and its "
@@ -54,7 +53,7 @@ _SENSOR: Final = (
     Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
 )
 _READ: Final = Group("sensor",
-    *_SENSOR,
+    *SENSOR,
     Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
            "start)"),
     Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
@@ -95,72 +94,11 @@ RESULTS: Final = (
         _runtime("every_scan", bool),
     ),
 )
-PROCESSOR: Final = Group("processor",
-    Option("--realtime", bool, "run before other processes, on a processor of its own and in locked memory, as far as "
-           "permitted"),
-)
-RUN: Final = (_READ, *RESULTS, PROCESSOR)
-DEMO: Final = Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)"))
-RECORD: Final = Group("file", Option("file FILE", str, "new file, .mcap"))
-REPLAY: Final = Group("recording",
-    Option("file FILE", str, "recording, .mcap, .npz, .csv or a rosbag2 folder; of several sensors a file each, also "
-           "as FILE,FILE", nargs="*"),
-    Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
-    (Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline, instead of the recorded ones"),
-     Option("--zero", bool, "take the first 100 scans during which the pad is free and still as its baseline")),
-    Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),
-    Option("--sensor FILE", Path, "sensor file of edge-sr doctor, instead of the recorded order and axes"),
-    Option("--rate-hz R", positive, "scans a second, if the file does not state it or with --paced"),
-)
-CONVERT: Final = Group("recording",
-    Option("recording FILE", str, "recording, .mcap, .npz, .csv or a rosbag2 folder"),
-    Option("new NEW", str, "new file, .mcap, .npz or .csv"),
-    Option("--rate-hz R", positive, "scans a second of a .csv that does not state it"),
-)
-MAP: Final = Group("map",
-    Option("--out FILE", Path, "file for the layers of the map (default %(default)s)", default=Path("map.npz")),
-    Option("--png FILE", Path, "file for a picture of contact and height"),
-    Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
-    Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
-    Option("--centre-mm X Y", float, "x and y of its centre in the object's plane, in mm (default 0 0)",
-           nargs=2, default=(0.0, 0.0)),
-)
-MODELS: Final = Group(None, Option("--measure", bool, "measure the run time of each here, 1.5 s a model"))
-BASELINE: Final = (
-    Group("sensor", *_SENSOR),
-    Group("baseline",
-        Option("--out FILE", Path, "file for the baseline", required=True),
-        Option("--scans N", whole(FEWEST_RECORDED), f"scans to average (default and minimum {FEWEST_SCANS}; of a "
-               f"recording at least {FEWEST_RECORDED})"),
-        Option("--skip N", whole(0), "scans to leave out at the start (default 0)"),
-    ),
-)
-DEVICES: Final = Group(None, Option("--json", bool, "write JSON, for programs"))
-DOCTOR: Final = (
-    Group("sensor",
-        *_SENSOR,
-        Option("--baseline FILE", Path, "earlier readings of the free pad, to detect a load on it"),
-    ),
-    Group("what is measured",
-        Option("--drift-s T", positive, "seconds to measure the free, still pad (default %(default)g)", default=60.0),
-        Option("--no-press", bool, "skip the presses on the corners"),
-        Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
-    ),
-    Group("results",
-        Option("--out FILE", Path, "write the results into a sensor file"),
-        Option("--json", bool, "write one JSON document to stdout"),
-        Option("--forget-gains SENSOR", str, "remove what the sensor of this name learned from contacts from the file "
-               "of --sensor, and end"),
-    ),
-)
-BENCH: Final = Group(None,
-    Option("--out DIR", Path, "folder for bench.csv and bench.md"),
-    Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
-    Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
-    Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
-    Option("--models DIR", Path, "folder of your own models, measured as well"),
-    Option("--only NAME", str, "measure only these methods", nargs="+"),
-    Option("--system", bool, "measure the whole program only: 2 minutes with 3000 ticks"),
-    Option("--sensors N", whole(1), "measure the whole program with so many sensors (default 1)"),
-    Option("--against COMMIT", str, "measure the whole program in turn with that of another commit"),
-)
+RUN: Final = (_READ, *RESULTS)
+# fmt: on
+
+
+def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
+    """Return the flags of the runtime, each by its own name; options without a flag keep their defaults."""
+    given = vars(options)
+    return RuntimeOptions(**{name: given[name] for name in asdict(DEFAULTS) if name in given})

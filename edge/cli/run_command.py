@@ -39,7 +39,7 @@ from edge.api import (
     pump,
     save_baselines,
 )
-from edge.cli.run_help import runtime_options
+from edge.cli.option_tables import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
 from edge.pipeline.run_statistics import silence_hint
@@ -271,10 +271,6 @@ def run(
                 from edge.api import open_poses
 
                 closing.callback(open_poses(text, commands.poses).close)
-            if options.realtime:  # last, so that it does not affect what the page and the sinks have started
-                from edge.cli.realtime import realtime
-
-                closing.enter_context(realtime(_tell, source.thread_ids))
             pump(source, runtime, sinks, statistics, stop=stop, duration_s=options.duration_s, commands=commands)
         # A run that its user ends before the first scan was due is no fault of the sensor.
         if not statistics.scans and (statistics.events or not stop.is_set()):
@@ -326,16 +322,8 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                 received = ", ".join(f"{name} {count}" for name, count in source.counters().items() if count)
                 print(f"received: {received or 'nothing'}", file=sys.stderr)
                 if source.unix_offset_ns and statistics.scans:
-                    print(recorded_text(source.unix_time_s(), time.time()), file=sys.stderr)
-
-
-def recorded_text(made_s: float, now_s: float) -> str:
-    """Return when a recording was made, both in [s] since 1970: a pad wears, and its rest level moves."""
-    days = max(now_s - made_s, 0.0) / 86_400
-    ago = (
-        f"{days:.0f} days ago" if days >= 2 else f"{24 * days:.0f} h ago" if days >= 1 / 24 else "within the last hour"
-    )
-    return f"recorded on {time.strftime('%Y-%m-%d at %H:%M', time.localtime(made_s))}, {ago}"
+                    made = time.localtime(source.unix_time_s())  # a pad wears, and its rest level moves
+                    print(time.strftime("recorded on %Y-%m-%d at %H:%M", made), file=sys.stderr)
 
 
 def _tell(line: str) -> None:

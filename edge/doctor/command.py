@@ -14,12 +14,12 @@ from typing import TextIO
 
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.findings import Finding, page, summary, worst
-from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_press
-from edge.doctor.write_sensor_file import check_writable, keep
+from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
+from edge.doctor.write_sensor_file import check_writable, keep, refuse_device
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
-from edge.terminal.progress_bar import SECONDS, Progress
+from edge.terminal.progress_bar import progress
 from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
@@ -32,35 +32,29 @@ from firmware_bridge.zeroing.baseline import deformation
 
 
 class FeltLine:
-    """Line that is rewritten in place on a terminal; nothing is written elsewhere."""
+    """Line of the load on the pad that is rewritten in place on a terminal; nothing is written elsewhere."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = drawn(stream)
-        self._shown = 0
+        self._rewritable = rewritable(self._stream)
         self._shown_s = self.asked_s = time.monotonic()
 
-    def show(self, guide: GuidedPress) -> None:
-        """Show the load on the pad, at most ten times a second."""
+    def show(self, felt: float) -> None:
+        """Show the load, as a share of that of a press, at most ten times a second."""
         now_s = time.monotonic()
-        if now_s - self._shown_s < 0.1 or not rewritable(self._stream):
+        if now_s - self._shown_s < 0.1 or not self._rewritable:
             return
         self._shown_s = now_s
-        full = min(int(10 * guide.felt), 10)
         left_s = max(PATIENCE_S - (now_s - self.asked_s), 0)
         skip = ", Enter skips" if _stdin_is_terminal() else ""
-        self._write(f"felt [{'#' * full:10}] {left_s:.0f} s left{skip}")
+        text = f"felt [{'#' * min(int(10 * felt), 10):10}] {left_s:.0f} s left{skip}"
+        self._stream.write(f"\r{text[: columns() - 1]}\x1b[K")
+        self._stream.flush()
 
     def clear(self) -> None:
         """Clear the line, for text that stays."""
-        if self._shown:
-            self._write("")
-            self._stream.write("\r")
-
-    def _write(self, text: str) -> None:
-        text = text[: columns() - 1]
-        self._stream.write("\r" + text.ljust(self._shown))
-        self._stream.flush()
-        self._shown = len(text)
+        if self._rewritable:
+            self._stream.write("\r\x1b[K")
 
 
 def enter_pressed() -> bool:
@@ -96,12 +90,12 @@ class Visit:
         """Watch the link while the pads are free; raises LinkLostError."""
         length_s = self._options.drift_s
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
-        with Progress("watching", length_s, SECONDS, stream=self._err) as bar:
+        with progress("watching", length_s, "s", stream=self._err) as bar:
 
             def show(scans: int, passed_s: float) -> None:
                 if passed_s > 0:
-                    bar.note(f"{scans / passed_s:.0f} scans/s")
-                bar.reach(min(passed_s, length_s))
+                    bar.set_postfix_str(f"{scans / passed_s:.0f} scans/s", refresh=False)
+                bar.update(min(passed_s, length_s) - bar.n)
 
             watch(self._link, watched, length_s, self._stop, tell=show)
 
@@ -120,11 +114,13 @@ class Visit:
         guide = GuidedPress(weight_g, geometry)
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
-        findings, found = judge_press(guide.answer, self._options.out is not None, weight_g is not None, geometry)
+        findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)
+        if weight_g is not None:
+            findings.append(judge_force(guide.counts_per_newton, kept=self._options.out is not None))
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
-        if guide.answer.counts_per_newton is not None:
-            self.newtons[name] = guide.answer.counts_per_newton
+        if guide.counts_per_newton is not None:
+            self.newtons[name] = guide.counts_per_newton
         if found is not None:
             self.mountings[name] = found
 
@@ -154,7 +150,7 @@ class Visit:
                     ask(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
             if enter_pressed():
                 ask(guide.skip())
-            line.show(guide)
+            line.show(guide.felt)
         line.clear()
 
     def _why_no_press(self) -> str | None:
@@ -184,10 +180,13 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         return 0
     known = sensor_settings(options.sensor, options.id_map)
     if options.out is not None:
-        check_writable(options.out, known, presses=not options.no_press, weighs=options.weight_g is not None)
+        check_writable(options.out, known)
     before = stored_baselines(options.baseline, known)
     with stop_on_signals() as stop:
         link, known, watched = prepare(options.source, known, before, options.rate_hz)
+        emulated = "emulated" in (link.kind, link.origin)
+        if options.out is not None and emulated:
+            refuse_device(options.out, known)
         visit = Visit(options, link, known, err, stop)
         start_s = time.monotonic()
         failed: BridgeError | None = None
@@ -210,7 +209,6 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         kept, replaced = False, options.out is not None and options.out.exists()
         if options.out is not None and failed is None and whole:
             free = {name: one for name, one in examined.baselines.items() if name not in examined.loaded}
-            emulated = "emulated" in (link.kind, link.origin)
             try:
                 keep(options.out, known, watched.facts.port, free, visit.mountings, visit.newtons, emulated=emulated)
                 kept = True
@@ -235,9 +233,9 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
             if kept and options.weight_g is not None:
                 then = f"python -m train.own {options.out} --recordings FOLDER --out mine"
                 files += wrapped(f"train a model for it alone: {then}", columns())
-            emulated = "" if link.kind == "device" else f" ({link.kind.upper()})"
+            kind = "" if link.kind == "device" else f" ({link.kind.upper()})"
             early = "" if stopped_s is None else f"stopped after {stopped_s:.0f} s: "
-            print(f"{link.name}{emulated}", page(examined.findings, columns()), *files, sep="\n", file=out)
+            print(f"{link.name}{kind}", page(examined.findings, columns()), *files, sep="\n", file=out)
             print(*wrapped(early + summary(examined.findings), columns()), sep="\n", file=out)
         if failed is not None:
             raise failed

@@ -73,10 +73,7 @@ def judge(watched: Watched, unix_time_s: float) -> Examined:
     baud = link_checks.check_baud(facts, counters, duration_s, len(enough), watched.rate_hz, taxel_count)
     id_map = link_checks.check_id_map(watched.ids, watched.model, bool(half_silent))
     line_full = baud is not None and baud.verdict == "wrong"
-    of_link = [link_checks.check_link(counters, duration_s), baud]
-    if facts.port is not None and enough:
-        of_link.append(link_checks.check_latency(facts, max(one.held_back_ms() for one in enough.values()), line_full))
-    of_link.append(id_map)
+    of_link = [link_checks.check_link(counters, duration_s), baud, link_checks.check_latency(facts), id_map]
     findings = [finding for finding in of_link if finding is not None]
     if not enough:
         link_faulty = any(finding.verdict == "wrong" for finding in findings)

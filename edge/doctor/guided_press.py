@@ -6,7 +6,7 @@ readings fits only one axis and one direction, and any three corners settle whic
 """
 
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -32,14 +32,6 @@ class Press:
     push_counts: tuple[float, float] | None  # change of summed x and y when pushed to the middle; None if not felt
 
 
-@dataclass
-class Answer:
-    """Answer of the presses: those that were felt, and counts per newton where a weight was laid on."""
-
-    presses: list[Press] = field(default_factory=list)
-    counts_per_newton: float | None = None
-
-
 @dataclass(frozen=True)
 class Axes:
     """Directions of the axes: `signs` of x and y, after the swap."""
@@ -54,18 +46,15 @@ def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
     There are eight, and four where the pad is not square: a quarter turn would make another grid of it.
     """
     grid = np.arange(geometry.taxel_count).reshape(geometry.rows, geometry.cols)
-    quarter_turns = range(4) if geometry.rows == geometry.cols else (0, 2)
-    turned = {
-        f"turned by {90 * quarters} degrees clockwise" if quarters else AS_MAPPED: np.rot90(grid, -quarters)
-        for quarters in quarter_turns
-    }
-    mirrored = {
-        name.replace(AS_MAPPED, "mirrored left to right").replace("turned", "mirrored, then turned"): np.rot90(
-            np.fliplr(grid), -quarters
-        )
-        for quarters, name in zip(quarter_turns, turned, strict=True)
-    }
-    return {name: tuple(grid.ravel().tolist()) for name, grid in (turned | mirrored).items()}
+    found: dict[str, tuple[int, ...]] = {}
+    for mirrored in (False, True):
+        for quarters in range(4) if geometry.rows == geometry.cols else (0, 2):
+            ways = ["mirrored left to right"] * mirrored + [f"turned by {90 * quarters} degrees clockwise"] * bool(
+                quarters
+            )
+            turned = np.rot90(np.fliplr(grid) if mirrored else grid, -quarters)
+            found[", then ".join(ways) or AS_MAPPED] = tuple(turned.ravel().tolist())
+    return found
 
 
 def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
@@ -130,43 +119,33 @@ _NORM: Final = "as the model expects: x right, y down, z up when pressed"
 
 
 def judge_press(
-    answer: Answer, kept: bool, weighed: bool, geometry: SensorGeometry = USPA44
+    presses: Sequence[Press], geometry: SensorGeometry = USPA44, *, kept: bool = False
 ) -> tuple[list[Finding], Mounting | None]:
     """Return the findings, and the mounting that they give; None while order or axes are not clear.
 
-    Where the results are `kept`, in a sensor file, nothing is left to be done; a weight was asked for if `weighed`.
+    Where the results are `kept`, in a sensor file, nothing is left to be done.
     """
-    presses = answer.presses
+    if len(presses) < FEWEST_CORNERS:
+        measured = f"{len(presses)} of 4 corners measured"
+        return [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")], None
     verdict, remedy = "wrong", "write a sensor file, edge-sr doctor --out FILE, and run edge-sr --sensor FILE"
     if kept:
         verdict, remedy = "look", "the sensor file states this: run edge-sr with it"
-    findings: list[Finding] = []
-    mounting = None
-    if len(presses) < FEWEST_CORNERS:
-        measured = f"{len(presses)} of 4 corners measured"
-        findings = [Finding(name, "not known", measured, "", _AGAIN) for name in ("taxel order", "axis signs")]
+    turn, axes, z = find_order(presses, geometry), find_axes(presses, geometry), z_sign(presses)
+    norm = "each corner answers where it is pressed"
+    if turn is None:
+        other = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
+        order = Finding("taxel order", "wrong", _why_no_order(presses, geometry), norm, other)
     else:
-        turn = find_order(presses, geometry)
-        norm = "each corner answers where it is pressed"
-        if turn is None:
-            other = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
-            findings.append(Finding("taxel order", "wrong", _why_no_order(presses, geometry), norm, other))
-        else:
-            findings.append(judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy))
-        axes, z = find_axes(presses, geometry), z_sign(presses)
-        if axes is None or z is None:
-            findings.append(_unclear_axes(sum(press.push_counts is not None for press in presses), z))
-        else:
-            found = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=geometry.taxel_count)
-            ways = [way for way, sign in zip("xyz", found.signs, strict=True) if sign < 0]
-            parts = ["x and y swapped"] * found.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
-            measured = " and ".join(parts) or "x right, y down, z up when pressed"
-            findings.append(judged("axis signs", verdict if parts else "ok", measured, _NORM, remedy))
-            if turn is not None:
-                mounting = replace(found, order=orders(geometry)[turn])
-    if weighed:
-        findings.append(_force_finding(answer.counts_per_newton, kept))
-    return findings, mounting
+        order = judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy)
+    if axes is None or z is None:
+        return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z)], None
+    mounting = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=geometry.taxel_count)
+    ways = [way for way, sign in zip("xyz", mounting.signs, strict=True) if sign < 0]
+    parts = ["x and y swapped"] * mounting.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
+    measured = " and ".join(parts) or "x right, y down, z up when pressed"
+    signs = judged("axis signs", verdict if parts else "ok", measured, _NORM, remedy)
+    return [order, signs], None if turn is None else replace(mounting, order=orders(geometry)[turn])
 
 
 def _unclear_axes(pushes: int, z: int | None) -> Finding:
@@ -180,7 +159,8 @@ def _unclear_axes(pushes: int, z: int | None) -> Finding:
     return Finding("axis signs", "wrong", "the corners contradict each other", _NORM, remedy)
 
 
-def _force_finding(counts_per_newton: float | None, kept: bool) -> Finding:
+def judge_force(counts_per_newton: float | None, *, kept: bool) -> Finding:
+    """Return the finding on a weight that was laid on; None stands for nothing steady."""
     low, high = 900.0, 1700.0  # around the 1150 to 1370 of data sheets and of a fit
     norm = f"{low:.0f} to {high:.0f}"
     if counts_per_newton is None:
@@ -229,13 +209,15 @@ class GuidedPress:
     Attributes:
         first: the first request.
         done: True when there are no more requests.
-        answer: results so far; complete when `done`.
+        presses: those that were felt.
+        counts_per_newton: of the summed z, where a weight was laid on; else None.
     """
 
     def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
         """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
         self.done = False
-        self.answer = Answer()
+        self.presses: list[Press] = []
+        self.counts_per_newton: float | None = None
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
         self._dialogue = self._all(geometry.corners, weight_g)
         self.first: Final = next(self._dialogue) or ""
@@ -277,24 +259,19 @@ class GuidedPress:
                 continue
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
                 break
-            self.answer.presses.append(press)
+            self.presses.append(press)
         if weight_g is not None:
-            self.answer.counts_per_newton = yield from _weigh(weight_g)
+            self.counts_per_newton = yield from _weigh(weight_g)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
     ask = f"Press the {name} corner with a finger, about as hard as a stiff doorbell, and hold it."
-    for _ in range(3):
-        held = yield from _wait(ask, _touched, 20)
-        if held is None:
-            return None
-        mean = np.mean([reading.zeroed for reading in held], axis=0)
-        taxel = corner_taxel(mean[2])
-        if taxel is not None:
-            break
-        yield from _wait("That was not a corner. Let go.", _free, FREE_SCANS)
-        ask = f"Press the {name} corner itself and hold it."
-    else:
+    held = yield from _wait(ask, lambda one: _touched(one) and corner_taxel(one.zeroed[2]) is not None, 20)
+    if held is None:
+        return None
+    mean = np.mean([reading.zeroed for reading in held], axis=0)
+    taxel = corner_taxel(mean[2])
+    if taxel is None:  # it moved from one corner to another
         return None
     before = mean[:2].sum(axis=(1, 2))
 

@@ -42,13 +42,6 @@ class Samples:
         together = min(100, self.scans // 2)  # an adapter that delivers scans in bunches makes one meaningless
         return float(np.median(self.time_s[together:] - self.time_s[:-together])) / together
 
-    def held_back_ms(self) -> float:
-        """Return the upper quartile of the scans' delays after the most punctual ones around them, in [ms]."""
-        period_s = self.period_s()
-        late_s = self.time_s - period_s * np.arange(self.scans)
-        around = np.lib.stride_tricks.sliding_window_view(late_s, 2 * AROUND + 1)
-        return 1000 * float(np.percentile(around[:, AROUND] - around.min(axis=1), 75))
-
     def lost(self) -> int:
         """Count the scans that never came, by steps in time; a scan that is only late is followed by less late ones."""
         period_s = self.period_s()

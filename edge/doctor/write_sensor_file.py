@@ -15,30 +15,31 @@ from firmware_bridge.zeroing.baseline import Baseline
 _AS_WIRED = frozenset({"mounting"})
 
 
-def check_writable(path: Path, known: SensorFile, *, presses: bool, weighs: bool) -> None:
+def check_writable(path: Path, known: SensorFile) -> None:
     """Check that a file may be written, before minutes are spent on its content.
 
-    The doctor started with what is `known`, and will ask for `presses`, and for a weight where it `weighs`. Raises
-    SensorFileError where the file cannot be written, or holds values that this visit cannot measure.
+    It is a new one, or that of `known`, of which all is kept that is not measured again. Raises SensorFileError for
+    another, and for one that cannot be written.
     """
     try:
         in_place.check_writable(path)
     except OSError as error:
         why = error.strerror or error
         raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
-    before = _before(path)
-    at_best = {
-        name: replace(
-            entry,
-            counts_per_newton=entry.counts_per_newton if weighs else None,
-            assumed=entry.assumed if presses else entry.assumed | _AS_WIRED,
-            pad=None,
-            learned=None,
-            emulated=frozenset(),
+    if path.exists() and (known.path is None or known.path.resolve() != path.resolve()):
+        raise SensorFileError(
+            f"{path}: left as it is, because what it holds would be lost: pass --sensor {path} as well, to keep what "
+            "is not measured again, or another --out"
         )
-        for name, entry in before.sensors.items()
-    }
-    _refuse_loss(path, before, replace(before, sensors=at_best | dict(known.sensors)))
+
+
+def refuse_device(path: Path, known: SensorFile) -> None:
+    """Raise a SensorFileError where an emulated sensor would be written into the file of a device."""
+    measured = (one for one in known.sensors.values() if one.baseline is not None or "mounting" not in one.assumed)
+    if path.exists() and not all(one.emulated for one in measured):
+        raise SensorFileError(
+            f"{path}: left as it is, because it is of a device, and this one is emulated: another --out"
+        )
 
 
 def keep(
@@ -54,14 +55,12 @@ def keep(
     """Write what is `known` from before and the new results, by sensor, into a sensor file, and return it.
 
     `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
-    were read, and `found` are corrections of the mounting. Raises SensorFileError where the file cannot be written, or
-    holds values that were not measured this time.
+    were read, and `found` are corrections of the mounting. Raises SensorFileError where the file cannot be written.
     """
     with changing(path):
-        before = _before(path)
         entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
-        if known.path is not None and known.path.resolve() == path.resolve():  # a run may have learned gains meanwhile
-            for name, entry in before.sensors.items():
+        if path.exists():  # a run may have learned gains meanwhile
+            for name, entry in load_sensor_file(path).sensors.items():
                 entries[name] = replace(entries.get(name, entry), learned=entry.learned)
         for name in sorted({*baselines, *found, *counts_per_newton}):
             entry = entries.get(name, SensorEntry(as_wired, assumed=_AS_WIRED))
@@ -86,49 +85,8 @@ def keep(
         # A sensor of a named source is one of several, each with an adapter of its own.
         serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
         written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
-        _refuse_loss(path, before, written)
         save_sensor_file(path, written)
         return written
-
-
-def _before(path: Path) -> SensorFile:
-    """Return the content of the file; an empty one where there is no file, or edge-sr would refuse it."""
-    try:
-        return load_sensor_file(path)
-    except SensorFileError:
-        return SensorFile()
-
-
-def _refuse_loss(path: Path, before: SensorFile, written: SensorFile) -> None:
-    lost = [
-        f"{part} of sensor {name}"
-        for name, entry in before.sensors.items()
-        for part in _lost(entry, written.sensors.get(name, SensorEntry(assumed=_AS_WIRED)))
-    ]
-    if before.adapter is not None and written.adapter is None:
-        lost.append("serial number of the adapter")
-    if lost:
-        raise SensorFileError(
-            f"{path}: left as it is, because it holds what would be lost: {', '.join(lost)}: pass --sensor {path} "
-            "as well, to keep what is not measured again, or another --out"
-        )
-
-
-def _lost(entry: SensorEntry, written: SensorEntry) -> list[str]:
-    """Name the values of one entry that the other lacks, or has only of an emulated sensor."""
-
-    def lost(part: str, held: bool, holds: bool) -> bool:
-        return held and (not holds or part in written.emulated - entry.emulated)
-
-    return [
-        *["order and axes"] * lost("mounting", "mounting" not in entry.assumed, "mounting" not in written.assumed),
-        *["gains"] * (entry.mounting.evens_gains and not written.mounting.evens_gains),
-        *["counts per newton"] * lost("force", entry.counts_per_newton is not None, bool(written.counts_per_newton)),
-        *["constants of the pad"] * lost("gains", entry.pad is not None, written.pad is not None),
-        *["learned gains"] * (entry.learned is not None and written.learned is None and written.pad is None),
-        *["place on the robot"] * (entry.frame is not None and written.frame is None),
-        *["baseline"] * lost("baseline", entry.baseline is not None, written.baseline is not None),
-    ]
 
 
 def _serial_number(port: str) -> str | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from edge.pipeline.run_statistics import silence_hint
 from edge.pipeline.scan_reader import Source
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from edge.validation import check_whole
 from firmware_bridge.errors import BaselineRefusedError, DeviceError
 from firmware_bridge.links.base import Notice
@@ -45,7 +45,7 @@ def take_baselines(
     baselines: dict[str, Baseline] = {}
     whole_s: dict[str, float] = {}
     received_s = clock_s()
-    with Progress("zeroing", skip + scans, "scan") as bar:
+    with progress("zeroing", skip + scans, "scan") as bar:
         while not (baselines and baselines.keys() == skipped.keys()):
             if stop is not None and stop.is_set():
                 raise BaselineRefusedError("stopped before every sensor was zeroed: nothing is kept")
@@ -80,5 +80,5 @@ def take_baselines(
                 if now_s - whole_s[name] > GIVEN_UP_S:  # a taxel or the sensor is silent, while scans come
                     lack = f"no whole new scan from sensor {name} for {GIVEN_UP_S:.0f} s"
                     raise DeviceError(f"{lack}: edge-sr doctor shows what is wrong")
-            bar.reach(min(skip + scans, 1 + min(skipped.values(), default=-1)))
+            bar.update(min(skip + scans, 1 + min(skipped.values(), default=-1)) - bar.n)
     return baselines

@@ -114,52 +114,36 @@ def carry_out(commands: Commands, runtime: "Runtime", may_come: Callable[[str], 
 
 
 class CommandLines:
-    """Producer of commands from lines of a file descriptor; `read` never waits.
+    """Producer of commands from lines of a file descriptor, which a thread reads as soon as they come.
 
-    A thread of its own reads as well, as soon as data come: a pose without a time has that of its arrival, and the loop
-    may be waiting for a scan.
+    A pose without a time has that of its arrival, and the loop may be waiting for a scan.
     """
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
         self._commands = commands
         self._descriptor = descriptor
-        self._open = True
-        self._partial = b""
-        self._lock = threading.Lock()
         self._woken, self._waking = os.pipe()
-        # Started here, since a thread that the loop starts later would inherit the loop's processor.
         self._thread = threading.Thread(target=self._follow, name="command-lines", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """End the thread; the descriptor stays open."""
-        if self._thread.is_alive():
-            os.write(self._waking, b"!")
-            self._thread.join()
+        os.write(self._waking, b"!")
+        self._thread.join()
         for end in (self._woken, self._waking):
             os.close(end)
 
-    def read(self) -> None:
-        """Put the commands that came since the last call."""
-        with self._lock:
-            if not self._open or not select.select([self._descriptor], [], [], 0)[0]:
-                return
-            try:
-                data = os.read(self._descriptor, 1 << 16)  # all that a pipe holds, some 500 poses
-            except OSError:  # the other end is gone, which stops commands but not the run
-                data = b""
-            self._open = bool(data)
-            *lines, partial = (self._partial + (data or b"\n")).split(b"\n")
-            self._partial = partial[: LONGEST_BYTES + 1]
-            for line in lines:
-                self._parse(line)
-
     def _follow(self) -> None:
-        with suppress(OSError, ValueError):  # it was closed, which ends commands but not the run
-            while self._open:
+        data, partial = b"\n", b""
+        with suppress(OSError, ValueError):  # the other end is gone, which ends commands but not the run
+            while data:
                 if self._woken in select.select([self._descriptor, self._woken], [], [])[0]:
                     return
-                self.read()
+                data = os.read(self._descriptor, 1 << 16)  # all that a pipe holds, some 500 poses
+                *lines, partial = (partial + (data or b"\n")).split(b"\n")
+                partial = partial[: LONGEST_BYTES + 1]
+                for line in lines:
+                    self._parse(line)
 
     def _parse(self, line: bytes) -> None:
         if not line.strip():
@@ -200,7 +184,6 @@ def read_stdin(commands: Commands) -> Iterator[None]:
     if os.name == "posix" and sys.stdin is not None and not sys.stdin.closed and not sys.stdin.isatty():
         with suppress(OSError):  # a replaced stdin is not a file of the system
             lines = CommandLines(commands, sys.stdin.fileno())
-            commands.ask(lines.read)
     try:
         yield
     finally:

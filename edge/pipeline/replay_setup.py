@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import sensor_settings, unmapped, with_recorded
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
@@ -170,7 +170,7 @@ class _FollowedReplay(ReplayLink):
     def __init__(self, paths: Sequence[str], rate_hz: float | None, *, paced: bool) -> None:
         super().__init__(paths, rate_hz, paced=paced)
         scans = sum(len(track.counts) for recording in self.recordings for track in recording.tracks)
-        self._bar = Progress("replay", scans, "scan")
+        self._bar = progress("replay", scans, "scan")
 
     def __exit__(self, *exc_info: object) -> None:
         self._bar.close()
@@ -179,7 +179,7 @@ class _FollowedReplay(ReplayLink):
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that fell due since the last call."""
         scans = super().read(timeout_s)
-        self._bar.advance(len(scans))
+        self._bar.update(len(scans))
         return scans
 
 

@@ -55,7 +55,6 @@ class Source:
         rate_hz: requested rate of each sensor, in [Hz]; None without.
         overruns: scans discarded.
         pace: the times of reading its links; any thread may set it.
-        thread_ids: system's numbers of the threads that read.
     """
 
     def __init__(
@@ -83,7 +82,6 @@ class Source:
         self._force = force
         self.overruns = 0
         self.pace = Pace()
-        self.thread_ids: tuple[int, ...] = ()
         self._links = links
         self._last_ns = 0
         self._opened = self._closed = False
@@ -255,7 +253,6 @@ class Source:
             reading, thread = _started("scan-reader", partial(self._follow, link))
             self._threads.append(thread)
             reading.add_done_callback(self._end)
-        self.thread_ids = tuple(thread.native_id for thread in self._threads if thread.native_id is not None)
 
     def _end_reading(self) -> None:
         self._stop.set()

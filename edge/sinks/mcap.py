@@ -29,7 +29,6 @@ from edge.sinks.ros2.cdr_messages import (
     wrench,
 )
 from edge.sinks.ros2.map_messages import UNITS, image, in_si
-from edge.terminal.stop_signals import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
@@ -195,11 +194,10 @@ class McapSink(Sink):
 
     def close(self) -> None:
         """Finish the file; one without a message is deleted."""
-        with finishing(self._path):
-            if self._failed:
-                self._file.abandon()
-                return
-            self._try(self._file.close)
+        if self._failed:
+            self._file.abandon()
+            return
+        self._try(self._file.close)
         if not self._file.messages:
             self._path.unlink(missing_ok=True)
 

@@ -116,10 +116,17 @@ class Fan(Sink):
         self.tell(event, counters)
 
 
-FORMS: Final = (
-    *("status", "jsonl:FILE", "jsonl:- (stdout)", "mcap:FILE.mcap"),
-    *("shm:NAME", "zenoh:KEY", "ros2:TOPIC", "ros2:TOPIC?commands"),
-)
+FORMS: Final = {
+    "status": "one live line (default on a terminal)",
+    "jsonl:FILE": "one JSON record a line",
+    "jsonl:- (stdout)": "the same",
+    "mcap:FILE.mcap": "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
+    "shm:NAME": "latest values in shared memory",
+    "zenoh:KEY": "messages over zenoh; to a router with ?connect=tcp/HOST:7447",
+    "ros2:TOPIC": "ROS 2 messages",
+    "ros2:TOPIC?commands": "the same, with resets and zeroings from the robot",
+}
+"""Forms of a sink, and what each is, for the help."""
 
 
 def check_sink(text: str) -> tuple[str, str]:

@@ -17,16 +17,17 @@ from firmware_bridge.scans.mounting import Mounting, placed_map
 if TYPE_CHECKING:
     from firmware_bridge.links.replay import ReplayLink
 
-FORMS: Final = (
-    "slcan:/dev/ttyUSB0[@baud]",
-    "slcan:serial=D30BL366[@baud]",
-    "xela-server:ws://HOST[:5000]",
-    "gs_usb[:SERIAL]",
-    "gs_usb:BUS-PORT",
-    "can:INTERFACE:CHANNEL",
-    "replay:FILE[,FILE]",
-    "demo[:loop]",
-)
+FORMS: Final = {
+    "slcan:/dev/ttyUSB0[@baud]": "serial CAN adapter, such as VScom or CANable",
+    "slcan:serial=D30BL366[@baud]": "the same, by its serial number",
+    "xela-server:ws://HOST[:5000]": "the vendor's server",
+    "gs_usb[:SERIAL]": "USB CAN adapter with candleLight firmware",
+    "gs_usb:BUS-PORT": "the one at this bus and socket, such as gs_usb:1-2.3",
+    "can:INTERFACE:CHANNEL": "adapter that python-can knows, such as can:socketcan:can0",
+    "replay:FILE[,FILE]": "recording: .mcap, .npz or .csv",
+    "demo[:loop]": "emulated sensor",
+}
+"""Forms of a source, and what each is, for the help."""
 
 
 DEMO_LOOP: Final = "demo:loop"

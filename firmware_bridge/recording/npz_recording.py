@@ -10,13 +10,11 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import prod
 from pathlib import Path
-from tempfile import TemporaryFile
 from tokenize import TokenError
-from typing import Any, BinaryIO, Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 from numpy.lib import format as npy
@@ -50,28 +48,20 @@ _BROKEN: Final = (
 )
 
 
-def read_npz(
-    path: Path, names: Iterable[str], most_bytes: int, damaged: Callable[[], object] | None = None
-) -> dict[str, NDArray[Any]]:
+def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray[Any]]:
     """Read the arrays of these names that are in the file, of `most_bytes` together; others are not read.
-
-    Where the file has lost its end, `damaged` is called, and the arrays that are whole are read; without it that is
-    refused.
 
     Raises:
         NpzError: not an archive of plain arrays of numbers and text, damaged, or larger.
         OSError: the file cannot be read.
     """
     try:
-        with warnings.catch_warnings(), _ShortReads(io.FileIO(path)) as file, ExitStack() as opened:
+        with (
+            warnings.catch_warnings(),
+            _ShortReads(io.FileIO(path)) as file,
+            zipfile.ZipFile(file) as archive,
+        ):
             warnings.simplefilter("error")  # numpy repairs headers of Python 2 with a warning, also for broken ones
-            begins = file.read(4) == b"PK\3\4"
-            if damaged is not None and begins and not zipfile.is_zipfile(file):
-                copy = opened.enter_context(TemporaryFile())
-                _copy_whole(file, copy)
-                file = copy
-                damaged()
-            archive = opened.enter_context(zipfile.ZipFile(file))
             members = {info.filename: info for info in archive.infolist()}
             wanted = {name: members[f"{name}.npy"] for name in names if f"{name}.npy" in members}
             total_bytes = sum(info.file_size for info in wanted.values())
@@ -83,33 +73,6 @@ def read_npz(
     except _BROKEN as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise NpzError(f"not a whole .npz archive of plain arrays: {reason[:200]}") from error
-
-
-def _copy_whole(file: BinaryIO, copy: BinaryIO) -> None:
-    """Copy an archive that lost its end, where its directory is, with a directory of its members that are whole."""
-    # Head of a member: mark, version, flags, compression, time, check sum, sizes, and lengths of name and extra field.
-    # The directory holds the same with three more fields of nothing, attributes, and the place of the member.
-    head_form = struct.Struct("<4sHHHIIIIHH")
-    size_bytes, at, directory, count = file.seek(0, io.SEEK_END), 0, bytearray(), 0
-    while True:
-        file.seek(at)
-        head = file.read(head_form.size)
-        if len(head) < head_form.size or not head.startswith(b"PK\3\4"):
-            break
-        _, version, flags, method, time, crc, packed, whole, name_bytes, extra_bytes = head_form.unpack(head)
-        name, extra = file.read(name_bytes), file.read(extra_bytes)
-        if extra.startswith(b"\1\0\x10\0"):  # sizes of eight bytes, as for a member of unknown length
-            whole, packed = struct.unpack_from("<QQ", extra, 4)
-        end = file.tell() + packed
-        if end > min(size_bytes, MOST_NPZ_BYTES) or flags & 8:
-            break
-        sizes = (crc, packed, whole, len(name), 0, 0, 0, 0, 0, at)
-        directory += struct.pack("<4sHHHHIIIIHHHHHII", b"PK\1\2", version, version, flags, method, time, *sizes) + name
-        at, count = end, count + 1
-    file.seek(0)
-    while left := min(at - file.tell(), LONGEST_READ_BYTES):
-        copy.write(file.read(left))
-    copy.write(directory + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, count, count, len(directory), at, 0))
 
 
 class _ShortReads(io.BufferedReader):
@@ -158,22 +121,19 @@ _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "
 
 
 def load_npz(path: Path) -> Recording:
-    """Read an npz; of one that lost its end the arrays that are whole, which `notes` then report."""
-    notes: list[str] = []
-    cut_off = f"{path} is damaged: its end is missing, and only its whole arrays are read; copy it again"
+    """Read an npz."""
     try:
-        return _recording(path, notes, lambda: notes.append(cut_off))
+        return _recording(path)
     except NpzError as error:
         raise RecordingError(f"{path}: {error}") from error
 
 
-def _recording(path: Path, notes: list[str], damaged: Callable[[], object]) -> Recording:
+def _recording(path: Path) -> Recording:
     required = ("format", "version", *_SCANS, "counts")
-    arrays = read_npz(path, (*required, *_ORIGINS, *_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES, damaged)
+    arrays = read_npz(path, (*required, *_ORIGINS, *_POSES, *_BASELINE, "rate_hz", "mountings"), MOST_NPZ_BYTES)
     for name in required:
         if name not in arrays:
-            lost = f"; {notes[0]}" if notes else ""
-            raise NpzError(f"array '{name}': missing, expected what `edge-sr convert` writes{lost}")
+            raise NpzError(f"array '{name}': missing, expected what `edge-sr convert` writes")
     form, version, counts = arrays["format"], arrays["version"], arrays["counts"]
     if str(form) != NPZ_FORMAT:
         _refuse("format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
@@ -189,11 +149,10 @@ def _recording(path: Path, notes: list[str], damaged: Callable[[], object]) -> R
         path,
         tracks,
         None if rate is None else float(rate),
-        _baselines(path, tracks, arrays["sensor"]),
+        _baselines(arrays, tracks),
         _mountings(str(arrays.get("mountings", "{}")), tracks),
-        notes=tuple(notes),
         origin=origin_of(np.unique(origin).tolist()),
-        poses=[] if notes and "pose" not in arrays else _poses(arrays),
+        poses=_poses(arrays),
     )
 
 
@@ -228,11 +187,11 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
         yield Track(name, arrays["counts"][sensors == name].astype(np.int32), times.astype(np.int64))
 
 
-def _baselines(path: Path, tracks: Sequence[Track], sensors: NDArray[np.str_]) -> dict[str, Baseline]:
+def _baselines(arrays: Mapping[str, NDArray[Any]], tracks: Sequence[Track]) -> dict[str, Baseline]:
     """Return the baselines of the first scan of each sensor, dated by the clock of the scans."""
-    arrays = read_npz(path, _BASELINE, MOST_NPZ_BYTES, lambda: None)
-    if len(arrays) < len(_BASELINE):
+    if not arrays.keys() >= _BASELINE.keys():
         return {}
+    sensors = arrays["sensor"]
     _check_arrays(arrays, _BASELINE, sensors.shape, baseline_counts=tracks[0].counts.shape[1:])
     baselines: dict[str, Baseline] = {}
     for track in tracks:

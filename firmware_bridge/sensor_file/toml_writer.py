@@ -25,12 +25,10 @@ from firmware_bridge.sensor_file.model import (
     FILE_FORMAT,
     FILE_VERSION,
     PARTS,
-    PadFrame,
     SensorEntry,
     SensorFile,
     load_sensor_file,
 )
-from firmware_bridge.zeroing.baseline import Baseline
 
 LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
@@ -105,37 +103,50 @@ def _text(sensor_file: SensorFile) -> str:
     ]
     if sensor_file.adapter is not None:
         lines.append(_line("adapter", sensor_file.adapter, "serial number"))
-    cols = sensor_file.geometry.cols
+    grid = sensor_file.geometry.scan_shape
     for name, entry in sensor_file.sensors.items():
-        parts: dict[str, list[str]] = {"": _entry_lines(entry, cols)}
-        if entry.frame is not None:
-            parts[".frame"] = _frame_lines(entry.frame)
+        parts: dict[str, list[str]] = {"": _entry_lines(entry, grid)}
+        if (frame := entry.frame) is not None:
+            parts[".frame"] = [
+                "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
+                _line("parent", frame.parent),
+                _line("place_mm", frame.place_mm),
+                _line("quaternion", frame.quaternion, "x, y, z, w"),
+            ]
         if entry.pad is not None:
-            parts[".pad"] = ["# The pad itself, for networks that ask for it.", *_pad_lines(entry.pad, cols)]
+            parts[".pad"] = ["# The pad itself, for networks that ask for it.", *_pad_lines(entry.pad, grid)]
         if entry.learned is not None:
             about = "# Learned from contacts while it ran; edge-sr doctor --forget-gains removes it."
-            parts[".learned"] = [about, *_pad_lines(entry.learned, cols)]
-        if entry.baseline is not None:
-            parts[".baseline"] = _baseline_lines(entry.baseline)
+            parts[".learned"] = [about, *_pad_lines(entry.learned, grid)]
+        if (baseline := entry.baseline) is not None:
+            dated = not math.isnan(baseline.created_unix_s)
+            parts[".baseline"] = [
+                "# What the free pad reads, in counts, place by place.",
+                _line("id", baseline.id),
+                *[_line("created_unix_s", baseline.created_unix_s)] * dated,
+                _line("scans", baseline.scans),
+                *(
+                    line
+                    for axis, plane in zip(AXES, baseline.counts.tolist(), strict=True)
+                    for line in _rows(axis, plane)
+                ),
+            ]
         for part, own in parts.items():
             lines += ["", f"[sensors.{_value(name)}{part}]", *own]
     return "\n".join([*lines, ""])
 
 
-def _entry_lines(entry: SensorEntry, cols: int) -> list[str]:
+def _entry_lines(entry: SensorEntry, grid: tuple[int, int, int]) -> list[str]:
     mounting = entry.mounting
-    gains = np.asarray(mounting.gains).reshape(len(AXES), -1)
+    gains = np.asarray(mounting.gains).reshape(grid)
+    alike = bool((gains == gains[:, :1, :1]).all())
     lines = [
         "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
-        *_grid_lines("order = ", mounting.order, cols),
+        *_rows("order", np.reshape(mounting.order, grid[1:]).tolist()),
         _line("swap_xy", mounting.swap_xy),
         _line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
+        *([_line("gains", gains[:, 0, 0].tolist(), "of x, y and z")] if alike else _rows("gains", gains.tolist())),
     ]
-    if (gains == gains[:, :1]).all():
-        lines.append(_line("gains", gains[:, 0].tolist(), "of x, y and z"))
-    else:
-        planes = [line for plane in gains.tolist() for line in _grid_lines("    ", plane, cols, end="    ],")]
-        lines += ["gains = [", *planes, "]"]
     if entry.counts_per_newton is not None:
         lines.append(_line("counts_per_newton", float(entry.counts_per_newton), "of the summed z"))
     if entry.assumed:
@@ -146,16 +157,7 @@ def _entry_lines(entry: SensorEntry, cols: int) -> list[str]:
     return lines
 
 
-def _frame_lines(frame: PadFrame) -> list[str]:
-    return [
-        "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
-        _line("parent", frame.parent),
-        _line("place_mm", frame.place_mm),
-        _line("quaternion", frame.quaternion, "x, y, z, w"),
-    ]
-
-
-def _pad_lines(pad: Pad, cols: int) -> list[str]:
+def _pad_lines(pad: Pad, grid: tuple[int, int, int]) -> list[str]:
     lines: list[str] = []
     for name in PAD_RANGES:
         if name in pad.constants:
@@ -167,30 +169,14 @@ def _pad_lines(pad: Pad, cols: int) -> list[str]:
         ("gain_half_widths", pad.gain_half_widths, "Half of each one's 90 % interval, as a share of it."),
     ):
         if values is not None:
-            rows = (values[at : at + cols] for at in range(0, len(values), cols))
-            lines += [f"# {about}", f"{key} = ["]
-            lines += [f"    {', '.join(repr(float(value)) for value in row)}," for row in rows]
-            lines.append("]")
+            rows = np.reshape(values, (-1, grid[2])).tolist()
+            lines += [f"# {about}", f"{key} = [", *(f"    {_value(row)[1:-1]}," for row in rows), "]"]
     return lines
 
 
-def _baseline_lines(baseline: Baseline) -> list[str]:
-    lines = ["# What the free pad reads, in counts, place by place.", _line("id", baseline.id)]
-    if not math.isnan(baseline.created_unix_s):
-        lines.append(_line("created_unix_s", baseline.created_unix_s))
-    lines.append(_line("scans", baseline.scans))
-    for axis, plane in zip(AXES, baseline.counts, strict=True):
-        lines += _grid_lines(f"{axis} = ", plane.ravel().tolist(), plane.shape[1])
-    return lines
-
-
-def _grid_lines(start: str, values: Sequence[int | float], cols: int, end: str = "]") -> list[str]:
-    """Format a grid row by row."""
-    texts = [repr(value) for value in values]
-    width = max(map(len, texts))
-    indent = " " * (len(start) - len(start.lstrip()) + 4)
-    rows = (texts[at : at + cols] for at in range(0, len(texts), cols))
-    return [f"{start}[", *(f"{indent}[{', '.join(text.rjust(width) for text in row)}]," for row in rows), end]
+def _rows(key: str, rows: Sequence[object]) -> list[str]:
+    """Return a list of lists with a line for each, as a grid lies on the pad."""
+    return [f"{key} = [", *(f"    {_value(row)}," for row in rows), "]"]
 
 
 def _line(key: str, value: object, about: str = "") -> str:

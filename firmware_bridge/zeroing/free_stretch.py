@@ -12,7 +12,6 @@ from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, refuse_load
 
 FEWEST_RECORDED: Final = 30
 """Scans for a baseline of a recording, which cannot be extended: a pad may be free for only half a second there."""
-STEP: Final = 8  # scans by which a stretch is made longer at a time
 
 
 class Stretch(NamedTuple):
@@ -41,11 +40,11 @@ class Stretch(NamedTuple):
 
 
 def free_stretch(counts: NDArray[np.int32]) -> Stretch:
-    """Return the stretch with the lowest z in which the pad is still, of FEWEST_RECORDED to FEWEST_SCANS scans.
+    """Return the FEWEST_RECORDED scans with the lowest z in which the pad is still, or the first FEWEST_SCANS.
 
     A grip can be as still as a free pad for half a second. So the stretch has to be the freest one, and no taxel of it
     may lie above the freest scans of the whole recording, as with an earlier baseline. Where the pad is still nowhere,
-    but was let go of, these are the freest FEWEST_RECORDED scans.
+    but was let go of, these are the freest scans.
     Raw counts (n, 3, rows, cols) of all scans of a sensor; ABSENT where a taxel gave no reading.
 
     Raises:
@@ -69,8 +68,8 @@ def free_stretch(counts: NDArray[np.int32]) -> Stretch:
     for begin in freest_first:
         fault = _fault(taken[begin : begin + FEWEST_RECORDED], reference)
         if fault is None:
-            begin, end = _widest(taken, begin, reference)
-            return Stretch(rows[begin:end], taken[begin:end], _touched(z, z[begin:end]))
+            free = slice(begin, begin + FEWEST_RECORDED)
+            return Stretch(rows[free], taken[free], _touched(z, z[free]))
         least = least or fault
     lowest = slice(freest_first[0], freest_first[0] + FEWEST_RECORDED)
     spread = float(np.ptp(np.percentile(unwrapped(taken[lowest]), (5, 95), axis=0), axis=0).max())
@@ -86,25 +85,6 @@ def _touched(z: NDArray[np.int64], free: NDArray[np.int64]) -> bool:
     A contact of 1.3 N raises the summed z by 1500 counts; a free pad warms by less within a recording.
     """
     return bool((z > np.median(free) + 1500).sum() >= 5)
-
-
-def _widest(taken: NDArray[np.int32], begin: int, reference: Baseline) -> tuple[int, int]:
-    """Return the longest stretch around a place: the numbers of its first scan, and of the one after its last."""
-    end = begin + FEWEST_RECORDED
-    while end + STEP <= min(len(taken), begin + FEWEST_SCANS) and _goes_on(taken, begin, end + STEP, end, reference):
-        end += STEP
-    while begin >= STEP and end - begin + STEP <= FEWEST_SCANS and _goes_on(taken, begin - STEP, end, begin, reference):
-        begin -= STEP
-    return begin, end
-
-
-def _goes_on(taken: NDArray[np.int32], begin: int, end: int, at: int, reference: Baseline) -> bool:
-    """Return True if all these scans are of a free and still pad, and so are those alone that are new at one end.
-
-    A still pad may have a few scans that are far off, and so few of a press must not pass as those.
-    """
-    new = taken[begin:at] if at - begin == STEP else taken[at:end]
-    return _fault(new, reference) is None and _fault(taken[begin:end], reference) is None
 
 
 def _fault(counts: NDArray[np.int32], reference: Baseline) -> BaselineRefusedError | None:

@@ -1,15 +1,18 @@
 """Run times on a clock of its own, the front, and the cost of a scan's way against an earlier commit."""
 
+import re
 import shutil
 
 import hot_path
 import numpy as np
+import program_cost
 import pytest
 from hot_path import ROOT, compare, main, report, slower
+from program_cost import Ratio, ratio_of
+from program_cost import main as cost
 
 from edge.bench.command import front
-from edge.bench.system import Ratio, ratio_of
-from edge.bench.timing import back_to_back, paced, summary
+from edge.bench.timing import back_to_back, paced
 
 
 class Clock:
@@ -72,14 +75,6 @@ def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
     assert found.missed == 10
 
 
-def test_percentiles():
-    took_ns = np.arange(1, 3001) * 1000
-    times = summary(took_ns)
-    assert times.p50_us == 1500.5
-    assert (times.p99_us, times.p999_us) == pytest.approx((2970.01, 2997.001))
-    assert (times.max_us, times.runs) == (3000, 3000)
-
-
 @pytest.mark.parametrize(
     ("took_ms", "most", "runs"), [(1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90), (200, 10, 10)]
 )
@@ -131,8 +126,11 @@ def test_an_interval_holds_the_truth_about_as_often_as_it_says():
     assert 50 <= sum(one.low <= 1.2 <= one.high for one in found) < 60
 
 
-def test_blocks_that_cannot_be_compared_are_refused():
-    with pytest.raises(ValueError, match="3 blocks over 2"):
-        ratio_of([1, 2, 3], [1, 2])
-    with pytest.raises(ValueError, match="0 blocks over 0"):
-        ratio_of([], [])
+def test_the_cost_of_the_program_is_a_line_for_rest_and_contact_of_each_tree(limits, capsys):
+    limits(program_cost, SETTLE_S=0.5, ROUNDS=1)
+    assert cost(["--round-s", "0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["at rest, 1 sensors, now", "in contact, 1 sensors, now"]
+    assert all(float(re.search(r"cpu_percent ([\d.]+)", line)[1]) > 0 for line in lines)
+    p50_us = re.search(r"p50_us ([\d.e+]+)", lines[1])  # none where a busy machine lost frames
+    assert p50_us is None or float(p50_us[1]) > 50

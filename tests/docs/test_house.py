@@ -63,16 +63,3 @@ def shown(source):
 def test_a_planted_word_of_the_dialect_is_seen_in_shown_text(planted):
     assert shown(f"raise UsageError({planted!r})") == [planted]
     assert plain_english.shown_dialect(planted)
-
-
-def test_strings_are_whole_sentences_without_docstrings_and_values():
-    source = '"""Heard by nobody at all."""\nsay(f"no scan of {name} in {told} s")\nkinds = ("lost", "given_up")\n'
-    assert shown(source) == ["no scan of _ in _ s"]
-
-
-def test_a_page_shows_its_text_its_labels_and_the_strings_of_its_script():
-    html = '<p id="told" aria-label="newest scan">What was heard</p>'
-    assert set(plain_english.shown_dialect(plain_english.page_text(html, ".html"))) == {"heard"}
-    assert "newest scan" in plain_english.page_text(html, ".html")
-    script = 'const told = 1; // heard here\nsay(`doubt of ${told}`, "beside it");\n'
-    assert set(plain_english.shown_dialect(plain_english.page_text(script, ".js"))) == {"doubt", "beside"}

@@ -10,7 +10,6 @@ from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
-from edge.cli import main as cli
 from edge.doctor import write_sensor_file as keep
 from edge.doctor.findings import Finding, summary
 from edge.doctor.write_sensor_file import check_writable
@@ -40,22 +39,16 @@ class TestLoss:
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize(
-        ("held", "lost"),
+        "held",
         [
-            (SensorEntry(baseline=BASELINE, **ASSUMED), "baseline of sensor 4"),
-            (SensorEntry(counts_per_newton=1180.0, **ASSUMED), "counts per newton of sensor 4"),
-            (SensorEntry(Mounting(swap_xy=True)), "order and axes of sensor 4"),
-            (SensorEntry(pad=Pad(thickness_mm=4.2), **ASSUMED), "constants of the pad of sensor 4"),
-            (SensorEntry(Mounting(gains=GAINS), **ASSUMED), "gains of sensor 4"),
-            (SensorEntry(frame=PadFrame("tool0"), **ASSUMED), "place on the robot of sensor 4"),
+            SensorEntry(baseline=BASELINE, counts_per_newton=1180.0, **ASSUMED),
+            SensorEntry(Mounting(swap_xy=True, gains=GAINS), pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0")),
         ],
     )
-    def test_each_part_is_named_and_kept_where_the_file_is_given_as_well(self, tmp_path, held, lost):
+    def test_what_is_not_measured_again_is_kept(self, tmp_path, held):
         path = tmp_path / "s.toml"
         save_sensor_file(path, SensorFile(sensors={"4": held}))
         found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
-        with pytest.raises(SensorFileError, match=f"would be lost: {lost}: pass --sensor .*s.toml as well"):
-            keep.keep(path, SensorFile(), None, found, NONE, NONE)
         keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
         now = load_sensor_file(path).sensors["4"]
@@ -87,22 +80,20 @@ class TestLoss:
         now = load_sensor_file(path)
         assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
 
-    def test_what_cannot_be_found_is_told_before_the_visit(self, good):
-        check_writable(good, SensorFile(adapter="D30BL366"), presses=True, weighs=True)
-        check_writable(good, load_sensor_file(good), presses=False, weighs=False)
-        with pytest.raises(SensorFileError, match="would be lost: counts per newton of sensor 4"):
-            check_writable(good, SensorFile(), presses=True, weighs=False)
+    def test_a_file_that_was_not_given_as_well_is_refused_before_the_visit(self, good):
+        check_writable(good, load_sensor_file(good))
         content = good.read_text()
-        with pytest.raises(SensorFileError, match=r"left as it is, because .* lost: order and axes of sensor 4"):
-            told("--out", good, "--weight-g", 200, link=lambda: pytest.fail("it was opened"))
+        with pytest.raises(
+            SensorFileError, match=r"left as it is, because .* would be lost: pass --sensor .*good\.toml"
+        ):
+            told("--out", good, link=lambda: pytest.fail("it was opened"))
         assert good.read_text() == content
 
-    def test_what_was_found_of_a_device_is_not_replaced_by_what_is_emulated(self, tmp_path):
-        path = tmp_path / "s.toml"
-        save_sensor_file(path, SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, **ASSUMED)}))
-        with pytest.raises(SensorFileError, match="would be lost: baseline of sensor 4"):
-            keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE, emulated=True)
-        keep.keep(path, SensorFile(), None, {"4": BASELINE}, NONE, NONE)
+    def test_the_file_of_a_device_is_not_written_of_an_emulated_sensor(self, good):
+        link = FakeLink([WELL], kind="emulated")
+        with pytest.raises(SensorFileError, match="it is of a device, and this one is emulated"):
+            told("--sensor", good, "--out", good, link=lambda: link)
+        assert link.reads == 0
 
 
 class TestMarks:
@@ -144,16 +135,6 @@ class TestUse:
             with Source(FakeLink([], kind=kind), sensor_file=EMULATED):
                 pass
         refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
-
-    @pytest.mark.parametrize("command", [["doctor", "--drift-s", "0.1"], ["baseline", "--out", "zero.json"], []])
-    def test_on_the_command_line_it_is_2_and_one_line(self, tmp_path, monkeypatch, capsys, command):
-        monkeypatch.chdir(tmp_path)
-        save_sensor_file(tmp_path / "s.toml", EMULATED)
-        for module in ("edge.api", "edge.doctor.examine"):
-            monkeypatch.setattr(f"{module}.links_to", lambda *_, **__: [FakeLink([], kind="device")])
-        code = cli.main([*command, "--sensor", "s.toml"])
-        lines = [line for line in capsys.readouterr().err.splitlines() if "emulated sensor 4" in line]
-        assert code == 2 and len(lines) == 1
 
 
 WELL = as_scans(healthy_counts(200))

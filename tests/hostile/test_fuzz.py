@@ -7,13 +7,14 @@ tests/bridge.
 import os
 import re
 import tempfile
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import ROOT, make_contract, write_model
+from edge_samples import ROOT, make_contract, wait_for, write_model
 from hostile_samples import REST, archive, npy, recording_arrays, sensor_toml, stored
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -142,8 +143,8 @@ def commands(data: bytes) -> None:
     asked = Commands()
     lines = CommandLines(asked, read_end)
     try:
-        asked.ask(lines.read)
-        got = [command for _ in range(len(data) // 4096 + 2) for command in asked.poll()]
+        wait_for(lambda: "command-lines" not in [thread.name for thread in threading.enumerate()])
+        got = asked.poll()
         assert all(command.name in ("reset", "zero") and isinstance(command.force, bool) for command in got)
         assert len(got) + asked.refused <= data.count(b"\n") + 1
         assert len(got) <= data.count(b"reset") + data.count(b"zero") + data.count(b"\\u")

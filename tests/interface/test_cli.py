@@ -1,6 +1,5 @@
 """`edge-sr` as a user runs it: help, recordings, models, baselines, and refusals."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,16 +37,6 @@ class TestHelp:
                     cli.main([*([command] if command else []), "--help"])
                 out, errors = capsys.readouterr()
                 assert errors == "" and max(map(len, out.splitlines())) <= most, command
-
-    def test_options_are_in_groups_and_those_of_the_demo_are_its_own(self):
-        text = run("--help").stdout
-        groups = "options, sensor, model, outputs, live page, contact, checks of patterns and sensor, processor"
-        at = [text.index(f"\n{group}:\n") for group in groups.split(", ")]
-        assert at == sorted(at)
-        for name in cli.COMMANDS:
-            assert re.search(f"^  {name} ", text, re.MULTILINE), name
-        demo = run("demo", "--help").stdout
-        assert "usage: edge-sr demo [options]" in demo and "--view" in demo and "--source" not in demo
 
     def test_the_version(self):
         done = run("doctor", "--version")

@@ -8,7 +8,6 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
 from functools import partial
 
 import pytest
@@ -16,8 +15,6 @@ from cli_samples import TIMEOUT_S, base_options, files, records, run, start
 from edge_samples import ROOT, wait_for
 
 from edge.cli import main as cli
-from edge.cli import run_command
-from edge.errors import ModelError
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.recording.formats import load_recording
 
@@ -96,27 +93,11 @@ class TestEnds:
         assert cli.main(["--model", "nothere", "--source", f"slcan:{emulator.port}"]) == 4
         assert capsys.readouterr().err.startswith("edge-sr: no model 'nothere'") and received == []
 
-    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, files, monkeypatch, capsys):
+    def test_a_model_that_cannot_be_used_leaves_the_channel_closed(self, emulator, tmp_path):
         """The link opens while the model loads."""
-        opened = threading.Event()
-
-        def load(name, stop):
-            assert opened.wait(TIMEOUT_S)
-            raise ModelError(f"{name} cannot be used")
-
-        obey = emulator.adapter.feed
-
-        def feed(data):
-            answer = obey(data)
-            if emulator.adapter.channel_open:
-                opened.set()
-            return answer
-
-        monkeypatch.setattr(run_command, "load_model", load)
-        emulator.adapter.feed = feed
-        path = files / "tiny.onnx"
-        assert cli.main(["--model", str(path), "--source", f"slcan:{emulator.port}"]) == 4
-        assert capsys.readouterr().err == f"edge-sr: {path} cannot be used\n"
+        (tmp_path / "broken.onnx").write_text("no model")
+        done = run("--model", tmp_path / "broken.onnx", "--source", f"slcan:{emulator.port}")
+        assert done.returncode == 4 and "broken.onnx: not a model" in done.stderr
         wait_for(lambda: not emulator.adapter.channel_open)
 
     def test_a_port_that_never_speaks_is_told_of_with_what_to_do_and_is_3(self, files):

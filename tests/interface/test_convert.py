@@ -117,12 +117,6 @@ def test_a_csv_has_the_order_of_the_id_map_and_what_is_missing_is_said(made, tmp
     assert not load_recording(files["left/6"]).poses
 
 
-def test_what_a_file_is_called_cannot_colour_the_terminal(tmp_path, capsys):
-    path = write_recording(tmp_path / "press.csv", make_counts(20), rate_hz=100)
-    assert convert(path, tmp_path / "\x1b[31mred.npz") == 0
-    assert "red.npz: 20 scans" in (said := capsys.readouterr().out) and "\x1b" not in said
-
-
 def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):
     scans = [make_scan(number, sensor=name) for number in range(3) for name in ("a/b", "a-b")]
     path = record_into(tmp_path / "press.mcap", make_results(scans))
@@ -130,10 +124,9 @@ def test_two_sensors_whose_names_make_one_file_name_get_numbers(tmp_path):
     assert [len(load_recording(tmp_path / f"press-{number}.csv").tracks[0].counts) for number in (1, 2)] == [3, 3]
 
 
-@pytest.mark.parametrize("ending", ["mcap", "npz"])
-def test_a_csv_becomes_a_recording_at_its_rate(tmp_path, ending):
+def test_a_csv_becomes_a_recording_at_its_rate(tmp_path):
     source = write_recording(tmp_path / "finger.csv", make_counts(6), rate_hz=None)
-    new = tmp_path / f"new.{ending}"
+    new = tmp_path / "new.mcap"
     assert convert(source, new, "--rate-hz", 50) == 0
     scans = scans_of(new)
     assert [scan.time_ns for scan in scans] == [number * 20_000_000 for number in range(6)]
@@ -156,6 +149,11 @@ def test_files_of_version_0_1_are_read(tmp_path):
     ("words", "code", "said"),
     [
         ("press.mcap new.mcap", 2, "press.mcap and new.mcap have the same format"),
+        (
+            "text.npz new.csv",
+            2,
+            "text.npz becomes no .csv: edge-sr convert text.npz text.mcap; edge-sr convert text.mcap",
+        ),
         ("bag new.mcap", 2, "bag and new.mcap have the same format"),
         ("press.mcap taken.npz", 5, "taken.npz exists: give another name, or delete it first"),
         ("press.mcap none/new.npz", 5, "cannot write none/new.npz: No such file"),

@@ -1,18 +1,18 @@
 import dataclasses
+import json
 from itertools import pairwise, takewhile
 
 import cli_samples
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
+from edge_samples import BASELINE, FakeLink, FakeModel, make_scan
 from pose_samples import make_posed_contract, write_posed_model
 from trust_samples import make_posed_trust
 
-from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, UsageError, demo_recording, load_model
-from edge.cli import main as cli
+from edge.api import POSED_MODEL, USPA44, Event, Runtime, Source, demo_recording, load_model
 from edge.cli import run_command
-from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore, score_table
-from edge.cli.run_help import parsed_options
+from edge.cli.demo import SLIDE, DemoRecording, DemoScenes, DemoScore
+from edge.cli.main import parsed_options
 from edge.evaluation.metrics import psnr_db, rmse_percent
 from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
@@ -144,21 +144,6 @@ def test_the_bundled_model_drops_the_foreign_tap_and_flags_the_magnet():
     assert max(used[scene == 1]) == 1
 
 
-def test_the_table_has_a_line_a_tap_and_says_what_the_taps_are_worth(recording):
-    scores = [
-        dataclasses.replace(s, psnr_db=-12.301, rmse_percent=99.99, alone_percent=88.88, pose=(-7.05, 2.35, -15))
-        for s in play(recording).scores()
-    ]
-    *lines, verdict = score_table(scores).splitlines()
-    assert len(lines) == 2 + 2 and max(map(len, lines)) <= 50
-    assert "did not fall: 99.99 % of full scale, 88.88 % with it alone" in verdict and "rose" not in verdict
-    scores[1] = dataclasses.replace(scores[1], rmse_percent=88, alone_percent=99)
-    assert "error fell: 88.00" in score_table(scores)
-    scores[1] = dataclasses.replace(scores[1], rmse_percent=99.995)
-    assert "rose at tap 2" in score_table(scores)
-    assert score_table(scores[:1]).splitlines()[-1].startswith("Each pattern is of one tap")
-
-
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory):
     """A tiny model that takes poses, pad and gains, as the one of the demo does."""
@@ -169,12 +154,12 @@ def posed(tmp_path_factory):
     return str(path)
 
 
-def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(posed, monkeypatch, capfd):
+def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_tap(posed, tmp_path, capfd):
     """The demo's own scans, twice, from a link that waits for its reader: no machine is too slow for it."""
     with np.load(demo_recording()) as demo:
         tap_of, counts = demo["tap"], demo["counts"].astype(np.int32)
     poses = load_recording(demo_recording()).poses
-    series, sink = ScanSeries("4", USPA44), ListSink()
+    series, path = ScanSeries("4", USPA44), tmp_path / "out.jsonl"
     link = FakeLink([[series.close(one, n * 10_000_000)] for n, one in enumerate([*counts, *counts])], kind="emulated")
     link.patient = link.states_poses = True
     length_ns = len(counts) * 10_000_000
@@ -185,18 +170,17 @@ def test_a_demo_that_goes_on_is_scored_once_and_each_pass_begins_at_its_first_ta
         return [waiting.pop(0) for one in tuple(waiting) if one.time_ns < now_ns]
 
     link.poses = stated
-    monkeypatch.setattr(run_command, "open_sink", lambda text, **facts: sink)
-    options = parsed_options("", ["--source", "demo:loop", "--sink", "status", "--model", posed])
+    options = parsed_options("", ["--source", "demo:loop", "--sink", f"jsonl:{path}", "--model", posed])
     run_command.run(options, Source(link))
     out, err = capfd.readouterr()
     assert out.count("4 of 4 taps scored") == 1 and err.count("continues until Ctrl-C") == 1
     assert out.count("map of a letter of 50 mm") == 1
     assert all(err.count(f"demo: now {scene}") == 2 for scene in ("another surface", "a magnet", "the pad slides"))
     used: dict[tuple[int, int], set[int]] = {}
-    for result in sink.results:
-        if result.pattern is not None:
-            again, frame = divmod(result.scan.number, len(tap_of))
-            used.setdefault((again, int(tap_of[frame])), set()).add(result.taps_used)
+    for record in map(json.loads, path.read_text().splitlines()):
+        if record["state"] != "event" and record["pattern"] is not None:
+            again, frame = divmod(record["scan"], len(tap_of))
+            used.setdefault((again, int(tap_of[frame])), set()).add(record["taps_used"])
     assert max(used[0, 3]) > 1 and used[1, 0] == {1}
 
 
@@ -258,23 +242,3 @@ def test_the_robot_taps_where_it_is_proposed_and_slides_and_both_are_scored(pose
         assert "4 of 4 taps scored" in done.stderr
     sliding = [one["pose"] for one in results[-250:] if one["pose"]]  # where the machine stands still poses are lost
     assert len({pose["x_mm"] for pose in sliding}) > 100 and "map of a letter of 50 mm" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "source"),
-    [
-        (["demo", "--view"], "demo:loop"),
-        (["--source", "demo", "--view", "0"], "demo:loop"),
-        (["demo", "--view", "--sink", "status"], "demo:loop"),
-        (["demo", "--view", "--sink", "jsonl:-"], "demo"),
-        (["demo"], "demo"),
-    ],
-)
-def test_the_demo_goes_on_for_who_looks_at_the_page_and_a_sink_gets_one_round(monkeypatch, capsys, arguments, source):
-    """In a container, as a service or before `tee` as well: a page needs no terminal."""
-
-    def ask(*names, **_):
-        raise UsageError(*names)
-
-    monkeypatch.setattr(run_command, "open_source", ask)
-    assert cli.main(arguments) == 2 and capsys.readouterr().err == f"edge-sr: {source}\n"

@@ -114,7 +114,7 @@ def test_a_reader_that_has_had_enough_is_no_trouble(empty, tmp_path):
 def closing(empty, tmp_path):
     """A gripper that closes on nothing, and the emulator whose cable can be pulled."""
     options = known(tmp_path)
-    command = [sys.executable, "-m", "edge.bench.emulated_buses"]
+    command = [sys.executable, str(ROOT / "tests/support/emulated_buses.py")]
     with subprocess.Popen(
         [*command, str(tmp_path / "rest.npz")], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as emulator:
@@ -249,17 +249,6 @@ def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
     with Source(Live([[make_scan(n)] for n in range(10)]), sensor_file=SensorFile(sensors=known)) as source:
         grip.run(source, FakeModel(), 60)
     assert set(gripper.done) == {"stop"} and grip.why.startswith("it never began: ")
-
-
-@pytest.mark.parametrize(
-    "wrong", ["--area-mm2=nan", "--most-counts=-1", "--oldest-ms=0", "--duration-s=much", "--area-mm2=inf"]
-)
-def test_a_limit_is_a_positive_number(stop_on_area, argv, capsys, wrong):
-    argv(["stop_on_area.py", "--area-mm2", "20", wrong])
-    with pytest.raises(SystemExit, match="2"):
-        stop_on_area.main()
-    limit, _, value = wrong.partition("=")
-    assert f"argument {limit}: invalid positive value: '{value}'" in capsys.readouterr().err
 
 
 class Live(FakeLink):

@@ -26,7 +26,7 @@ from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
 from edge.api import Event, Note, Result, SinkError, UsageError
-from edge.cli.run_help import parser
+from edge.cli.main import parser
 from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import check_sink

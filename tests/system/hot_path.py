@@ -23,7 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
-from edge.bench.system import BenchError, Ratio, ratio_of, tree_of
+from program_cost import CostError, Ratio, ratio_of, tree_of
 
 ROOT: Final = Path(__file__).parents[2]
 PAIRS: Final = 6
@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         try:
             found = compare(ROOT, tree_of(commit, Path(folder)))
-        except (ChildError, BenchError) as error:
+        except (ChildError, CostError) as error:
             print(f"hot path: {commit} cannot be compared with: {error}")
             return 0
     return report(found, commit)

@@ -39,7 +39,7 @@ from browser_samples import (
 )
 from edge_samples import ROOT, wait_for
 
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.recording.formats import load_recording
 
 sys.path.append(str(ROOT / "docs"))
@@ -228,7 +228,7 @@ def test_a_held_pad_is_shown_measured_and_recorded(held, open_page, tmp_path):
     # The pictures of the pages can still be taken.
     assert pictures.held_demo().shape[1:] == pictures.magnet_near().shape[1:] == (3, 4, 4)
     pictures.PICTURES = tmp_path
-    pictures.keep(page, "phone", Progress("pictures", 1, "picture"))
+    pictures.keep(page, "phone", progress("pictures", 1, "picture"))
     taken = (tmp_path / "live-phone.png").read_bytes()
     assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
 

@@ -22,7 +22,7 @@ from typing import Final, cast
 
 import joblib
 
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
@@ -50,14 +50,14 @@ def make_presses(world: World, path: Path) -> PressSet:
     except OSError as error:
         raise DatasetError(f"{folder} cannot be made: {error.strerror}") from error
     missing = [number for number in range(world.chunks) if not _part(folder, number).exists()]
-    with Progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
+    with progress("pads", world.chunks, "pad", done=world.chunks - len(missing)) as bar:
         pool = joblib.Parallel()
         for start in range(0, len(missing), _AT_ONCE):
             numbers = missing[start : start + _AT_ONCE]
             solved = cast(list[PressSet], pool(joblib.delayed(solve_pad)(world, one) for one in numbers))
             for number, part in zip(numbers, solved, strict=True):
                 replace(part, config=facts).save(_part(folder, number))
-                bar.advance()
+                bar.update()
     parts = [load_presses(_part(folder, number)) for number in range(world.chunks)]
     if any(part.config != facts for part in parts):
         raise DatasetError(f"{folder} holds parts that were made with other settings: delete it")

@@ -26,7 +26,7 @@ from torch import distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from edge.terminal.progress_bar import Progress
+from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
 from train.errors import TrainError
@@ -213,13 +213,13 @@ class _Log:
     """Progress bar on a terminal, and TensorBoard."""
 
     def __init__(self, name: str, done: int, steps: int, folder: Path | None) -> None:
-        self._bar = Progress(name, steps, "step", done=done)
+        self._bar = progress(name, steps, "step", done=done)
         self._writer = SummaryWriter(str(folder)) if folder else None
 
     def step(self, step: int, loss: float, rate: float) -> None:
-        self._bar.advance()
+        self._bar.update()
         if step % 50 == 0:
-            self._bar.note(f"loss {loss:.4f}")
+            self._bar.set_postfix_str(f"loss {loss:.4f}", refresh=False)
             if self._writer:
                 self._writer.add_scalar("loss", loss, step)
                 self._writer.add_scalar("learning rate", rate, step)

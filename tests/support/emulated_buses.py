@@ -1,6 +1,6 @@
 """Emulated adapters in a process of their own, each with its part of the sensors, until stdin is closed.
 
-    python -m edge.bench.emulated_buses FILE FILE --buses 2 --rate-hz 100
+    python tests/support/emulated_buses.py FILE FILE --buses 2 --rate-hz 100
 
 The first lines that it prints are the ports. Recordings are played again and again.
 """

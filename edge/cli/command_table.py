@@ -1,0 +1,324 @@
+"""Commands of `edge-sr`: what does each, its options and its help."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from edge.cli.option_tables import RESULTS, RUN, SENSOR, Group, Option
+from edge.mapping.evidence import PX_PER_MM, SIZE_MM
+from edge.sinks.registry import FORMS as SINKS
+from edge.terminal.argument_types import positive, whole
+from firmware_bridge.links.registry import FORMS as SOURCES
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS
+from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+
+
+class Command(NamedTuple):
+    """Command: what does it, and its help: what follows its name, what it does, its options, and what is below them."""
+
+    does: str  # module and function, loaded when it is used
+    usage: str
+    about: str
+    groups: tuple[Group, ...]
+    more: str = ""
+
+
+def _lines(forms: Mapping[str, str]) -> str:
+    return "".join(f"{form}\t{meaning}\n" for form, meaning in forms.items())
+
+
+TABLE: Final = {
+    "": Command(
+        "edge.cli.run_command:follow",
+        "[options]\n       edge-sr COMMAND [options]",
+        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
+        "pattern: a fine map of how deep an object presses into the pad, in mm.",
+        RUN,
+        f"""\
+commands (each has its own --help):
+demo\tan emulated sensor; no hardware needed
+devices\tlist what is plugged in, and what to type to read it
+doctor\tfind faults of sensor and adapter, and how the pad is mounted
+record FILE\trun, and record into a file
+replay FILE\tcompute the patterns of a recording
+convert FILE NEW\twrite a recording in another format
+map\tfuse the patterns into a map of an object larger than the pad
+baseline\tmeasure the free pad once, and store it
+models\tlist the bundled models
+bench\tmeasure error and run time on this machine
+
+sources, SRC (found by itself if one adapter is plugged in):
+{_lines(SOURCES)}
+outputs, S:
+{_lines(SINKS)}
+keys on a terminal:
+r\tforget earlier taps, as for a new object
+z\tzero again: the pad must be free; Z even in contact
+
+lines on stdin, where it is no terminal:
+{{"cmd": "reset"}}\tlike key r
+{{"cmd": "zero"}}\tlike key z; "sensor": "4" for one sensor, "force": true even in contact
+{{"cmd": "pose", "x_mm": 1, "y_mm": 0}}\twhere the pad is
+
+The signal SIGUSR1 is like key z.
+
+examples:
+  edge-sr devices
+  edge-sr doctor --out sensor.toml
+  edge-sr --sensor sensor.toml --view
+  edge-sr --sink jsonl:- | your-program
+
+Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
+""",
+    ),
+    "demo": Command(
+        "edge.cli.run_command:show_demo",
+        "[options]",
+        "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
+        "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
+        (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),
+        "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
+    ),
+    "record": Command(
+        "edge.cli.run_command:record",
+        "FILE [options]",
+        "Runs like edge-sr, and records scans, patterns and events.",
+        (Group("file", Option("file FILE", str, "new file, .mcap")), *RUN),
+        """\
+examples:
+  edge-sr record press.mcap
+  edge-sr replay press.mcap --view
+
+All other options are those of edge-sr: its --help lists sources, outputs and keys.
+""",
+    ),
+    "replay": Command(
+        "edge.cli.run_command:replay",
+        "FILE... [options]",
+        "Computes the patterns of a recording.",
+        (
+            Group(
+                "recording",
+                Option(
+                    "file FILE",
+                    str,
+                    "recording, .mcap, .npz, .csv or a rosbag2 folder; of several sensors a file each, "
+                    "also as FILE,FILE",
+                    nargs="*",
+                ),
+                Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
+                (
+                    Option(
+                        "--baseline FILE",
+                        Path,
+                        "readings of the free pad, from edge-sr baseline, instead of recorded ones",
+                    ),
+                    Option(
+                        "--zero",
+                        bool,
+                        "take the first 100 scans during which the pad is free and still as its baseline",
+                    ),
+                ),
+                Option("--paced", bool, "play at the original speed, with current times; so does --view with a --sink"),
+                Option("--sensor FILE", Path, "sensor file of edge-sr doctor, instead of the recorded order and axes"),
+                Option("--rate-hz R", positive, "scans a second, if the file does not state it or with --paced"),
+            ),
+            *RESULTS,
+        ),
+        """\
+Computes a result for every scan, as fast as possible, with the times of the recording. It begins \
+with the baseline (the readings of the free pad) that was in use at the first scan. If there is none, and the \
+recording does not begin free and still, those scans are the baseline during which the pad is still and pressed least.
+
+With --view and no --sink it is played again and again, from the first viewer until Ctrl-C; the page can pause, slow \
+and scrub it.
+
+examples:
+  edge-sr replay --example --view
+  edge-sr replay left.csv right.csv \\
+          --view
+  edge-sr replay press.mcap \\
+          --model mtsr4-int8 \\
+          --sink mcap:again.mcap
+""",
+    ),
+    "convert": Command(
+        "edge.cli.convert_command:run",
+        "FILE NEW",
+        "Writes a recording in another format: that of the ending of the new name.",
+        (
+            Group(
+                "recording",
+                Option("recording FILE", str, "recording, .mcap, .npz, .csv or a rosbag2 folder"),
+                Option("new NEW", str, "new file, .mcap, .npz or .csv"),
+                Option("--rate-hz R", positive, "scans a second of a .csv that does not state it"),
+            ),
+        ),
+        """\
+Formats: .mcap holds all that was recorded, .npz arrays for numpy, .csv counts, times and poses of one sensor (of \
+several a file each); the last two are made of an .mcap. What the new file cannot hold is printed. Nothing is \
+computed, and no file is replaced.
+
+examples:
+  edge-sr convert press.mcap press.npz
+  edge-sr convert press.mcap press.csv
+  edge-sr convert old.npz old.mcap
+""",
+    ),
+    "map": Command(
+        "edge.cli.run_command:map_object",
+        "[options]",
+        "Runs like edge-sr, and fuses the patterns into a map of the object.",
+        (
+            Group(
+                "map",
+                Option(
+                    "--out FILE", Path, "file for the layers of the map (default %(default)s)", default=Path("map.npz")
+                ),
+                Option("--png FILE", Path, "file for a picture of contact and height"),
+                Option("--size-mm L", positive, "length of its sides in mm (default %(default)g)", default=SIZE_MM),
+                Option("--px-per-mm N", positive, "pixels of the map per mm (default %(default)g)", default=PX_PER_MM),
+                Option(
+                    "--centre-mm X Y",
+                    float,
+                    "x and y of its centre in the object's plane, in mm (default 0 0)",
+                    nargs=2,
+                    default=(0.0, 0.0),
+                ),
+            ),
+            *RUN,
+        ),
+        """\
+Needs poses of the pad (where it is, and how it is turned) in the object's plane: lines on stdin, or those of a \
+recording. x points right and y down, as in a pattern.
+
+example:
+  my_robot_poses | edge-sr map \\
+          --out part.npz --png part.png
+
+A line of poses:
+  {"cmd": "pose", "x_mm": 1.5,
+   "y_mm": -20, "turn_deg": 5}
+
+All other options are those of edge-sr: its --help lists sources, outputs and keys.
+""",
+    ),
+    "models": Command(
+        "edge.cli.listings:show_models",
+        "[--measure]",
+        "Lists the bundled models, with their error.",
+        (Group(None, Option("--measure", bool, "measure the run time of each here, 1.5 s a model")),),
+    ),
+    "baseline": Command(
+        "edge.cli.run_command:baseline",
+        "--out FILE",
+        "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
+        (
+            Group("sensor", *SENSOR),
+            Group(
+                "baseline",
+                Option("--out FILE", Path, "file for the baseline", required=True),
+                Option(
+                    "--scans N",
+                    whole(FEWEST_RECORDED),
+                    f"scans to average (default and minimum {FEWEST_SCANS}; of a recording at least {FEWEST_RECORDED})",
+                ),
+                Option("--skip N", whole(0), "scans to leave out at the start (default 0)"),
+            ),
+        ),
+        """\
+Keep the pad still, with nothing touching it.
+
+examples:
+  edge-sr baseline --out zero.json
+  edge-sr --baseline zero.json
+
+Of a recording it takes the scans during which the pad is still and pressed least, or those that you name:
+  edge-sr baseline --out zero.json \\
+          --source replay:f.csv \\
+          --skip 190 --scans 60
+""",
+    ),
+    "devices": Command(
+        "edge.cli.listings:show_devices",
+        "[--json]",
+        "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
+        "its use.",
+        (Group(None, Option("--json", bool, "write JSON, for programs")),),
+        "Exit code: 3 if there is no adapter.",
+    ),
+    "doctor": Command(
+        "edge.doctor.command:run",
+        "[options]",
+        "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
+        (
+            Group(
+                "sensor",
+                *SENSOR,
+                Option("--baseline FILE", Path, "earlier readings of the free pad, to detect a load on it"),
+            ),
+            Group(
+                "what is measured",
+                Option(
+                    "--drift-s T", positive, "seconds to measure the free, still pad (default %(default)g)", default=60
+                ),
+                Option("--no-press", bool, "skip the presses on the corners"),
+                Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
+            ),
+            Group(
+                "results",
+                Option("--out FILE", Path, "write the results into a sensor file"),
+                Option("--json", bool, "write one JSON document to stdout"),
+                Option(
+                    "--forget-gains SENSOR",
+                    str,
+                    "remove what the sensor of this name learned from contacts from the file of --sensor, and end",
+                ),
+            ),
+        ),
+        """\
+Keep the pad still, with nothing touching it, until you are asked to press its corners. Hold it in the \
+orientation in which patterns are to be drawn: it defines top and left.
+
+examples:
+  edge-sr doctor
+  edge-sr doctor --out sensor.toml
+  edge-sr doctor --weight-g 200 \\
+          --out sensor.toml
+  edge-sr --sensor sensor.toml
+
+Enter skips a request. Ctrl-C ends the doctor: what is measured until then is printed, and written with --out once the \
+free pad is measured.
+
+Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong usage, 3 sensor, 130 Ctrl-C.
+""",
+    ),
+    "bench": Command(
+        "edge.bench.command:run",
+        "[options]",
+        "Measures error against run time of the bundled models and of methods without a network.",
+        (
+            Group(
+                None,
+                Option("--out DIR", Path, "folder for bench.csv and bench.md"),
+                Option("--rate-hz R", positive, "paced ticks a second (default 100)", default=100.0),
+                Option("--ticks N", whole(10), "paced ticks a row (default 3000)", default=3000),
+                Option("--threads N", whole(1), "numbers of threads (default 1 2)", nargs="+", default=[1, 2]),
+                Option("--models DIR", Path, "folder of your own models, measured as well"),
+                Option("--only NAME", str, "measure only these methods", nargs="+"),
+            ),
+        ),
+        """\
+Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
+program should run meanwhile.
+
+examples:
+  edge-sr bench --out today
+  edge-sr bench --threads 1 \\
+          --only stsr mtsr
+
+Ctrl-C ends it with exit code 130, after the rows measured so far are written.
+""",
+    ),
+}
+COMMANDS: Final = (*filter(None, TABLE),)
