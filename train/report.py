@@ -16,7 +16,7 @@ Row = dict[str, Cell]
 
 
 class Report:
-    """Collector of an experiment's results, written as NAME.md.
+    """Collector of an experiment's results, written as NAME.md and, where it has pictures, NAME.png.
 
     The head of the page names the experiment's source, and the models and frozen sets that it has used by then. A quick
     run was cut short for a test: said at the top of the page.
@@ -39,6 +39,24 @@ class Report:
     def table(self, rows: Sequence[Row], caption: str) -> None:
         """Add a table to the page."""
         self._parts.append(f"{caption}\n\n{markdown(rows)}")
+
+    def pictures(self, patterns: Sequence[tuple[str, NDArray[np.floating]]], rows: int, caption: str) -> None:
+        """Add named patterns (H, W) in [mm] to the page, in so many rows."""
+        from matplotlib.figure import Figure  # of the development environment alone, where reports are made
+
+        columns = -(-len(patterns) // rows)
+        figure = Figure(figsize=(2.2 * columns + 1, 2.5 * rows), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False)
+        most = max(float(pattern.max()) for _, pattern in patterns)
+        for axes, (name, pattern) in zip(grid.flat, patterns, strict=False):
+            axes.set_title(name, fontsize=8)
+            shown = axes.imshow(pattern, vmin=0, vmax=most)
+        for axes in grid.flat:
+            axes.axis("off")
+        figure.colorbar(shown, ax=grid, label="pattern [mm]")
+        path = self._path.with_suffix(".png")
+        figure.savefig(path, dpi=100, metadata={"Software": None})
+        self._parts.append(f"{caption}\n\n![{path.stem}]({path.name})")
 
     def write(self) -> Path:
         """Write the page, and return its path."""

@@ -84,6 +84,12 @@ def real(bench: Workbench, report: Report) -> None:
         for grip, one, estimates, around, mine in zip(grips, whole, hidden, neighbours, z, strict=True)
     ]
     report.table(rows, f"{model.name} by trial and sensor.")
+    shown: list[tuple[str, NDArray[np.floating]]] = []
+    for what, which in (("strongest", np.argmax), ("weakest", np.argmin)):
+        for grip, one in zip(grips, whole, strict=True):
+            name = f"{grip.trial.removeprefix('data_sample_')}\n{grip.free.sensor}, {what}"
+            shown.append((name, one.patterns[which(one.zeroed[:, 2].sum(axis=(1, 2)))]))
+    report.pictures(shown, 4, "Each recording's strongest and weakest scan under load.")
 
 
 def _cells(
