@@ -9,7 +9,7 @@ from edge.cli import option_tables as of
 from edge.cli.option_tables import Group
 from edge.errors import UsageError
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.sinks.registry import check_apart, check_sink
+from edge.sinks.registry import FORMS, check_apart, check_sink
 from edge.terminal.argument_types import Parser
 
 
@@ -46,13 +46,7 @@ replay:FILE[,FILE]\trecording: .mcap, .npz or .csv
 demo[:loop]\temulated sensor
 
 outputs, S:
-status\tone live line (default on a terminal)
-jsonl:FILE\tone JSON record a line; jsonl:- is stdout
-mcap:FILE.mcap\trecording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it
-shm:NAME\tlatest values in shared memory
-zenoh:KEY\tmessages over zenoh; to a router with ?connect=tcp/HOST:7447
-ros2:TOPIC\tROS 2 messages
-
+OUTPUTS
 keys on a terminal:
 r\tforget earlier taps, as for a new object
 z\tzero again: the pad must be free; Z even in contact
@@ -71,7 +65,7 @@ examples:
   edge-sr --sink jsonl:- | your-program
 
 Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
-"""
+""".replace("OUTPUTS", "".join(f"{form.text}\t{form.about}\n" for form in FORMS.values()))
 
 _BASELINE: Final = """\
 Keep the pad still, with nothing touching it.
@@ -99,8 +93,7 @@ Computes a result for every scan, as fast as possible, with the times of the rec
 with the baseline (the readings of the free pad) that was in use at the first scan. If there is none, and the \
 recording does not begin free and still, those scans are the baseline during which the pad is still and pressed least.
 
-With --view and no --sink it is played again and again, from the first viewer until Ctrl-C; the page can pause, slow \
-and scrub it.
+With --view and no --sink it is played at its own speed, from when the page is opened.
 
 examples:
   edge-sr replay --example --view
@@ -264,7 +257,7 @@ def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace
         if not any(text.startswith("jsonl:") for text in options.sink):
             raise UsageError("--fields requires a sink of JSON records, such as --sink jsonl:-")
     for text in options.poses:
-        from edge.pose_sources.open_poses import check_poses
+        from edge.pose_sources import check_poses
 
         check_poses(text)
     runtime_options(options)

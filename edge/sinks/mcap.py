@@ -12,7 +12,8 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import CountersInTurn, record
 from edge.sinks.mcap_writer import McapFile
 from edge.sinks.ros2.cdr_messages import (
@@ -47,6 +48,7 @@ from firmware_bridge.recording.scan_messages import (
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing.baseline import Baseline
 
 
@@ -60,33 +62,34 @@ class McapScans(McapFile):
     def __init__(
         self,
         path: Path,
-        run: RunFacts,
+        sensors: SensorFile,
+        offset_ns: int | None,
         facts: Mapping[str, Mapping[str, str]] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin the file; one that exists is left alone.
 
-        Without the mountings of the run, axes would point elsewhere when the file is played again. Its offset is 0
+        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is 0
         where the time of recording is unknown, and None for the clocks as they are now. `facts` are further metadata.
 
         Raises:
             SinkError: the file exists, or cannot be written.
         """
-        offset_ns = run.unix_offset_ns
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._baselines: dict[str, Baseline | None] = {}
-        self._frames = dict(run.frames)
+        self._frames = dict(sensors.frames)
         self._facts = {
-            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(run.geometry).items()},
+            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(sensors.geometry).items()},
             "units": {name: unit.name for name, unit in UNITS.items()},
         }
         self._mountings = {
-            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in run.mountings.items()
+            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in sensors.mountings.items()
         }
         self._repeat_ns: dict[str, int] = {}
-        self._scan, self._baseline = scan_type(run.geometry.taxel_count), baseline_type(run.geometry.taxel_count)
+        taxels = sensors.geometry.taxel_count
+        self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._source_told = False
         try:
             super().__init__(path, "ros2", f"tactile-edge-sr {__version__}", clock_s)
@@ -158,19 +161,22 @@ class McapScans(McapFile):
 class McapSink(Sink):
     """Writer of records into a new file; their wall times follow the clock at the start, however it is set later.
 
-    In a robot's run a slow disk must delay nothing: after some seconds records are left out, and counted.
+    In a robot's run a slow disk must delay nothing: after some seconds records are left out, and counted. A recording
+    waits for it.
     """
 
     def __init__(
-        self, path: Path, contract: Contract, run: RunFacts = NOW, clock_s: Callable[[], float] = time.monotonic
+        self, path: Path, contract: Contract, source: Source, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
         """Begin the file, as McapScans does; the contract is that of the model that the run begins with."""
-        self._path, self._run = path, run
+        self._path, self._geometry = path, source.sensor_file.geometry
+        self._origin: SourceKind | None = source.origin
+        self._waits = source.kind == "replay"
         self._turns = CountersInTurn()
         self.unwritten = 0
         self._failed = False
         facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
-        self._file = McapScans(path, run, facts, clock_s)
+        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, facts, clock_s)
 
     @property
     def scans(self) -> int:
@@ -208,11 +214,11 @@ class McapSink(Sink):
         sensor, unix_ns, frame = scan.sensor, scan.time_ns + to.offset_ns, frame_of(result)
         on_bus_unix_ns = scan.on_bus_ns + to.offset_ns
         fields = record(result, self._turns.of(result, counters))
-        to.add_scan(scan, self._run.origin or result.source, frame, result.baseline, result.baseline_age_s)
+        to.add_scan(scan, self._origin or result.source, frame, result.baseline, result.baseline_age_s)
         to.add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
         for name, values in maps_of(result).items():
             to.add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
-        force = wrench(result, self._run.geometry, on_bus_unix_ns)
+        force = wrench(result, self._geometry, on_bus_unix_ns)
         if force is not None:
             to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
         self._add_events(result.events)
@@ -226,7 +232,7 @@ class McapSink(Sink):
     def _act_if_room(self, act: Callable[..., None], *given: object) -> None:
         """Do something if there is room for one more record; else count it as left out."""
         if self._file.full():
-            if not self._run.lossless:
+            if not self._waits:
                 self.unwritten += 1
                 return
             self._file.drain()

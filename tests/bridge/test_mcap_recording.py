@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, FakeModel, fake_source, make_contract, make_scan, make_wrench_result
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_samples import (
@@ -28,7 +28,6 @@ from mcap_samples import (
 
 from edge.api import open_runtime, open_source
 from edge.perception.event import Event
-from edge.pipeline.sink import RunFacts
 from edge.sinks import mcap_writer
 from edge.sinks.mcap import McapSink
 from edge.sinks.mcap_writer import CHUNK_S, McapFile
@@ -119,7 +118,7 @@ class TestSink:
         now_ns = time.monotonic_ns()
         results = make_results([make_scan(number, time_ns=now_ns + number) for number in range(2)])
         before_ns = time.time_ns()
-        sink = open_sink(f"mcap:{tmp_path}/out.mcap", SURE)
+        sink = open_sink(f"mcap:{tmp_path}/out.mcap", SURE, fake_source())
         sink.write(results[0], {})
         monkeypatch.setattr(time, "time_ns", lambda: 0)
         sink.write(results[1], {})
@@ -129,7 +128,7 @@ class TestSink:
 
     def test_scans_are_on_the_disk_within_a_second(self, tmp_path):
         now_s = [0.0]
-        sink = McapSink(tmp_path / "out.mcap", SURE, clock_s=lambda: now_s[0])
+        sink = McapSink(tmp_path / "out.mcap", SURE, fake_source(), clock_s=lambda: now_s[0])
         sink.write(make_results([make_scan()])[0], {})
         now_s[0] = CHUNK_S
         while not sink.scans:
@@ -143,7 +142,9 @@ class TestSink:
         path = HangingDisk(tmp_path / "out.mcap")
         path.hangs_s = 0.05 if lossless else None
         results = make_results([make_scan(number) for number in range(50)])
-        sink = McapSink(path, SURE, RunFacts(lossless=lossless), clock_s=itertools.count(0.0, 0.1).__next__)
+        sink = McapSink(
+            path, SURE, fake_source("replay" if lossless else "device"), clock_s=itertools.count(0.0, 0.1).__next__
+        )
         for result in results:
             sink.write(result, {})
         left_out = sink.unwritten
@@ -236,7 +237,7 @@ def test_public_readers_find_units_frames_and_marks(tmp_path):
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     path = tmp_path / "press.mcap"
     sink = McapSink(
-        path, make_contract(), RunFacts(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+        path, make_contract(), fake_source(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
     )
     for result in results:
         scan = replace(result.scan, device_ns=result.scan.time_ns - 2_000_000)
@@ -275,7 +276,9 @@ def field_is_in(path, text):
 
 def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
     layout = json.loads((ROOT / "examples/viewers/foxglove.json").read_text())
-    sink = McapSink(tmp_path / "press.mcap", make_contract(), RunFacts(frames={"4": PadFrame("tool0", (0, 0, 50.5))}))
+    sink = McapSink(
+        tmp_path / "press.mcap", make_contract(), fake_source(frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    )
     result = make_wrench_result()
     sink.write(replace(result, deviation=result.pattern / 10), {})
     sink.tell(Event(time.monotonic_ns(), "note", None, "hello"), {})

@@ -14,14 +14,12 @@ linux_only = pytest.mark.skipif(sys.platform != "linux", reason="these calls are
 SCRIPT = """
 import os, threading
 import sys, tempfile
-from functools import partial
 from pathlib import Path
 sys.path.insert(0, "tests/support")
-from edge_samples import make_contract
+from edge_samples import fake_source, make_contract
 from edge.sinks.mcap_writer import McapFile
 from edge.cli.realtime import realtime
 from edge.sinks.registry import open_sink
-from edge.view.recorder import Recorder
 
 def state():
     locked = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if line[:6] == "VmLck:"]
@@ -35,16 +33,14 @@ started = threading.Thread(target=lambda: (asked.wait(), thread.append(state()))
 bystander = threading.Thread(target=lambda: (other.wait(), thread.append(state())))
 started.start(), bystander.start()
 folder = Path(tempfile.mkdtemp())
-recorder = Recorder(folder, lambda event: None)
-recorder.open_sink = partial(open_sink, contract=make_contract())
 writing, put = [], McapFile.put
 McapFile.put = lambda file, data: (writing.append(state()), put(file, data))
+recorder = open_sink(f"mcap:{folder}/press.mcap", make_contract(), fake_source())
 with realtime(told.append, [started.native_id]):
     within = state()
     begun = threading.Thread(target=lambda: writing.append((*state()[:2], before[2])))  # by whatever the loop calls
     begun.start()
     begun.join()
-    recorder.record(True)
     recorder.close()
     asked.set()
     started.join()

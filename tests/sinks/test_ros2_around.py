@@ -1,4 +1,4 @@
-"""Around the ROS 2 sink: diagnostics, topics, environments, files for ROS, and bytes as ROS itself makes them."""
+"""Around the ROS 2 sink: topics, environments, files for ROS, and bytes as ROS itself makes them."""
 
 import pytest
 
@@ -19,21 +19,19 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import BASELINE, ROOT, make_scan, make_wrench_result
+from edge_samples import ROOT, fake_source, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
-from edge.api import Event, Note, Result, SinkError, UsageError
+from edge.api import Event, SinkError, UsageError
 from edge.cli.run_help import parser
-from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import check_sink
 from edge.sinks.ros2 import cdr_messages, map_messages
 from edge.sinks.ros2.cdr_messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
-from edge.sinks.ros2.diagnostics import Level
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.errors import CdrError
 from firmware_bridge.links.base import Notice
@@ -51,59 +49,14 @@ class Clock:
         return self.now_ns
 
 
-def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
-    clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock, unix_ns=lambda: 1_700_000_000_123_456_789)
-    keep_published(sink, published)
-
-    def statuses():
-        taken = [status for message in published for status in message.get("status", ())]
-        published.clear()
-        return [(status["level"], status["message"]) for status in taken]
-
-    scan = make_scan(1, time_ns=clock.now_ns)
-    idle = Result(scan, "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
-    for _ in range(250):
-        clock.now_ns += 10_000_000
-        sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns)), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "2 dropped"), (Level.OK, "idle")]
-    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
-    clock.now_ns += 1_500_000_000
-    sink.wait()
-    sink.wait()
-    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
-    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
-    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
-    clock.now_ns += 1_000_000_000
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
-    clock.now_ns += 1_000_000_000
-    doubtful = {"state": "contact", "trusted": False, "untrusted_reason": "unexplained"}
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubtful), {"dropped": 2})
-    (status,) = statuses()
-    assert status[0] == Level.WARN
-    assert status[1].startswith("pattern not to be believed: the pattern does not explain its readings")
-    clock.now_ns += 1_000_000_000
-    doubt = {"state": "baseline_in_doubt", "contact": None, "notes": (Note("baseline_in_doubt", "why"),)}
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubt), {"dropped": 2})
-    assert statuses() == [(Level.ERROR, "why")]
-    published.clear()
-    sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
-    sink.close()
-    began_ns = 1_700_000_000_123_456_789
-    stamp = published[-1]["header"]["stamp"]
-    passed_ns = clock.now_ns - 10**12
-    assert stamp["sec"] * 10**9 + stamp["nanosec"] == began_ns + passed_ns, "wall time, from the start's on"
-
-
 DAYS_NS = 3 * 86_400 * 10**9
 
 
-def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
+def test_what_is_not_of_now_has_the_times_of_its_recording():
     """Recorded on a machine that was up for three days more than this one."""
     recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(unix_offset_ns=offset_ns, source="replay"), clock_ns=clock)
+    sink = Ros2Sink("skin", fake_source(unix_offset_ns=offset_ns), environment=ENVIRONMENT, clock_ns=clock)
     clock.now_ns += 60 * 10**9
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)
@@ -111,14 +64,22 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     sink.close()
     stamps = [one["header"]["stamp"] for one in published if "header" in one]
     assert {stamp["sec"] * 10**9 + stamp["nanosec"] for stamp in stamps} == {recorded_ns + offset_ns}
-    said = [status for one in published for status in one.get("status", ())]
-    assert [status["message"] for status in said] == ["REPLAY, not a sensor", "ended"]
-    assert "scan_age_s" not in {pair["key"] for status in said for pair in status["values"]}
+
+
+def test_stamps_of_now_are_wall_time_by_the_clock_at_the_start():
+    clock, published, began_ns = Clock(), [], 1_700_000_000_123_456_789
+    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock, unix_ns=lambda: began_ns)
+    keep_published(sink, published)
+    result = contact(1)
+    sink.write(replace(result, scan=replace(result.scan, time_ns=clock.now_ns + 5_000_000_000)), {})
+    stamp = published[0]["header"]["stamp"]
+    assert stamp["sec"] * 10**9 + stamp["nanosec"] == began_ns + 5_000_000_000
+    sink.close()
 
 
 def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another():
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock)
+    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
     for name in ("left/4", "right/4"):
         sink.write(contact(1, sensor=name), {})
     keep_published(sink, published)
@@ -167,14 +128,14 @@ NONSENSE = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
 )
 def test_an_environment_that_ros_would_not_take_is_refused(environment, error, said):
     with pytest.raises(error, match=said):
-        Ros2Sink("skin", environment)
+        Ros2Sink("skin", fake_source(), environment=environment)
 
 
 def test_without_the_package_one_line_says_how_to_get_it():
     script = (
         "import sys; sys.modules['cyclonedds'] = None\n"
         "from edge.sinks.registry import open_sink\n"
-        "try: open_sink('ros2:skin', None)\n"
+        "try: open_sink('ros2:skin', None, None)\n"
         "except ValueError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -11,7 +11,6 @@ from edge.pipeline.commands import WAITING, Command, Commands
 from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.view.access import grant, is_loopback
 from edge.view.viewers import Viewer, execute
-from firmware_bridge.links.replay_player import Player
 
 TOKEN = "correct-horse-battery"
 OURS = "127.0.0.1:8077"
@@ -160,32 +159,12 @@ def executed(*messages):
     return asked, why
 
 
-def test_a_recording_is_steered_by_what_makes_sense():
-    player, asked = Player(), Commands()
-    player.reach(0.0, 6.0, 0)
-
-    def play(**wanted):
-        return execute(json.dumps({"cmd": "play"} | wanted), Viewer(), asked, player)
-
-    assert play(on=False, speed=0.5, at_s=4) is None
-    assert (player.state.paused, player.state.speed, player.take_jump()) == (True, 0.5, 4.0)
-    assert play(at_s=99) is None and player.take_jump() == 6.0
-    before = player.state
-    wrong = [{"at_s": "4"}, {"at_s": 10**400}, {"speed": 10**400}, {"at_s": True}, {"speed": 0}, {"speed": -1}]
-    for wanted in (*wrong, {"on": 1}, {"att_s": 4}, {"at_s": float("nan")}):
-        assert "expected" in str(play(**wanted)), wanted
-    assert execute('{"cmd": "play", "on": true}', Viewer(), asked) == "no recording is played that a page can steer"
-    assert player.state == before and player.take_jump() is None and asked.poll() == []
-
-
 def test_commands_are_polled_once_in_their_order():
-    zero, record = {"cmd": "zero", "sensor": "4", "force": True}, {"cmd": "record"}
-    asked, why = executed({"cmd": "zero"}, zero, {"cmd": "reset"}, record | {"on": True}, record | {"on": False})
-    recorded = []
-    asked.record = recorded.append
-    assert why == [None] * 5 and asked.refused == 0
+    zero = {"cmd": "zero", "sensor": "4", "force": True}
+    asked, why = executed({"cmd": "zero"}, zero, {"cmd": "reset"})
+    assert why == [None] * 3 and asked.refused == 0
     assert asked.poll() == [Command("zero"), Command("zero", "4", True), Command("reset")]
-    assert recorded == [True, False] and asked.poll() == []
+    assert asked.poll() == []
     assert len(json.dumps(zero | {"sensor": "s" * 1000})) < LONGEST_BYTES
 
 
@@ -196,9 +175,8 @@ def test_commands_are_polled_once_in_their_order():
         {"cmd": "zero", "sensro": "4"},
         {"cmd": "zero", "sensor": "\ud800"},  # which no record can hold
         {"cmd": "zero", "sensor": "\x1b]0;mine\a"},  # which a terminal would do
-        {"cmd": "record", "on": "yes"},
-        {"cmd": "record", "on": True, "path": "/etc/passwd"},
         {"cmd": "pause"},
+        {"cmd": "pause", "on": "yes"},
     ],
 )
 def test_what_is_no_command_is_counted_and_told(message):

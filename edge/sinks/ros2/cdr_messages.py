@@ -36,10 +36,6 @@ _TYPE_FIELDS: Final = {
     "sensor_msgs/PointField": "string name, uint32 offset, uint8 datatype, uint32 count",
     "sensor_msgs/PointCloud2": "std_msgs/Header header, uint32 height, uint32 width, sensor_msgs/PointField[] fields, "
     "bool is_bigendian, uint32 point_step, uint32 row_step, uint8[] data, bool is_dense",
-    "diagnostic_msgs/KeyValue": "string key, string value",
-    "diagnostic_msgs/DiagnosticStatus": "byte level, string name, string message, string hardware_id, "
-    "diagnostic_msgs/KeyValue[] values",
-    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header, diagnostic_msgs/DiagnosticStatus[] status",
     "geometry_msgs/Point": "float64 x, float64 y, float64 z",
     "geometry_msgs/PointStamped": "std_msgs/Header header, geometry_msgs/Point point",
     "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
@@ -73,7 +69,6 @@ STRING: Final = TYPES["std_msgs/String"]
 FLOAT64: Final = TYPES["std_msgs/Float64"]
 INT8: Final = TYPES["std_msgs/Int8"]
 POINT_CLOUD: Final = TYPES["sensor_msgs/PointCloud2"]
-DIAGNOSTIC_ARRAY: Final = TYPES["diagnostic_msgs/DiagnosticArray"]
 POINT_STAMPED: Final = TYPES["geometry_msgs/PointStamped"]
 POSE_STAMPED: Final = TYPES["geometry_msgs/PoseStamped"]
 POSE_WITH_COVARIANCE_STAMPED: Final = TYPES["geometry_msgs/PoseWithCovarianceStamped"]
