@@ -172,8 +172,6 @@ def open_sink(
         SinkError: it cannot be opened.
     """
     form, target = check_sink(text)
-    if form.open in (_open_mcap, _open_ros2) and contract.output_unit != "mm":
-        raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
     return form.open(target, contract, source, SinkOptions(stop or threading.Event(), commands, fields))
 
 
@@ -195,6 +193,7 @@ def _open_jsonl(target: str, contract: Contract, source: Source, options: SinkOp
 def _open_mcap(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
     from edge.sinks.mcap import McapSink
 
+    _check_unit(f"mcap:{target}", contract)
     return McapSink(Path(target), contract, source)
 
 
@@ -213,8 +212,14 @@ def _open_zenoh(target: str, contract: Contract, source: Source, options: SinkOp
 def _open_ros2(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
     with needs_cyclone_dds(f"ros2:{target}"):
         from edge.sinks.ros2.sink import Ros2Sink
+    _check_unit(f"ros2:{target}", contract)
     topic, accepts = _ros2_topic(target)
     return Ros2Sink(topic, source, options.commands if accepts else None)
+
+
+def _check_unit(text: str, contract: Contract) -> None:
+    if contract.output_unit != "mm":
+        raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
 
 
 def _check_mcap(target: str) -> None:

@@ -28,15 +28,15 @@ from mcap_samples import (
 
 from edge.api import open_runtime, open_source
 from edge.perception.event import Event
-from edge.sinks import mcap_writer
-from edge.sinks.mcap import McapSink
-from edge.sinks.mcap_writer import CHUNK_S, McapFile
+from edge.sinks import mcap
+from edge.sinks.mcap import CHUNK_S, McapScans, McapSink
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2.cdr_messages import RESULT
 from edge.sinks.ros2.map_messages import image_map, in_si
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_baseline, decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -138,7 +138,7 @@ class TestSink:
 
     @pytest.mark.parametrize("lossless", [True, False])
     def test_a_disk_that_hangs_is_waited_for_by_the_lossless_alone(self, tmp_path, limits, lossless):
-        limits(mcap_writer, MOST_WAITING_BYTES=20_000)
+        limits(mcap, MOST_WAITING_BYTES=20_000)
         path = HangingDisk(tmp_path / "out.mcap")
         path.hangs_s = 0.05 if lossless else None
         results = make_results([make_scan(number) for number in range(50)])
@@ -156,10 +156,9 @@ class TestSink:
 
     def test_a_reader_seeks_by_its_chunks(self, tmp_path):
         now_s = [0.0]
-        file = McapFile(tmp_path / "out.mcap", "", "", lambda: now_s[0])
-        channel = file.add_channel("/a", "cdr", file.add_schema("A", "ros2msg", "int8 a\n"), {})
+        file = McapScans(tmp_path / "out.mcap", SensorFile(), 0, clock_s=lambda: now_s[0])
         for _ in range(100):
-            file.add_message(channel, round(now_s[0] * 1e9), b"\0\1\0\0\1")
+            file.add("", "/a", MessageType("a/msg/A", "int8 a"), round(now_s[0] * 1e9), b"\0\1\0\0\1")
             now_s[0] += CHUNK_S
             file.look()
         file.close()

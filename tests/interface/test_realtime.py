@@ -17,7 +17,7 @@ import sys, tempfile
 from pathlib import Path
 sys.path.insert(0, "tests/support")
 from edge_samples import fake_source, make_contract
-from edge.sinks.mcap_writer import McapFile
+from edge.sinks.mcap import McapScans
 from edge.cli.realtime import realtime
 from edge.sinks.registry import open_sink
 
@@ -33,8 +33,8 @@ started = threading.Thread(target=lambda: (asked.wait(), thread.append(state()))
 bystander = threading.Thread(target=lambda: (other.wait(), thread.append(state())))
 started.start(), bystander.start()
 folder = Path(tempfile.mkdtemp())
-writing, put = [], McapFile.put
-McapFile.put = lambda file, data: (writing.append(state()), put(file, data))
+writing, put = [], McapScans.put
+McapScans.put = lambda file, data: (writing.append(state()), put(file, data))
 recorder = open_sink(f"mcap:{folder}/press.mcap", make_contract(), fake_source())
 with realtime(told.append, [started.native_id]):
     within = state()
