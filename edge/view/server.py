@@ -55,13 +55,12 @@ class Page(NamedTuple):
     body: bytes
 
 
-def load_page(key: str = "") -> Page:
-    """Return the page, with its style, its script and its key inside: nothing else is fetched."""
+def load_page() -> Page:
+    """Return the page, with its style and its script inside: nothing else is fetched."""
     style, script = (FOLDER / "page.css").read_bytes(), page_script()
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
     body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
-    body = body.replace(b'name="edge-sr-key" content=""', b'name="edge-sr-key" content="%s"' % key.encode())
     headers = (
         ("Content-Type", "text/html; charset=utf-8"),
         ("Content-Length", str(len(body))),
@@ -141,7 +140,7 @@ class Server:
         self._watched = False
         self._snapshot, self._commands, self._access = snapshot, commands, access
         self._failed = failed
-        self._page = load_page(access.key)
+        self._page = load_page()
         self._socket = listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None

@@ -271,8 +271,8 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
     ("settings", "token", "query", "words"),
     [
         ({}, None, "", None),
-        ({"below": "/", "host": "127.0.0.1:{port}"}, None, "", None),
         ({"host": "edge_up"}, browser_samples.TOKEN, f"?token={browser_samples.TOKEN}", None),
+        ({"host": "127.0.0.1:{port}"}, None, "", "may not send requests to this server"),
         ({}, browser_samples.TOKEN, "", "the token is missing or wrong"),
         ({"sockets": False}, None, "", "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
         ({"sockets": None}, None, "", "answers 502 for /edge/ws, and not edge-sr"),
@@ -288,11 +288,3 @@ def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(open_page, s
         page.reload()
         playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.close()  # before what it is connected to
-
-
-def test_a_page_of_another_name_shows_that_it_needs_the_token(open_page):
-    """Chromium resolves every name that ends in .localhost to this machine, as a stranger's server may."""
-    with live_page() as view, proxy(view.port, host="127.0.0.1:{port}") as url:
-        trouble = open_page(url.replace("127.0.0.1", "robot.localhost")).locator("#trouble")
-        playwright.expect(trouble).to_contain_text("may not send requests to this server")
-        playwright.expect(trouble).to_contain_text("--view-token")

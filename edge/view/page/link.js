@@ -47,7 +47,6 @@ class Link {
     Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, receivedS: nowS(), nextS: null, ended: false, why: null });
     // Beside the page, which a proxy may serve below a path.
     this.url = new URL(`${location.pathname.replace(/\/?$/, "/")}ws`, location.href);
-    this.url.searchParams.set("key", document.querySelector("meta[name=edge-sr-key]").content);
     const token = takeToken();
     if (token !== null) this.url.searchParams.set("token", token);
   }
