@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseError, PoseQueue
 from edge.sinks.registry import needs_cyclone_dds
-from edge.sinks.ros2.cdr_messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED, base_topic
+from edge.sinks.ros2.messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED, base_topic
 from edge.sinks.zenoh import close_session, open_session, opening, parsed_target
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose

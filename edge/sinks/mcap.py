@@ -26,20 +26,22 @@ from edge.perception.result_fields import maps_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import CountersInTurn, record
-from edge.sinks.ros2.cdr_messages import (
+from edge.sinks.ros2.messages import (
     IMAGE,
     LOG,
     RESULT,
     TF_MESSAGE,
+    UNITS,
     WRENCH_STAMPED,
     frame_of,
+    image,
+    in_si,
     log_message,
     result_message,
     sensor_path,
     transforms,
     wrench,
 )
-from edge.sinks.ros2.map_messages import UNITS, image, in_si
 from edge.terminal.stop_signals import finishing
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import TimedPose

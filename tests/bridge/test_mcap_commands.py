@@ -22,8 +22,8 @@ from mcap_samples import SURE, arrays_of, make_results, messages_of, odd_scans, 
 from edge.cli import main as cli
 from edge.doctor.examine import prepare
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2 import messages as ros_messages
+from edge.sinks.ros2.messages import image_map, in_si
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting

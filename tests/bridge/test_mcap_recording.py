@@ -31,9 +31,8 @@ from edge.perception.event import Event
 from edge.sinks import mcap
 from edge.sinks.mcap import CHUNK_S, McapScans, McapSink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.cdr_messages import RESULT
-from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2 import messages as ros_messages
+from edge.sinks.ros2.messages import RESULT, image_map, in_si
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.cdr import MessageType

@@ -14,8 +14,7 @@ from edge.inference.trust import features
 from edge.perception.pattern_description import Balance, wrench_of
 from edge.perception.result import LEAST_FORCE_N
 from edge.sinks.mcap import McapSink
-from edge.sinks.ros2.cdr_messages import WRENCH_STAMPED, force_and_torque
-from edge.sinks.ros2.map_messages import image_map
+from edge.sinks.ros2.messages import WRENCH_STAMPED, force_and_torque, image_map
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS

@@ -31,7 +31,7 @@ from edge.pipeline.sink import SinkOptions
 from edge.sinks.json_encoding import COUNTED_NS
 from edge.sinks.jsonl import JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
-from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.ros2.messages import RESULT
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__.lower())

@@ -16,8 +16,8 @@ from edge_samples import fake_source, make_contract, make_wrench_result, wait_fo
 
 from edge.api import Command, Commands, Event
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
+from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading

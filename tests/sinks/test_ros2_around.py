@@ -29,9 +29,9 @@ from edge.api import Event, SinkError, UsageError
 from edge.cli.run_help import parser
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import check_sink
-from edge.sinks.ros2 import cdr_messages, map_messages
-from edge.sinks.ros2.cdr_messages import LONGEST_TOPIC, base_topic, sensor_topic
+from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
+from edge.sinks.ros2.messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.errors import CdrError
 from firmware_bridge.links.base import Notice
@@ -172,7 +172,7 @@ def test_rviz_shows_topics_that_are_published(sink):
     assert (qos["durability"], qos["reliability"]) == ("transient_local", "reliable")
 
 
-KINDS = [one for one in cdr_messages.TYPES.values() if one.name in TYPE_HASHES]
+KINDS = [one for one in ros_messages.TYPES.values() if one.name in TYPE_HASHES]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
@@ -186,7 +186,7 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
 def test_every_type_is_ros_own():
     """Also those of recordings, which are not published."""
     assert TYPE_HASHES.keys() == {one.name for one in KINDS}
-    for kind in cdr_messages.TYPES.values():
+    for kind in ros_messages.TYPES.values():
         assert [(field.name, field.kind) for field in kind.fields] == [
             (name, ros_kind.replace("/msg/", "/")) for name, ros_kind, _ in ros2_messages.fields(kind.name)
         ]
@@ -204,7 +204,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
     event = Event(3, "refused", "4", "not done, ä")
     sink.write(replace(result, deviation=result.pattern / 10, centroid_mm=(1.0, 2.0), events=(event,)), {"dropped": 1})
     sink.close()
-    sent += [("tf2_msgs/msg/TFMessage", cdr_messages.transforms(frames, UNIX_NS))]
+    sent += [("tf2_msgs/msg/TFMessage", ros_messages.transforms(frames, UNIX_NS))]
     assert {name for name, _ in sent} == TYPE_HASHES.keys(), "every type that is published"
     for name, message in sent:
         again = ros2_messages.dds_type(name).deserialize(message).serialize(use_version_2=False)
@@ -213,7 +213,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
 
 
 def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
-    image = map_messages.image(map_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
+    image = ros_messages.image(ros_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
     values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", image)["data"]), "<f4")
     assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
 
@@ -222,14 +222,14 @@ UNIX_NS = 1_700_000_000_123_456_789
 
 
 def test_another_image_is_not_taken_for_a_map():
-    said = cdr_messages.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    said = ros_messages.IMAGE.decode(ros_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
-        map_messages.image_map(cdr_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+        ros_messages.image_map(ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():
     for result in make_results(odd_scans(4)):
-        said = cdr_messages.RESULT.decode(cdr_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
+        said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
         told = json.loads(said["record"])
         assert told["counts"][2][1][1] == (result.scan.counts[2, 1, 1] if result.scan.fresh[1, 1] else None)
         assert told["counters"] == {"late": 1} and said["header"]["frame_id"] == result.scan.sensor

@@ -43,7 +43,7 @@ class TestMessages:
         consumer, results = consume(endpoint), make_results(40)
         assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
         event = Event(5, "lost", None, "the cable is out")
-        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source("emulated"))
+        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         expected = []
         for number, result in enumerate(results):
             counters = {"scans": number}
@@ -56,7 +56,7 @@ class TestMessages:
                 expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
             if number == 20:
                 sink.tell(event, counters)
-                said = plain(event_record(event, counters, "emulated"))
+                said = plain(event_record(event, counters, "replay"))
                 expected.append(("grip/event", "application/json", said, {}))
         sink.close()
         messages, lives = consumer.until_gone()
@@ -68,7 +68,6 @@ class TestMessages:
             header, got = unpack(payload) if key.endswith("pattern") else (json.loads(payload), {})
             header.pop("maps", None)
             assert header == said
-            assert header["source"] == "emulated"
             assert got.keys() == maps.keys()
             for name, values in maps.items():
                 np.testing.assert_array_equal(got[name], values)

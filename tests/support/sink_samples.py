@@ -17,8 +17,7 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2.cdr_messages import LOG, RESULT
-from edge.sinks.ros2.map_messages import image_map
+from edge.sinks.ros2.messages import LOG, RESULT, image_map
 
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
 CONTRACT = make_contract(interval_factor=1.6)
@@ -204,7 +203,7 @@ class Zenoh(Opened):
 
         endpoint = free_endpoint()
         self._consumer = Consumer(endpoint)
-        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source("emulated"))
+        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         self._heard: list[Any] = []
 
     def end(self) -> None:

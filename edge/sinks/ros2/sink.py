@@ -20,7 +20,8 @@ from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record
-from edge.sinks.ros2.cdr_messages import (
+from edge.sinks.ros2.dds_domain import join, reader, taken, writer
+from edge.sinks.ros2.messages import (
     FLOAT64,
     IMAGE,
     INT8,
@@ -32,13 +33,15 @@ from edge.sinks.ros2.cdr_messages import (
     base_topic,
     frame_of,
     header,
+    image,
+    in_si,
+    points,
     sensor_topic,
+    taxels,
     transforms,
     wrench,
     wrench_message,
 )
-from edge.sinks.ros2.dds_domain import join, reader, taken, writer
-from edge.sinks.ros2.map_messages import image, in_si, points, taxels
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
