@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
-from edge.mapping.evidence import PX_PER_MM, SIZE_MM
+from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.perception.contact_options import RuntimeOptions
 from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
