@@ -40,6 +40,7 @@ class MapState(NamedTuple):
 
 
 SHOW_NS: Final = 500_000_000
+"""Time between two states that are shown, in [ns]; longer for a map of more than MOST_SHOWN_PX, which costs more."""
 MOST_SHOWN_PX: Final = 500
 """Most pixels along a side of a map as it is shown, of a larger one every second or third: a page has not many more."""
 
@@ -172,11 +173,12 @@ class MapSink(Sink):
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
             return
-        self._due_ns, self._unseen = self._clock_ns() + SHOW_NS, False
+        grid = self.whole.grid
+        step = -(-grid.pixels // MOST_SHOWN_PX)
+        self._due_ns, self._unseen = self._clock_ns() + SHOW_NS * step**2, False
         seen_ns = max((time_ns for _, time_ns in self._pads.values()), default=0)
         pads = {name: pose for name, (pose, at_ns) in self._pads.items() if seen_ns - at_ns <= SENSOR_SILENT_NS}
-        grid, (contact, doubted) = self.whole.grid, self.whole.contact()
-        step = -(-grid.pixels // MOST_SHOWN_PX)
+        contact, doubted = self.whole.contact()
         contact[np.isnan(contact) & (doubted > 0)] = -1
         size_mm = grid.pixels / grid.px_per_mm
         self.show(MapState(contact[::step, ::step], pads, self._counts, size_mm, grid.centre_mm))
