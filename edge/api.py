@@ -13,7 +13,6 @@ request that cannot be met raises a BridgeError or an EdgeError with one clear l
 
 import importlib
 import math
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -47,10 +46,9 @@ from edge.pipeline.result_stream import Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import infer, load_model, open_runtime
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.sink import RunFacts, Sink
+from edge.pipeline.sink import Sink
 from edge.pipeline.source_setup import links_to, sensor_settings, with_recorded
-from edge.sinks import registry as forms
-from edge.sinks.registry import Fan
+from edge.sinks.registry import Fan, open_sink
 from edge.validation import check_positive
 from firmware_bridge.errors import (
     BaselineRefusedError,
@@ -78,7 +76,7 @@ if TYPE_CHECKING:
     from edge.perception.patches import Patch, PatchEvent, PatchEvents, patches
     from edge.pipeline.baseline_capture import take_baselines
     from edge.pipeline.replay_setup import open_recording
-    from edge.pose_sources.open_poses import PoseSource, open_poses
+    from edge.pose_sources import PoseSource, open_poses
     from firmware_bridge.links.discovery import devices
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
@@ -92,8 +90,8 @@ _ON_USE: Final = {
     "patches": "edge.perception.patches",
     "take_baselines": "edge.pipeline.baseline_capture",
     "open_recording": "edge.pipeline.replay_setup",
-    "PoseSource": "edge.pose_sources.open_poses",
-    "open_poses": "edge.pose_sources.open_poses",
+    "PoseSource": "edge.pose_sources",
+    "open_poses": "edge.pose_sources",
     "devices": "firmware_bridge.links.discovery",
 }
 __all__ = [
@@ -220,41 +218,3 @@ def open_source(
     known = sensor_settings(sensor, id_map)
     links = links_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
     return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
-
-
-def open_sink(
-    text: str,
-    contract: Contract,
-    source: Source,
-    *,
-    stop: threading.Event | None = None,
-    commands: Commands | None = None,
-    fields: str | None = None,
-) -> Sink:
-    """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
-
-    Args:
-        text: "jsonl:FILE", "mcap:FILE.mcap", ...
-        contract: contract of the model that makes the results.
-        source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
-        stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
-        commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
-        fields: those of JSON records, such as "force_n,pattern"; None for all.
-
-    Raises:
-        UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open.
-        SinkError: it cannot be opened.
-    """
-    run = RunFacts(
-        lossless=source.kind == "replay",
-        mountings=source.sensor_file.mountings,
-        frames=source.sensor_file.frames,
-        geometry=source.sensor_file.geometry,
-        unix_offset_ns=source.unix_offset_ns,
-        source=source.kind,
-        origin=source.origin,
-        stop=threading.Event() if stop is None else stop,
-        commands=commands,
-        fields=fields,
-    )
-    return forms.open_sink(text, contract, run)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from edge.cli.option_tables import RESULTS, RUN, SENSOR, Group, Option
-from edge.mapping.evidence import PX_PER_MM, SIZE_MM
+from edge.mapping.object_map import PX_PER_MM, SIZE_MM
 from edge.sinks.registry import FORMS as SINKS
 from edge.terminal.argument_types import positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
@@ -50,7 +50,7 @@ bench\tmeasure error and run time on this machine
 sources, SRC (found by itself if one adapter is plugged in):
 {_lines(SOURCES)}
 outputs, S:
-{_lines(SINKS)}
+{_lines({form.text: form.about for form in SINKS.values()})}
 keys on a terminal:
 r\tforget earlier taps, as for a new object
 z\tzero again: the pad must be free; Z even in contact
@@ -130,8 +130,7 @@ Computes a result for every scan, as fast as possible, with the times of the rec
 with the baseline (the readings of the free pad) that was in use at the first scan. If there is none, and the \
 recording does not begin free and still, those scans are the baseline during which the pad is still and pressed least.
 
-With --view and no --sink it is played again and again, from the first viewer until Ctrl-C; the page can pause, slow \
-and scrub it.
+With --view and no --sink it is played at its own speed, from when the page is opened.
 
 examples:
   edge-sr replay --example --view

@@ -2,12 +2,14 @@
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final, TextIO
 
 from edge.errors import SinkError, UsageError
-from edge.pipeline.sink import RunFacts, check_new
+from edge.pipeline.sink import check_new
+from edge.pipeline.source_setup import sensor_settings, unmapped
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
@@ -16,6 +18,7 @@ from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.sensor_file.model import SensorEntry
 
 _ENDINGS: Final = (".mcap", ".npz", ".csv")
 _WITHOUT: Final = {
@@ -109,10 +112,9 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
 
     recording = replay.recordings[0]
     kind = recording.origin or "replay"
-    # 0: the time of recording is unknown.
-    to = McapScans(
-        path, RunFacts(mountings=recording.mountings, geometry=recording.tracks[0].geometry, unix_offset_ns=0)
-    )
+    known = sensor_settings(None, unmapped(recording.tracks[0].geometry))
+    entries = {name: SensorEntry(mounting) for name, mounting in recording.mountings.items()}
+    to = McapScans(path, replace(known, sensors=entries), 0)  # the time of recording is unknown
     try:
         for scan, poses in _scans(replay):
             baseline = recording.baselines.get(scan.sensor)

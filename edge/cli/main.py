@@ -118,7 +118,7 @@ def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace
         if not any(text.startswith("jsonl:") for text in options.sink):
             raise UsageError("--fields requires a sink of JSON records, such as --sink jsonl:-")
     for text in options.poses:
-        from edge.pose_sources.open_poses import check_poses
+        from edge.pose_sources import check_poses
 
         check_poses(text)
     runtime_options(options)

@@ -78,7 +78,6 @@ RESULTS: Final = (
                nargs="?", const=8077),
         Option("--view-host H", str, "address of the page, for other computers (default 127.0.0.1: this one only)"),
         Option("--view-token T", str, "password in the page's address (default: generated and printed)"),
-        Option("--view-record-dir DIR", Path, "folder for recordings begun on the page (default: the current one)"),
     ),
     Group("contact",
         _runtime("contact_on_counts", positive),

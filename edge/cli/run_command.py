@@ -6,8 +6,8 @@ Modules that only some runs need are imported where they are used.
 import argparse
 import contextlib
 import ctypes
-import os
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -51,7 +51,6 @@ from firmware_bridge.in_place import BACKUP_SUFFIX
 if TYPE_CHECKING:
     from edge.api import MapSink
     from edge.cli.demo import Demo
-    from edge.pipeline.replay_setup import Player
     from edge.view.server import LiveView
 
 
@@ -77,13 +76,13 @@ def show_demo(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """Run `edge-sr replay`."""
     from edge.api import example_recording
-    from edge.pipeline.replay_setup import Player, open_recording
+    from edge.pipeline.replay_setup import open_recording
 
     files = [*options.file, *[example_recording()] * options.example]
     if not files:
         raise UsageError("which recording? name its FILE, or pass --example (edge-sr replay --help lists all options)")
-    # A person looks for as long as he likes; a sink gets each result once.
-    player = Player() if options.view is not None and not set(options.sink) - {"status"} else None
+    # Who opens the page sees its beginning; a sink is not kept waiting.
+    looked_at = threading.Event() if options.view is not None and not set(options.sink) - {"status"} else None
     paced = options.paced or options.view is not None
     source = open_recording(
         *files,
@@ -92,9 +91,9 @@ def replay(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         paced=paced,
         rate_hz=options.rate_hz,
         bar=not paced and "status" not in options.sink,
-        player=player,
+        begins=looked_at,
     )
-    run(options, source, player=player)
+    run(options, source, looked_at=looked_at)
 
 
 def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
@@ -186,12 +185,12 @@ def run(
     source: Source,
     statistics: Statistics | None = None,
     mapping: "MapSink | None" = None,
-    player: "Player | None" = None,
+    looked_at: threading.Event | None = None,
 ) -> None:
     """Run `edge-sr` without a command, or a command that runs the same way, with a source that is not open yet.
 
     `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
-    into a map, which the live page shows; it is closed here. `player` is of the recording that is the source.
+    into a map, which the live page shows; it is closed here. `looked_at` is set once somebody looks at that page.
     """
     stdout_taken = "jsonl:-" in options.sink
     # glibc gives each thread a heap of its own, in which other threads' free memory is of no use: -8 is M_ARENA_MAX.
@@ -221,14 +220,14 @@ def run(
         ):
             hint = partial(silence_hint, options.source, source.counters)
             unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
-            messages = MessageSink(hint=None if source.patient else hint, first=unchecked)
+            messages = MessageSink(hint=None if source.kind == "replay" else hint, first=unchecked)
             given = {"contract": model.contract, "source": source, "fields": options.fields}
             opener = partial(open_sink, **given, stop=stop, commands=commands)
             if view is not None:
-                view.begin(source.name, source.kind, model.name, opener, messages.say, player)
+                view.begin(source, model.name, messages.say, looked_at)
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
-                if player is not None:
-                    print("the recording begins when the page is opened, and repeats until Ctrl-C", file=sys.stderr)
+                if looked_at is not None:
+                    print("the recording begins when the page is opened", file=sys.stderr)
             if is_demo:
                 from edge.cli import demo
 
@@ -294,18 +293,13 @@ def _open_view(
     options: argparse.Namespace, contract: Contract, commands: Commands
 ) -> "contextlib.AbstractContextManager[LiveView | None]":
     if options.view is None:
-        for name in ("view_host", "view_token", "view_record_dir"):
+        for name in ("view_host", "view_token"):
             if getattr(options, name) is not None:
-                option = f"--{name.replace('_', '-')}"
-                raise UsageError(f"{option} requires --view")
+                raise UsageError(f"--{name.replace('_', '-')} requires --view")
         return contextlib.nullcontext()
     from edge.view.server import LOOPBACK, LiveView
 
-    directory = options.view_record_dir or Path()
-    if options.view_record_dir is not None and not os.access(f"{directory}/", os.W_OK | os.X_OK):
-        expected = "expected a folder that may be written into"
-        raise UsageError(f"--view-record-dir {directory}: {expected}; make it, or leave it out for the current folder")
-    return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, directory, contract, commands)
+    return LiveView(options.view_host or LOOPBACK, options.view, options.view_token, contract, commands)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import SinkError
-from edge.mapping.evidence import Grid
 from edge.mapping.map_files import check_npz, save_npz, save_png
 from edge.mapping.object_map import ObjectMap
 from edge.perception.result import Result
@@ -27,37 +26,23 @@ from firmware_bridge.poses import GAP_NS, PadPose
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 
-class Box(NamedTuple):
-    """Rows and columns of a map, from the first to below the last."""
-
-    top: int
-    left: int
-    bottom: int
-    right: int
-
-
 class MapState(NamedTuple):
-    """State of a map, numbered from 1: layers (H, W), poses of the pads by sensor, and patterns by their fate."""
+    """State of a map: its contact, poses of the pads by sensor, patterns by their fate, and its place in [mm].
 
-    number: int
-    grid: Grid
+    The contact is (H, W): the probability of a touch, NaN where nothing came, -1 where only doubted patterns did.
+    """
+
     contact: NDArray[np.float32]
-    doubted: NDArray[np.float32]
     pads: Mapping[str, PadPose]
     counts: Mapping[str, int]
-
-    def since(self, before: "MapState | None") -> Box | None:
-        """Return the part that has changed since another state, or since an empty map; None for nothing."""
-        if before is None:
-            changed = ~np.isnan(self.contact) | (self.doubted != 0)
-        else:  # bits are compared, since a NaN is not equal to itself
-            changed = (self.contact.view(np.int32) != before.contact.view(np.int32)) | (self.doubted != before.doubted)
-        rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
-        return Box(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1) if len(rows) else None
+    size_mm: float
+    centre_mm: tuple[float, float]
 
 
-SHOW_NS: Final = 250_000_000
-"""Time between two states that are shown, in [ns], of a map of 240 x 240 pixels; larger ones are shown less often."""
+SHOW_NS: Final = 500_000_000
+"""Time between two states that are shown, in [ns]; longer for a map of more than MOST_SHOWN_PX, which costs more."""
+MOST_SHOWN_PX: Final = 500
+"""Most pixels along a side of a map as it is shown, of a larger one every second or third: a page has not many more."""
 
 
 class MapSink(Sink):
@@ -95,10 +80,8 @@ class MapSink(Sink):
         self._facts: dict[str, str] = {}
         self._pads: dict[str, tuple[PadPose, int]] = {}
         self._clock_ns = clock_ns
-        self.pause_ns = SHOW_NS * max(1, whole.grid.pixels**2 // 240**2)
         self._due_ns = 0
         self._unseen = False
-        self._shown = 0
 
     @property
     def fused(self) -> int:
@@ -190,12 +173,15 @@ class MapSink(Sink):
     def _show(self) -> None:
         if self.show is None or not self._unseen or self._clock_ns() < self._due_ns:
             return
-        self._due_ns, self._unseen = self._clock_ns() + self.pause_ns, False
-        whole = self.whole
+        grid = self.whole.grid
+        step = -(-grid.pixels // MOST_SHOWN_PX)
+        self._due_ns, self._unseen = self._clock_ns() + SHOW_NS * step**2, False
         seen_ns = max((time_ns for _, time_ns in self._pads.values()), default=0)
         pads = {name: pose for name, (pose, at_ns) in self._pads.items() if seen_ns - at_ns <= SENSOR_SILENT_NS}
-        self._shown += 1
-        self.show(MapState(self._shown, whole.grid, *whole.contact(), pads, self._counts))
+        contact, doubted = self.whole.contact()
+        contact[np.isnan(contact) & (doubted > 0)] = -1
+        size_mm = grid.pixels / grid.px_per_mm
+        self.show(MapState(contact[::step, ::step], pads, self._counts, size_mm, grid.centre_mm))
 
 
 def _numbered(path: Path, number: int) -> Path:

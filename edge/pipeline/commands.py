@@ -28,19 +28,17 @@ class Command:
     """Request of a user that is carried out between two scans.
 
     Attributes:
-        name: "reset" forgets earlier taps, "zero" zeroes again, "record" begins or ends a recording.
+        name: "reset" forgets earlier taps, "zero" zeroes again.
         sensor: name of the sensor to zero; None for all.
         force: zero it even if it is in contact.
-        on: True begins a recording, False ends it.
     """
 
-    name: Literal["reset", "zero", "record"]
+    name: Literal["reset", "zero"]
     sensor: str | None = None
     force: bool = False
-    on: bool = False
 
 
-FORMS: Final = '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}, or a pose'
+FORMS: Final = '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}'
 RESET: Final = Command("reset")
 ZERO: Final = Command("zero")
 
@@ -51,7 +49,6 @@ class Commands:
     Attributes:
         refused: messages that were no command, or came when too many waited.
         reason: why the first of them since the reason was taken was refused; None without.
-        record: begins or ends a recording; nothing is recorded without.
         signalled: asked for by a signal, which may come at any moment, also while another is put; twice is once.
         poses: poses of pads, which wait in a queue of their own: a stream of them must not hold up a command.
     """
@@ -60,7 +57,6 @@ class Commands:
         """Start empty, without a producer."""
         self.refused = 0
         self.reason: str | None = None
-        self.record: Callable[[bool], object] = lambda on: None
         self.signalled: set[Command] = set()
         self.poses = PoseQueue()
         self._lock = threading.Lock()
@@ -87,18 +83,14 @@ class Commands:
         self._producers.append(producer)
 
     def poll(self) -> list[Command]:
-        """Return the commands to the runtime since the last call and carry out those of recording; never waits."""
+        """Return the commands since the last call; never waits."""
         while self.signalled:
             self.put(self.signalled.pop())
         for produce in self._producers:
             produce()
         commands: list[Command] = []
         while not self._waiting.empty():
-            command = self._waiting.get_nowait()
-            if command.name == "record":
-                self.record(command.on)
-            else:
-                commands.append(command)
+            commands.append(self._waiting.get_nowait())
         return commands
 
 
@@ -155,7 +147,9 @@ class CommandLines:
         command = runtime_command(parsed)
         if command is None:
             shown = ascii(line[:60].decode(errors="replace"))
-            self._commands.refuse(f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}")
+            self._commands.refuse(
+                f"a line on stdin is refused: {shown}{'...' * (len(line) > 60)}, expected {FORMS}, or a pose"
+            )
         else:
             self._commands.put(command)
 

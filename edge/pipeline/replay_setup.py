@@ -1,12 +1,14 @@
 """Recording as a source, with what it stores of its sensors."""
 
 import math
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
+from typing import Any
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import sensor_settings, unmapped, with_recorded
@@ -14,7 +16,6 @@ from edge.terminal.progress_bar import progress
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.links.replay_player import PlayedReplay, Player
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -31,7 +32,7 @@ def open_recording(
     paced: bool = False,
     rate_hz: float | None = None,
     bar: bool = False,
-    player: Player | None = None,
+    begins: threading.Event | None = None,
 ) -> Source:
     """Open a recording as a source, to compute its results again as `edge-sr replay` does.
 
@@ -45,7 +46,7 @@ def open_recording(
         paced: play at the recorded speed, as if live; a loop that is too slow loses scans, as with a sensor.
         rate_hz: scans a second of each sensor, where the file does not state it, or to play it at another speed.
         bar: show on a terminal how much of it was taken.
-        player: controls it, and makes it play without an end.
+        begins: set when a paced recording is to begin; at once without.
 
     Raises:
         RecordingError: the recording cannot be used.
@@ -53,10 +54,7 @@ def open_recording(
         SensorFileError: the sensor file cannot be used.
     """
     paths = [path for file in (path, *more) for path in recording_paths(str(file))]
-    if player is not None:
-        replay = PlayedReplay(paths, player, rate_hz)
-    else:
-        replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced)
+    replay = (_FollowedReplay if bar else ReplayLink)(paths, rate_hz, paced=paced, begins=begins)
     tracks = [track for recording in replay.recordings for track in recording.tracks]
     # A sensor file names the pad; without one the recording's grid does.
     file = sensor_settings(sensor, unmapped(tracks[0].geometry) if sensor is None else None)
@@ -167,8 +165,8 @@ def _remedy(path: Path, rate_hz: float | None) -> str:
 class _FollowedReplay(ReplayLink):
     """Recording with a bar that shows how much of it was taken."""
 
-    def __init__(self, paths: Sequence[str], rate_hz: float | None, *, paced: bool) -> None:
-        super().__init__(paths, rate_hz, paced=paced)
+    def __init__(self, paths: Sequence[str], rate_hz: float | None, **settings: Any) -> None:
+        super().__init__(paths, rate_hz, **settings)
         scans = sum(len(track.counts) for recording in self.recordings for track in recording.tracks)
         self._bar = progress("replay", scans, "scan")
 

@@ -49,6 +49,7 @@ class Source:
     Attributes:
         name: as a user would write it, such as "slcan:/dev/ttyUSB0"; of several links, all their names.
         patient: True if the link waits for its reader, and its scans have another clock than now.
+        length_s: length of the longest recording, in [s]; None where there is none.
         states_poses: True if poses of some sensors come with the scans, as in a recording.
         prefixes: beginnings of the names of the sensors of each link, such as "left/".
         sensor_file: properties of its sensors.
@@ -76,6 +77,7 @@ class Source:
         self.name = ", ".join(link.name for link in links)
         self.patient = len(links) == 1 and links[0].patient
         self.prefixes = tuple(link.prefix for link in links)
+        self.length_s = max((link.length_s for link in links if link.length_s is not None), default=None)
         self.states_poses = any(link.states_poses for link in links)
         self.sensor_file = SensorFile() if sensor_file is None else sensor_file
         self.rate_hz = rate_hz

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from edge.errors import SinkError
 from edge.perception.field import Field, Out
 from edge.perception.result_fields import FIELDS, MAPS
-from edge.sinks.ros2.cdr_messages import IMAGE, RESULT
-from edge.sinks.ros2.map_messages import UNITS, image_map
+from edge.sinks.ros2.messages import IMAGE, RESULT, UNITS, image_map
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PoseTrack, TimedPose

@@ -19,7 +19,8 @@ import orjson
 from edge.errors import SinkClosedError, SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink, SinkOptions
 from edge.sinks.json_encoding import CountersInTurn, RecordForm, chosen_fields, event_record
 
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
@@ -33,11 +34,12 @@ class JsonLinesSink(Sink):
     and its next record carries the count, as of any other counter that changes. A run that ends waits for no reader.
     """
 
-    def __init__(self, target: str, run: RunFacts = NOW) -> None:
-        """Open the target; a file that exists is replaced."""
+    def __init__(self, target: str, source: Source, options: SinkOptions) -> None:
+        """Open the target; a file that exists is replaced. Readers of a recording's records are waited for."""
         self._target = "stdout" if target == "-" else target
-        self._run = run
-        self._form = _ALL if run.fields is None else RecordForm(chosen_fields(run.fields), maps=True)
+        self._source, self._stop, self._waits = source.kind, options.stop, source.kind == "replay"
+        fields = options.fields
+        self._form = _ALL if fields is None else RecordForm(chosen_fields(fields), maps=True)
         self.unwritten = 0
         self._turns = CountersInTurn()
         try:
@@ -56,13 +58,13 @@ class JsonLinesSink(Sink):
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
-        fields = event_record(event, {**counters, "unwritten": self.unwritten}, self._run.source)
+        fields = event_record(event, {**counters, "unwritten": self.unwritten}, self._source)
         self._write(orjson.dumps(fields, option=orjson.OPT_APPEND_NEWLINE))
 
     def _write(self, line: bytes) -> None:
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
             # In the pause less comes in than a pipe holds.
-            if not self._run.lossless or self._run.stop.wait(0.002):
+            if not self._waits or self._stop.wait(0.002):
                 self.unwritten += 1
                 return
         written = 0

@@ -1,10 +1,21 @@
-"""Scans, patterns and events in one MCAP file, which Foxglove and `ros2 bag play` open and `replay:` plays again."""
+"""Scans, patterns and events in one MCAP file, which Foxglove and `ros2 bag play` open and `replay:` plays again.
+
+The public writer makes the records. What it makes is put on the disk in a thread of its own, a whole chunk or nothing:
+no caller waits, a full disk leaves a file that can be played, and a killed process one that lacks the last second.
+"""
 
 import json
+import os
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Final
+
+from mcap.writer import Writer
 
 from edge import __version__
 from edge.errors import SinkError
@@ -12,23 +23,25 @@ from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import CountersInTurn, record
-from edge.sinks.mcap_writer import McapFile
-from edge.sinks.ros2.cdr_messages import (
+from edge.sinks.ros2.messages import (
     IMAGE,
     LOG,
     RESULT,
     TF_MESSAGE,
+    UNITS,
     WRENCH_STAMPED,
     frame_of,
+    image,
+    in_si,
     log_message,
     result_message,
     sensor_path,
     transforms,
     wrench,
 )
-from edge.sinks.ros2.map_messages import UNITS, image, in_si
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import MessageType
@@ -46,55 +59,81 @@ from firmware_bridge.recording.scan_messages import (
 from firmware_bridge.recording.tracks import GEOMETRY_METADATA, MOUNTING_METADATA, SOURCE_METADATA
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import NS_PER_S
+from firmware_bridge.sensor_file.model import SensorFile
 from firmware_bridge.zeroing.baseline import Baseline
 
+CHUNK_S: Final = 1.0
+"""Longest stretch that a crash costs, in [s]; the index of chunks, 3 MB an hour and sensor, stays in memory."""
+MOST_CHUNK_BYTES: Final = 1 << 22
+MOST_WAITING_BYTES: Final = 1 << 24
+"""Most bytes that wait, before compression: five seconds of two sensors' patterns while the disk is busy elsewhere."""
 
-class McapScans(McapFile):
+
+class McapScans:
     """Writer of scans and poses, and what they mean, into a new file; `add` puts other messages next to them.
+
+    Every method but `abandon` raises an OSError where it, or an earlier record, cannot be written.
 
     Attributes:
         offset_ns: added to a time of the scans gives [ns] since 1970.
+        scans: number of scans on the disk so far, of all sensors.
+        messages: number of messages added so far.
     """
 
     def __init__(
         self,
         path: Path,
-        run: RunFacts,
+        sensors: SensorFile,
+        offset_ns: int | None,
         facts: Mapping[str, Mapping[str, str]] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin the file; one that exists is left alone.
 
-        Without the mountings of the run, axes would point elsewhere when the file is played again. Its offset is 0
+        Without the mountings of the sensors, axes would point elsewhere when the file is played again. The offset is 0
         where the time of recording is unknown, and None for the clocks as they are now. `facts` are further metadata.
 
         Raises:
             SinkError: the file exists, or cannot be written.
         """
-        offset_ns = run.unix_offset_ns
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str], int] = {}
-        self._baselines: dict[str, Baseline | None] = {}
-        self._frames = dict(run.frames)
+        self.scans = self.messages = 0
+        self._clock_s = clock_s
+        taxels = sensors.geometry.taxel_count
+        self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._facts = {
-            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(run.geometry).items()},
+            GEOMETRY_METADATA: {key: json.dumps(value) for key, value in asdict(sensors.geometry).items()},
             "units": {name: unit.name for name, unit in UNITS.items()},
         }
         self._mountings = {
-            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in run.mountings.items()
+            name: {"sensor": name, "mounting": mounting_text(mounting)} for name, mounting in sensors.mountings.items()
         }
+        self._frames = dict(sensors.frames)
+        self._baselines: dict[str, Baseline | None] = {}
         self._repeat_ns: dict[str, int] = {}
-        self._scan, self._baseline = scan_type(run.geometry.taxel_count), baseline_type(run.geometry.taxel_count)
         self._source_told = False
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}  # as the public writer numbers them
+        self._sequences: Counter[int] = Counter()
+        self._added_scans = 0
+        self._open_bytes = self._waiting_bytes = 0
+        self._due_s: float | None = None
+        self._made = bytearray()
+        self._size_bytes = 0
+        self._failed = False
+        self._handed_over: deque[tuple[Future[None], int]] = deque()
         try:
-            super().__init__(path, "ros2", f"tactile-edge-sr {__version__}", clock_s)
+            self._file = path.open("xb", buffering=0)
+            self._writer = Writer(self, chunk_size=2 * MOST_CHUNK_BYTES)  # type: ignore[arg-type]  # write, tell, flush
+            start = partial(self._writer.start, "ros2", f"tactile-edge-sr {__version__}")
+            self._jobs: list[Callable[[], object]] = [start]
+            self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="mcap-writer")
             try:
                 for name, fields in (facts or {}).items():
-                    self.add_metadata(name, fields)
-                self.add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
+                    self._add_metadata(name, fields)
+                self._add_metadata(GEOMETRY_METADATA, self._facts[GEOMETRY_METADATA])
                 for fields in self._mountings.values():
-                    self.add_metadata(MOUNTING_METADATA, fields)
+                    self._add_metadata(MOUNTING_METADATA, fields)
             except BaseException:  # Ctrl-C, too: nothing else would end a thread that has just been started
                 self.abandon()
                 raise
@@ -103,11 +142,6 @@ class McapScans(McapFile):
         except OSError as error:
             raise SinkError(f"cannot record into {path}: {error.strerror or error}") from error
 
-    @property
-    def scans(self) -> int:
-        """Number of scans on the disk so far, of all sensors."""
-        return sum(self.written.get(number, 0) for (_, name), number in self._channels.items() if name == "scan")
-
     def add_scan(
         self, scan: Scan, kind: SourceKind, frame: str, baseline: Baseline | None, baseline_age_s: float | None
     ) -> None:
@@ -115,7 +149,7 @@ class McapScans(McapFile):
         sensor, unix_ns = scan.sensor, scan.time_ns + self.offset_ns
         source = {"kind": kind}
         if not self._source_told:
-            self.add_metadata(SOURCE_METADATA, source)
+            self._add_metadata(SOURCE_METADATA, source)
             self._source_told = True
         repeat = unix_ns >= self._repeat_ns.get(sensor, 0)  # once a second, so that a part of a file has them, too
         if repeat:
@@ -133,6 +167,7 @@ class McapScans(McapFile):
         masks = mask_bits(scan.fresh), mask_bits(scan.renewed)
         # Scans name where they came from themselves, however often they were played: a tool may copy them alone.
         own = f"emulated/{sensor}" if kind == "emulated" else frame
+        self._added_scans += 1
         self.add(sensor, "scan", self._scan, unix_ns, encode_scan(scan, own, scan.on_bus_ns + self.offset_ns, *masks))
 
     def add_poses(self, poses: Sequence[TimedPose]) -> None:
@@ -142,34 +177,137 @@ class McapScans(McapFile):
             self.add("", "/poses", POSE, unix_ns, encode_pose(pose, unix_ns))
 
     def add(self, sensor: str, name: str, kind: MessageType, unix_ns: int, data: bytes) -> None:
-        """Add a message to a topic of a sensor, or to the topic `name` itself where `sensor` is empty."""
+        """Add a message to a topic of a sensor, or to the topic `name` itself where `sensor` is empty.
+
+        It is passed to the writing thread within CHUNK_S, if `look` is called by then.
+        """
         channel = self._channels.get((sensor, name))
         if channel is None:
             if kind.name not in self._schemas:
-                self._schemas[kind.name] = self.add_schema(kind.name, "ros2msg", kind.definition)
+                self._schemas[kind.name] = len(self._schemas) + 1
+                definition = kind.definition.encode()
+                self._jobs.append(partial(self._writer.register_schema, kind.name, "ros2msg", definition))
             topic = f"/{sensor_path(sensor)}/{name}" if sensor else name
             about = {"sensor": sensor} | ({"unit": UNITS[name].name} if name in UNITS else {})
-            channel = self.add_channel(topic, "cdr", self._schemas[kind.name], about)
-            self._channels[sensor, name] = channel
-        self.add_message(channel, unix_ns, data)
+            channel = self._channels[sensor, name] = len(self._channels) + 1
+            self._jobs.append(partial(self._writer.register_channel, topic, "cdr", self._schemas[kind.name], about))
+        if self._due_s is None:
+            self._due_s = self._clock_s() + CHUNK_S
+        sequence = self._sequences[channel] & 0xFFFFFFFF
+        self._jobs.append(partial(self._writer.add_message, channel, unix_ns, data, unix_ns, sequence))
+        self._sequences[channel] += 1
+        self.messages += 1
+        self._open_bytes += len(data)
+        if self._open_bytes >= MOST_CHUNK_BYTES:
+            self._hand_over()
+
+    def full(self) -> bool:
+        """Return True if so much waits for the disk that nothing should be added."""
+        self._look_back()
+        return self._waiting_bytes + self._open_bytes >= MOST_WAITING_BYTES
+
+    def look(self) -> None:
+        """Close the chunk if it is due."""
+        self._look_back()
+        if self._due_s is not None and self._clock_s() >= self._due_s:
+            self._hand_over()
+
+    def close(self) -> None:
+        """Write the rest, and the summary that lets a reader seek in the file; closed, and readable, if that fails."""
+        try:
+            self._hand_over()
+            self._jobs.append(self._writer.finish)
+            self._hand_over()
+            self.drain()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        self._executor.shutdown()
+        self._file.close()
+
+    def drain(self) -> None:
+        """Wait until only the open chunk is not on the disk yet."""
+        while self._handed_over:
+            self._handed_over[0][0].exception()
+            self._look_back()
+
+    def write(self, data: bytes) -> int:
+        """Take bytes of the public writer; they are put on the disk as a whole chunk."""
+        self._made += data
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the place of the next byte of the public writer."""
+        return self._size_bytes + len(self._made)
+
+    def flush(self) -> None:
+        """Do nothing: `_run` puts the bytes on the disk."""
+
+    def _add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add facts that hold for the whole file, and pass them to the writing thread at once."""
+        self._jobs.append(partial(self._writer.add_metadata, name, dict(values)))
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Pass what was added to the writing thread, which works in order and writes nothing more after a failure."""
+        self._look_back()
+        jobs, waiting_bytes = self._jobs, self._open_bytes
+        self._jobs, self._open_bytes, self._due_s = [], 0, None
+        self._handed_over.append((self._executor.submit(self._run, jobs, self._added_scans), waiting_bytes))
+        self._waiting_bytes += waiting_bytes
+
+    def _look_back(self) -> None:
+        while self._handed_over and self._handed_over[0][0].done():
+            writing, waiting_bytes = self._handed_over.popleft()
+            self._waiting_bytes -= waiting_bytes
+            writing.result()
+
+    def _run(self, jobs: list[Callable[[], object]], scans: int) -> None:
+        if self._failed:
+            return
+        for job in jobs:
+            job()
+        if self._writer.finish not in jobs:
+            self._writer.flush()
+        self.put(self._made)
+        self._made.clear()
+        self.scans = scans
+
+    def put(self, data: bytearray) -> None:
+        """Write all of the data or nothing: a disk that fills takes a part and refuses the rest."""
+        try:
+            with memoryview(data) as left:
+                done = 0
+                while done < len(left):
+                    done += self._file.write(left[done:])
+        except OSError:
+            self._failed = True
+            os.ftruncate(self._file.fileno(), self._size_bytes)
+            raise
+        self._size_bytes += len(data)
 
 
 class McapSink(Sink):
     """Writer of records into a new file; their wall times follow the clock at the start, however it is set later.
 
-    In a robot's run a slow disk must delay nothing: after some seconds records are left out, and counted.
+    In a robot's run a slow disk must delay nothing: after some seconds records are left out, and counted. A recording
+    waits for it.
     """
 
     def __init__(
-        self, path: Path, contract: Contract, run: RunFacts = NOW, clock_s: Callable[[], float] = time.monotonic
+        self, path: Path, contract: Contract, source: Source, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
         """Begin the file, as McapScans does; the contract is that of the model that the run begins with."""
-        self._path, self._run = path, run
+        self._path, self._geometry = path, source.sensor_file.geometry
+        self._origin: SourceKind | None = source.origin
+        self._waits = source.kind == "replay"
         self._turns = CountersInTurn()
         self.unwritten = 0
         self._failed = False
         facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
-        self._file = McapScans(path, run, facts, clock_s)
+        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, facts, clock_s)
 
     @property
     def scans(self) -> int:
@@ -206,11 +344,11 @@ class McapSink(Sink):
         sensor, unix_ns, frame = scan.sensor, scan.time_ns + to.offset_ns, frame_of(result)
         on_bus_unix_ns = scan.on_bus_ns + to.offset_ns
         fields = record(result, self._turns.of(result, counters))
-        to.add_scan(scan, self._run.origin or result.source, frame, result.baseline, result.baseline_age_s)
+        to.add_scan(scan, self._origin or result.source, frame, result.baseline, result.baseline_age_s)
         to.add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
         for name, values in maps_of(result).items():
             to.add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
-        force = wrench(result, self._run.geometry, on_bus_unix_ns)
+        force = wrench(result, self._geometry, on_bus_unix_ns)
         if force is not None:
             to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)
         self._add_events(result.events)
@@ -224,7 +362,7 @@ class McapSink(Sink):
     def _act_if_room(self, act: Callable[..., None], *given: object) -> None:
         """Do something if there is room for one more record; else count it as left out."""
         if self._file.full():
-            if not self._run.lossless:
+            if not self._waits:
                 self.unwritten += 1
                 return
             self._file.drain()

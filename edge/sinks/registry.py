@@ -1,20 +1,22 @@
 """Registry of the sinks, by the names that a user writes, and the fan-out of a run's results to all of them."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from operator import methodcaller
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.sink import NOW, RunFacts, Sink
-from edge.sinks.ros2.cdr_messages import base_topic
+from edge.pipeline.commands import Commands
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink, SinkOptions
+from edge.sinks.ros2.messages import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.poses import TimedPose
 
@@ -116,35 +118,25 @@ class Fan(Sink):
         self.tell(event, counters)
 
 
-FORMS: Final = {
-    "status": "one live line (default on a terminal)",
-    "jsonl:FILE": "one JSON record a line",
-    "jsonl:- (stdout)": "the same",
-    "mcap:FILE.mcap": "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
-    "shm:NAME": "latest values in shared memory",
-    "zenoh:KEY": "messages over zenoh; to a router with ?connect=tcp/HOST:7447",
-    "ros2:TOPIC": "ROS 2 messages",
-    "ros2:TOPIC?commands": "the same, with resets and zeroings from the robot",
-}
-"""Forms of a sink, and what each is, for the help."""
+class Form(NamedTuple):
+    """Form of a sink: as a user writes it, what it is, the check of its target, and the function that opens it."""
+
+    text: str
+    about: str
+    check: Callable[[str], object]
+    open: Callable[[str, Contract, Source, SinkOptions], Sink]
 
 
-def check_sink(text: str) -> tuple[str, str]:
+def check_sink(text: str) -> tuple[Form, str]:
     """Return form and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
-    form, _, target = text.partition(":")
-    if form == "npz" and target:
+    name, _, target = text.partition(":")
+    form = FORMS.get(name)
+    if name == "npz" and target:
         made = Path(target).with_suffix(".mcap")
         raise UsageError(f"no sink {text!r}: record by --sink mcap:{made}, then edge-sr convert {made} {target}")
-    if text != "status" and (form not in ("jsonl", "mcap", "shm", "zenoh", "ros2") or not target):
-        raise UsageError(f"no sink {text!r}; sinks are {', '.join(FORMS)}")
-    if form == "mcap" and not target.endswith(".mcap"):
-        raise UsageError(f"sink {text!r} names {target!r}, expected a file whose name ends in .mcap")
-    if form == "ros2":
-        _ros2_topic(target)
-    if form == "zenoh":
-        from edge.sinks.zenoh import parsed_target
-
-        parsed_target(target)
+    if form is None or (text != name if form.text == name else not target):
+        raise UsageError(f"no sink {text!r}; sinks are {', '.join(form.text for form in FORMS.values())}")
+    form.check(target)
     return form, target
 
 
@@ -155,46 +147,90 @@ def check_apart(texts: Sequence[str]) -> None:
             raise UsageError(f"sink {text!r} is there {texts.count(text)} times: leave one")
 
 
-def open_sink(text: str, contract: Contract, run: RunFacts = NOW) -> Sink:
-    """Open the sink that `text` names, of FORMS; the contract names the maps that will come, and their shapes.
+def open_sink(
+    text: str,
+    contract: Contract,
+    source: Source,
+    *,
+    stop: threading.Event | None = None,
+    commands: Commands | None = None,
+    fields: str | None = None,
+) -> Sink:
+    """Open a sink of results, as `edge-sr --sink` names it; close it after the last result is written.
+
+    Args:
+        text: "jsonl:FILE", "mcap:FILE.mcap", ...
+        contract: contract of the model that makes the results.
+        source: open source of the scans. Readers that are too slow miss records of a sensor, but never of a recording.
+        stop: set when the run is to end: then the sink no longer waits for readers of a recording's records either.
+        commands: those of the stream, for "ros2:TOPIC?commands", which takes zeroing and reset from the robot.
+        fields: those of JSON records, such as "force_n,pattern"; None for all.
 
     Raises:
-        UsageError: no such form; a sink in metres for patterns of an unknown unit; a package is not installed.
-        SinkError: the sink cannot be opened.
+        UsageError: the form does not exist (the message lists the forms), a field does not, or the source is not open;
+            a sink in metres for patterns of an unknown unit; a package is not installed.
+        SinkError: it cannot be opened.
     """
-    # Each is imported only where it is used, which saves start-up time and memory.
     form, target = check_sink(text)
-    if form == "status":
-        from edge.sinks.status_line import StatusSink
+    return form.open(target, contract, source, SinkOptions(stop or threading.Event(), commands, fields))
 
-        return StatusSink()
-    if form == "jsonl":
-        from edge.sinks.jsonl import JsonLinesSink
 
-        return JsonLinesSink(target, run)
-    if form == "mcap":
-        _check_unit(text, contract)
-        from edge.sinks.mcap import McapSink
+# Each is imported only where it is used, which saves start-up time and memory.
 
-        return McapSink(Path(target), contract, run)
-    if form == "shm":
-        from edge.sinks.shm import SharedMemorySink
 
-        return SharedMemorySink(target, contract)
-    if form == "zenoh":
-        from edge.sinks.zenoh import ZenohSink
+def _open_status(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.status_line import StatusSink
 
-        return ZenohSink(target, run)
-    with needs_cyclone_dds(text):
+    return StatusSink()
+
+
+def _open_jsonl(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.jsonl import JsonLinesSink
+
+    return JsonLinesSink(target, source, options)
+
+
+def _open_mcap(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.mcap import McapSink
+
+    _check_unit(f"mcap:{target}", contract)
+    return McapSink(Path(target), contract, source)
+
+
+def _open_shm(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.shm import SharedMemorySink
+
+    return SharedMemorySink(target, contract)
+
+
+def _open_zenoh(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.zenoh import ZenohSink
+
+    return ZenohSink(target, source)
+
+
+def _open_ros2(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    with needs_cyclone_dds(f"ros2:{target}"):
         from edge.sinks.ros2.sink import Ros2Sink
-    _check_unit(text, contract)
+    _check_unit(f"ros2:{target}", contract)
     topic, accepts = _ros2_topic(target)
-    return Ros2Sink(topic, run=run if accepts else replace(run, commands=None))
+    return Ros2Sink(topic, source, options.commands if accepts else None)
 
 
 def _check_unit(text: str, contract: Contract) -> None:
     if contract.output_unit != "mm":
         raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
+
+
+def _check_mcap(target: str) -> None:
+    if not target.endswith(".mcap"):
+        raise UsageError(f"sink 'mcap:{target}' names {target!r}, expected a file whose name ends in .mcap")
+
+
+def _check_zenoh(target: str) -> None:
+    from edge.sinks.zenoh import parsed_target
+
+    parsed_target(target)
 
 
 def _ros2_topic(target: str) -> tuple[str, bool]:
@@ -214,3 +250,21 @@ def needs_cyclone_dds(text: str) -> Iterator[None]:
         if (error.name or "").partition(".")[0] != "cyclonedds":
             raise
         raise UsageError(f"{text} needs Cyclone DDS: {how_to_install('ros2')}") from error
+
+
+FORMS: Final = {
+    "status": Form("status", "one live line (default on a terminal)", str, _open_status),
+    "jsonl": Form("jsonl:FILE", "one JSON record a line; jsonl:- is stdout", str, _open_jsonl),
+    "mcap": Form(
+        "mcap:FILE.mcap",
+        "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
+        _check_mcap,
+        _open_mcap,
+    ),
+    "shm": Form("shm:NAME", "latest values in shared memory", str, _open_shm),
+    "zenoh": Form(
+        "zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh, _open_zenoh
+    ),
+    "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic, _open_ros2),
+}
+"""Forms of sinks by their names, in the order of the help."""

@@ -16,7 +16,6 @@ from firmware_bridge.errors import harmless
 from firmware_bridge.schedule import SHOWN_AT_REST_S, SHOWN_SILENT_S
 
 CLEAR_TO_END: Final = "\x1b[K"
-ALL_DETAILS: Final = 4  # levels of detail of the line: 4 has all of it, 0 only what a person must act on
 _COUNTED: Final = ("dropped", "overruns", "torn_wire", "unwritten", "poses", "poses_refused", "poses_dropped")
 """Counters on the line. Of scans torn at the source, noise makes one in forty of a healthy sensor: not an alarm."""
 _SHORTER: Final = {"overruns": "overrun", "torn_wire": "torn"}
@@ -85,75 +84,75 @@ class StatusSink(Sink):
             self._terminal = False  # the window was closed; that ends no recording
 
     def _fitted(self, columns: int) -> str:
-        """Return the most detailed line of a width; one without details may be too long all the same."""
+        """Return the line, of which a narrow terminal gets the brief one; a part that is too long is left out whole."""
         line = self.line()
-        for details in range(ALL_DETAILS - 1, -1, -1):
-            if len(line) <= columns:
-                return line
-            line = self.line(details)
+        if len(line) > columns:
+            line = self.line(brief=True)
         if len(line) <= columns:
             return line
         room = max(columns - len(" ..."), 0)
         ends = [line.rfind(between, 0, room + len(between)) for between in (" | ", " ")]
         return (line[: next((end for end in ends if end > 0), 0)] + " ...")[: max(columns, 0)]
 
-    def line(self, details: int = ALL_DETAILS) -> str:
-        """Return the line, the most important part first."""
+    def line(self, *, brief: bool = False) -> str:
+        """Return the line, the most important part first; a brief one has only what a person acts on."""
         parts = []
         sources = {result.source for result in self._latest.values()} - {"device"}
         parts += sorted(source.upper() for source in sources)
         silence_s = self._clock_s() - self._last_scan_s
         if silence_s >= SHOWN_SILENT_S or not self._latest:
             parts.append(f"no scan for {silence_s:.0f} s")
-        parts += [self._sensor_text(name, details) for name in sorted(self._latest)]
+        parts += [self._sensor_text(name, brief=brief) for name in sorted(self._latest)]
         if self._without_poses:
             of = ",".join(sorted(name or "" for name in self._without_poses))
             parts.append(f"NO POSES {of}".rstrip())
         counted = ((name, self._counters.get(name, 0)) for name in _COUNTED)
         parts += [f"{count} {_SHORTER.get(name, name.replace('_', ' '))}" for name, count in counted if count]
-        if details == ALL_DETAILS:
+        if not brief:
             zeroed = [result for _, result in sorted(self._latest.items()) if result.baseline is not None]
             parts += [result.baseline_text() for result in zeroed]
         return " | ".join(parts)
 
-    def _sensor_text(self, name: str, details: int) -> str:
+    def _sensor_text(self, name: str, *, brief: bool) -> str:
         result = self._latest[name]
         silence_s = self._clock_s() - self._received_s[name]
         if silence_s >= SHOWN_SILENT_S and len(self._latest) > 1:
             return f"{name} no scan for {silence_s:.0f} s"
-        words = [(0, f"{name} {result.state}")]
+        words = [f"{name} {result.state}"]
         if result.state in ("zeroing", "incomplete") and result.note is not None:
             return f"{name} {result.note}"
         if result.state == "baseline_in_doubt":
             return f"{name} BASELINE IN DOUBT: zero the free pad"
         if result.dead:
-            words.append((0, f"without taxel {','.join(map(str, result.dead))}"))
+            words.append(f"without taxel {','.join(map(str, result.dead))}")
         if result.drift is not None and result.drift.step_counts:
-            words.append((1, f"rest off by {result.drift.step_counts:.0f}"))
+            words.append(f"rest off by {result.drift.step_counts:.0f}")
         if result.trusted is None and result.pattern is not None:
-            words.append((1, "not checked"))
+            words.append("not checked")
         if result.trusted is False:
-            words.append((0, f"NOT BELIEVED ({result.untrusted_reason})"))
-        if result.contact:
-            words.append((2, f"tap {result.taps_used}"))
+            words.append(f"NOT BELIEVED ({result.untrusted_reason})")
         if result.force_n is not None:
-            words.append((0, f"{result.force_n:.2f} N"))
+            words.append(f"{result.force_n:.2f} N")
         elif result.force_counts is not None:
-            words.append((0, f"{result.force_counts:.0f} counts"))
+            words.append(f"{result.force_counts:.0f} counts")
         if result.area_mm2 is not None:
-            words.append((1, f"{result.area_mm2:.0f} mm2"))
+            words.append(f"{result.area_mm2:.0f} mm2")
+        if brief:
+            return " ".join(words)
+        if result.contact:
+            words.append(f"tap {result.taps_used}")
         if result.interval_mm is not None:
-            words.append((2, f"+-{result.interval_mm:.3f} mm"))
+            words.append(f"+-{result.interval_mm:.3f} mm")
         if result.next_tap is not None:
-            words.append((2, _next_tap_text(result.next_tap)))
+            words.append(_next_tap_text(result.next_tap))
         if result.reused_from is not None:
-            words.append((3, "unchanged"))
+            words.append("unchanged")
         elif result.run_time_us is not None:
-            words.append((3, f"{result.run_time_us:.0f} us"))
+            words.append(f"{result.run_time_us:.0f} us")
         rate_hz = self._rates[name].rate_hz
         if rate_hz is not None:
-            words.append((3, f"{rate_hz:.0f} Hz"))
-        return " ".join(word for level, word in words if level <= details)
+            words.append(f"{rate_hz:.0f} Hz")
+        return " ".join(words)
 
 
 def _next_tap_text(proposed: NextTap) -> str:

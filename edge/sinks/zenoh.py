@@ -19,7 +19,8 @@ from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
-from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import CountersInTurn, event_record, pack, record
 from firmware_bridge.extras import how_to_install
 
@@ -43,15 +44,16 @@ class ZenohSink(Sink):
         zid: the session's id, which the time stamp of every message holds, too.
     """
 
-    def __init__(self, target: str, run: RunFacts = NOW) -> None:
+    def __init__(self, target: str, source: Source) -> None:
         """Open a session; it does not matter whether a subscriber is there, now or later."""
-        self._target, self._source = target, run.source
+        self._target, self._source = target, source.kind
         self._key, self._session = open_session(target)
         import zenoh
 
         self._failure = zenoh.ZError
         self._turns = CountersInTurn()
-        self._congestion = zenoh.CongestionControl.BLOCK if run.lossless else zenoh.CongestionControl.DROP
+        congestion = zenoh.CongestionControl
+        self._congestion = congestion.BLOCK if source.kind == "replay" else congestion.DROP
         with opening():
             self.zid = str(self._session.zid())
             self._events = self._publisher(f"{self._key}/event", "application/json")

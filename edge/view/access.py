@@ -4,9 +4,8 @@ A browser runs pages of strangers, which can reach a server on loopback, too. Th
 the browser was asked to reach (a stranger's name may resolve to this machine), the origin of the page that opens a
 socket, and, where other machines can reach the server, a token.
 
-A proxy may ask under its own name for this server, so that the origin of our page differs from the name. Such a page
-has the key that was sent in it, which pages of other origins cannot read, and a name that no stranger can have: a
-number, or this machine's without a domain. A page under another name needs the token, which no stranger knows.
+A proxy may ask under its own name for this server, so that the origin of our page differs from the name: such a page
+needs the token, which no stranger knows.
 """
 
 import hmac
@@ -17,7 +16,7 @@ import socket
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fcntl import ioctl
 from http import HTTPStatus
 from pathlib import Path
@@ -44,13 +43,12 @@ class Access:
     """Conditions that a request must meet.
 
     The server listens at `host`, a name or an address; `name` is that of this machine, with or without a domain. The
-    token is None where it is not needed. The key is sent within the page, which gives it when it opens the socket.
+    token is None where it is not needed.
     """
 
     host: str
     name: str
     token: str | None
-    key: str = field(default_factory=lambda: secrets.token_urlsafe(16))
 
     def refusal(self, path: str, hosts: Sequence[str], origins: Sequence[str]) -> Refusal | None:
         """Return the refusal of a request; None if it is granted.
@@ -67,13 +65,11 @@ class Access:
         # A browser sends no origin when a page asks why its socket was refused, so that the page names its own.
         origins = [*origins, *given.get("origin", [])]
         trusted = self.token is not None and _same(given.get("token", [""])[-1], self.token)
-        keyed = _same(given.get("key", [""])[-1], self.key)
         for origin in origins:
-            through = place == SOCKET and (trusted or (keyed and self._is_no_strangers(origin)))
-            if origin != f"http://{hosts[0]}" and not through:
+            if origin != f"http://{hosts[0]}" and not (place == SOCKET and trusted):
                 text = f"pages of {', '.join(origins)} may not send requests to this server"
                 if place == SOCKET:
-                    text += ": load this page again, or pass --view-token T and add ?token=T to its address"
+                    text += ": pass --view-token T to edge-sr, and add ?token=T to the page's address"
                 return Refusal(HTTPStatus.FORBIDDEN, text)
         if place not in (PAGE, SOCKET):
             return Refusal(HTTPStatus.NOT_FOUND, f"there is only {PAGE}")
@@ -106,16 +102,6 @@ class Access:
             return True
         # Any domain will do: a stranger may use this name too, but needs the token where other machines can reach us.
         return not is_loopback(self.host) and name.partition(".")[0] == self.name.lower().partition(".")[0]
-
-    def _is_no_strangers(self, origin: str) -> bool:
-        """Return True if no stranger can have the name in an origin, and let it point here."""
-        scheme, _, authority = origin.partition("://")
-        matched = _HOST.fullmatch(authority)
-        if scheme not in ("http", "https") or matched is None:
-            return False
-        name = (matched["address"] or matched["name"]).lower()
-        own = self.name.lower().partition(".")[0]
-        return _address(name) is not None or name in ("localhost", own, f"{own}.local")
 
 
 def grant(host: str, name: str, token: str | None) -> Access:

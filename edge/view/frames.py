@@ -7,10 +7,7 @@ and a deque is copied in one step, so no reader sees half of anything, and no lo
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final, NamedTuple
-
-import numpy as np
 
 from edge.inference.contract import Contract
 from edge.mapping.sink import MapState
@@ -21,7 +18,6 @@ from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record, pack, record
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.links.replay_player import PlayerState
 from firmware_bridge.schedule import SENSOR_SILENT_NS
 
 TRACE_S: Final = 60.0
@@ -174,13 +170,14 @@ class _Trace:
 class Run(NamedTuple):
     """Facts that do not change during a run: of its source, and of the model that it begins with.
 
-    A viewer that reconnects notices by the `id` that this is another run.
+    A viewer that reconnects notices by the `id` that this is another run. `length_s` is that of a recording, in [s].
     """
 
     name: str
     kind: SourceKind
     model: str
     contract: Contract
+    length_s: float | None
     id: str
 
 
@@ -199,7 +196,7 @@ class Frames:
         self._newest = dict(snapshot.newest)
         self._packed: dict[tuple[str, int], bytes] = {}
         self.map = snapshot.map
-        self._maps: dict[int, bytes] = {}
+        self._map: bytes | None = None
 
     @property
     def numbers(self) -> dict[str, int]:
@@ -216,14 +213,13 @@ class Frames:
         """Return the latest events after number `since`, with their numbers."""
         return [(sent.number, self._event(sent)) for sent in self._snapshot.events(since)]
 
-    def map_since(self, seen: MapState | None) -> bytes:
-        """Return what has changed on the map, which must be made, since a state that a viewer has; None for none."""
-        if self.map is None:
-            raise ValueError("no map is made")
-        number = 0 if seen is None else seen.number
-        if number not in self._maps:
-            self._maps[number] = _map_frame(self.map, seen)
-        return self._maps[number]
+    def of_map(self, state: MapState) -> bytes:
+        """Return the map, which is this state of it."""
+        if self._map is None:
+            header = {"kind": "map", "size_mm": state.size_mm, "centre_mm": state.centre_mm, "counts": state.counts}
+            pads = {name: [pose.x_mm, pose.y_mm, pose.turn_deg] for name, pose in state.pads.items()}
+            self._map = pack(header | {"pads": pads}, {"contact": state.contact})
+        return self._map
 
     def silent(self) -> dict[str, float]:
         """Return the silent sensors, and for how long each has been silent, in [s]."""
@@ -256,25 +252,7 @@ class Frames:
         return pack(header, {name: values for name, values in maps.items() if values is not None})
 
 
-def _map_frame(state: MapState, seen: MapState | None) -> bytes:
-    box = state.since(seen)
-    header = {
-        "kind": "map",
-        "number": state.number,
-        "pixels": state.grid.pixels,
-        "px_per_mm": state.grid.px_per_mm,
-        "centre_mm": state.grid.centre_mm,
-        "from": [0, 0] if box is None else [box.top, box.left],
-        "pads": {name: [pose.x_mm, pose.y_mm, pose.turn_deg] for name, pose in state.pads.items()},
-        "counts": state.counts,
-    }
-    if box is None:
-        return pack(header, {})
-    part = np.s_[box.top : box.bottom, box.left : box.right]
-    return pack(header, {"contact": state.contact[part], "doubted": state.doubted[part]})
-
-
-def hello(run: Run, recording: Path | None) -> bytes:
+def hello(run: Run) -> bytes:
     """Return the first frame that a viewer gets."""
     contract = run.contract
     height, width = contract.pattern_shape
@@ -297,23 +275,14 @@ def hello(run: Run, recording: Path | None) -> bytes:
         "width": width,
         "wrench": contract.traction_scale is not None,
         "checks": bool(contract.trust),
-        "recording": _path(recording),
-        "max_fps": MAX_FPS,
+        "length_s": run.length_s,
     }
     return pack(header, {})
 
 
-def state(
-    recording: Path | None,
-    viewers: int,
-    silent: dict[str, float],
-    played: PlayerState | None = None,
-    recorded: tuple[float, int] | None = None,
-) -> bytes:
-    """Return the frame of the run's state apart from its results; `recorded` is length in [s] and size in bytes."""
-    header = {"kind": "state", "recording": _path(recording), "viewers": viewers, "silent": silent}
-    header["recorded_s"], header["recorded_bytes"] = (None, None) if recorded is None else recorded
-    return pack(header | {"replay": None if played is None else played._asdict()}, {})
+def state(viewers: int, silent: dict[str, float]) -> bytes:
+    """Return the frame of the number of viewers, and of how long sensors have been silent, in [s]."""
+    return pack({"kind": "state", "viewers": viewers, "silent": silent}, {})
 
 
 def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
@@ -323,10 +292,6 @@ def refused(time_ns: int, why: str, source: SourceKind | None) -> bytes:
 
 def _event(fields: Mapping[str, Any], age_ns: int, number: Mapping[str, int]) -> bytes:
     return pack({**fields, **number, "kind": "event", "age_s": _seconds(age_ns)}, {})
-
-
-def _path(path: Path | None) -> str | None:
-    return None if path is None else harmless(str(path))
 
 
 def _drawn(point: Point, first_ns: int) -> list[float | None]:

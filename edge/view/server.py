@@ -7,6 +7,7 @@ import asyncio
 import base64
 import contextlib
 import errno
+import gc
 import hashlib
 import secrets
 import socket
@@ -16,9 +17,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
-from importlib import import_module
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import ClassVar, Final, NamedTuple, Self
 
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -33,18 +33,17 @@ from edge.mapping.sink import MapState
 from edge.perception.event import Event
 from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import LONGEST_BYTES
+from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.view.access import SOCKET, Access, grant, is_everything, own_addresses
 from edge.view.frames import Frames, Run, RunSnapshot, hello, refused, state
-from edge.view.recorder import FORM, Recorder
-from edge.view.viewers import MOST_VIEWERS, AttendedViewer, Connection, Connections, execute
+from edge.view.viewers import MOST_VIEWERS, Viewer, execute
 from firmware_bridge.links.base import SourceKind
-from firmware_bridge.links.replay_player import Player
 
 FOLDER: Final = Path(__file__).with_name("page")
 SCRIPTS: Final = (
-    *("drawing.js", "numbers.js", "link.js", "history.js", "traces.js"),
-    *("sensor.js", "hand.js", "moment.js", "map.js", "page.js"),
+    *("drawing.js", "numbers.js", "link.js", "traces.js"),
+    *("sensor.js", "hand.js", "map.js", "page.js"),
 )
 """Files of the script in the order in which they are joined, so that they share one scope."""
 
@@ -56,13 +55,12 @@ class Page(NamedTuple):
     body: bytes
 
 
-def load_page(key: str = "") -> Page:
-    """Return the page, with its style, its script and its key inside: nothing else is fetched."""
+def load_page() -> Page:
+    """Return the page, with its style and its script inside: nothing else is fetched."""
     style, script = (FOLDER / "page.css").read_bytes(), page_script()
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
     body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
-    body = body.replace(b'name="edge-sr-key" content=""', b'name="edge-sr-key" content="%s"' % key.encode())
     headers = (
         ("Content-Type", "text/html; charset=utf-8"),
         ("Content-Length", str(len(body))),
@@ -91,6 +89,32 @@ def _policy(script: bytes) -> str:
 
 STATE_S: Final = 1.0
 OPEN_S: Final = 5.0
+GONE_S: Final = 10.0
+"""Longest time for which a viewer reads nothing until it is disconnected, in [s]."""
+TIDY_CONNECTIONS: Final = 64
+
+
+class Connection(ServerConnection):
+    """Connection from its first byte on.
+
+    Lost ones are collected as garbage now and then, since the collector is off while the loop runs.
+    """
+
+    alive: ClassVar[set["Connection"]] = set()
+    lost: ClassVar[int] = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Count the connection."""
+        super().connection_made(transport)
+        Connection.alive.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count it no longer."""
+        super().connection_lost(exc)
+        Connection.alive.discard(self)
+        Connection.lost += 1
+        if Connection.lost % TIDY_CONNECTIONS == 0 and not gc.isenabled():
+            self.loop.call_soon(gc.collect)
 
 
 class Server:
@@ -106,7 +130,6 @@ class Server:
         commands: Commands,
         access: Access,
         port: int,
-        recorder: Recorder,
         failed: Callable[[str], object] = lambda text: None,
     ) -> None:
         """Take the port, 0 for any free one; pages are answered from `begin` to `close`.
@@ -116,22 +139,21 @@ class Server:
         """
         self._watched = False
         self._snapshot, self._commands, self._access = snapshot, commands, access
-        self._recorder, self._failed = recorder, failed
-        self._page = load_page(access.key)
+        self._failed = failed
+        self._page = load_page()
         self._socket = listen(access.host, port)
         self.port: int = self._socket.getsockname()[1]
         self._thread: threading.Thread | None = None
-        self._connections = Connections()
-        self._viewers: dict[ServerConnection, AttendedViewer] = {}
+        self._viewers: dict[ServerConnection, Viewer] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
         self._source: SourceKind | None = None
-        self._player: Player | None = None
+        self._looked_at = threading.Event()
 
-    def begin(self, run: Run, player: Player | None = None) -> None:
-        """Answer pages and sockets; `run` is the first that a viewer gets, who steers the player."""
-        self._source, self._player = run.kind, player
+    def begin(self, run: Run, looked_at: threading.Event) -> None:
+        """Answer pages and sockets; `run` is what a viewer gets first, and the first viewer sets `looked_at`."""
+        self._source, self._looked_at = run.kind, looked_at
         ready = threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
         self._thread.start()
@@ -167,19 +189,15 @@ class Server:
 
     async def _show(self, run: Run, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
-
-        class Counted(Connection):
-            every = self._connections
-
         async with serve(
-            partial(self._attend, run),
+            partial(self._attend, hello(run)),
             sock=self._socket,
             process_request=self._answer,
-            create_connection=Counted,
+            create_connection=Connection,
             compression=None,  # it would cost time 25 times a second, for a reader close by
             server_header=None,
             open_timeout=OPEN_S,
-            ping_interval=None,
+            ping_interval=None,  # a viewer is pinged more often
             close_timeout=1.0,
             max_size=LONGEST_BYTES,
         ) as server:
@@ -192,21 +210,19 @@ class Server:
                         await self._news.wait()
                 self._news.clear()
                 frames = Frames(self._snapshot, time.monotonic_ns(), self._source)
-                played = None if self._player is None else self._player.state
-                # A recording that rests is not silent: nothing is wrong with its sensors.
-                silent = {} if played is not None and played.rests else frames.silent()
-                recording = self._recorder.path
-                new_state = (recording, len(self._viewers), tuple(silent), played and played[1:])
-                now_s = time.monotonic()
+                silent, now_s = frames.silent(), time.monotonic()
+                new_state = len(self._viewers), tuple(silent)
                 if new_state != sent or now_s - sent_s >= STATE_S:
                     sent, sent_s = new_state, now_s
-                    broadcast(
-                        self._viewers, state(recording, len(self._viewers), silent, played, self._recorder.recorded)
-                    )
-                for viewer in self._viewers.values():
-                    viewer.send(frames, now_s)
+                    broadcast(self._viewers, state(len(self._viewers), silent))
+                for connection, viewer in self._viewers.items():
+                    for frame in viewer.due(frames) if viewer.keeps_up(now_s) else ():
+                        broadcast([connection], frame)
             server.close(code=CloseCode.GOING_AWAY, reason="the run has ended")
-            self._loop.call_later(0.5, self._connections.abort)  # of viewers that do not read that the run has ended
+            # Of clients that say nothing, and viewers that do not read that the run has ended.
+            for connection in tuple(Connection.alive):
+                if connection.server is server:
+                    self._loop.call_later(0.5, connection.transport.abort)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         headers = request.headers
@@ -214,41 +230,49 @@ class Server:
         if refusal is not None:
             return connection.respond(refusal.status, refusal.text + "\n")
         if request.path.partition("?")[0] == SOCKET:
-            if isinstance(connection, Connection) and self._connections.grant(connection):
-                return None
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"too many viewers ({MOST_VIEWERS}): close one\n")
+            return None
         return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, Headers(self._page.headers), self._page.body)
 
-    async def _attend(self, run: Run, connection: ServerConnection) -> None:
-        viewer = AttendedViewer(connection)
-        with contextlib.suppress(ConnectionClosed):
+    async def _attend(self, first: bytes, connection: ServerConnection) -> None:
+        if len(self._viewers) >= MOST_VIEWERS:
+            await connection.close(CloseCode.TRY_AGAIN_LATER, f"too many viewers ({MOST_VIEWERS}): close one")
+            return
+        viewer = self._viewers[connection] = Viewer()
+        self._watched = True
+        self._looked_at.set()
+        broadcast([connection], first)
+        self._news.set()
+        pinging = asyncio.create_task(_follow(connection, viewer))
+        try:
+            async for message in connection:
+                if connection.state is not State.OPEN:
+                    break  # many commands may wait from before it closed, and each takes its time
+                why = execute(message, viewer, self._commands)
+                if why is not None:
+                    broadcast([connection], refused(time.monotonic_ns(), why, self._source))
+                await asyncio.sleep(0.02)  # so that who never stops asking does not delay the loop
+        except ConnectionClosed:
+            pass
+        finally:
+            del self._viewers[connection]
+            self._watched = bool(self._viewers)
+            pinging.cancel()
+            self._news.set()
+
+
+async def _follow(connection: ServerConnection, viewer: Viewer) -> None:
+    """Ping a viewer again and again; end the connection of one that does not answer."""
+    with contextlib.suppress(ConnectionClosed):
+        while True:
+            viewer.pinged_s = time.monotonic()
             try:
-                async with asyncio.timeout(OPEN_S):
-                    await connection.send(hello(run, self._recorder.path))
+                async with asyncio.timeout(GONE_S):
+                    await (await connection.ping())
             except TimeoutError:
-                connection.transport.abort()
+                connection.transport.abort()  # a regular close would wait for the viewer to read
                 return
-            self._viewers[connection] = viewer
-            self._watched = True
-            if self._player is not None:
-                self._player.begin()
-            pinging = asyncio.create_task(viewer.follow())
-            try:
-                self._news.set()
-                async for message in connection:
-                    if connection.state is not State.OPEN:
-                        break  # many commands may wait from before it closed, and each takes its time
-                    why = execute(message, viewer, self._commands, self._player)
-                    if self._player is not None:
-                        self._news.set()
-                    if why is not None:
-                        broadcast([connection], refused(time.monotonic_ns(), why, self._source))
-                    await asyncio.sleep(0.02)  # so that who never stops asking does not delay the loop
-            finally:
-                del self._viewers[connection]
-                self._watched = bool(self._viewers)
-                pinging.cancel()
-                self._news.set()
+            viewer.pinged_s = None
+            await asyncio.sleep(0.25)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -281,24 +305,19 @@ class LiveView:
         other_urls: more addresses of it, where it listens at all addresses of this machine.
     """
 
-    def __init__(
-        self, host: str, port: int, token: str | None, record_dir: Path, contract: Contract, commands: Commands
-    ) -> None:
+    def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
         """Take the port, 0 for any free one, where `host` leads.
 
-        Requests must carry the token; None makes one where other machines can reach `host`. Recordings are made in
-        `record_dir`. Raises UsageError where the token is not valid, SinkError where the port cannot be taken.
+        Requests must carry the token; None makes one where other machines can reach `host`. Raises UsageError where the
+        token is not valid, SinkError where the port cannot be taken.
         """
         access = grant(host, socket.gethostname(), token)
-        self._snapshot = RunSnapshot()
+        snapshot = self._snapshot = RunSnapshot()
         self._messages: Callable[[Event], object] = lambda event: None
-        self._recorder = Recorder(record_dir, self._tell)
-        commands.record = self._recorder.record
-        import_module(f"edge.sinks.{FORM}")  # now, not between two scans: the import may take a fifth of a second
-        self._server = Server(self._snapshot, commands, access, port, self._recorder, failed=self._failed)
-        self._snapshot.wake = self._server.wake
+        self._server = Server(snapshot, commands, access, port, failed=self._failed)
+        snapshot.wake = self._server.wake
         self._contract = contract
-        self.sinks: list[Sink] = [self._recorder, self._snapshot]
+        self.sinks: list[Sink] = [snapshot]
         addresses = own_addresses(host) if is_everything(host) else []
         self.url, *self.other_urls = access.urls(self._server.port, addresses)
 
@@ -306,28 +325,22 @@ class LiveView:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        try:
-            self._recorder.close()
-        finally:
-            self._server.close()
+        self._server.close()
 
     def begin(
         self,
-        name: str,
-        kind: SourceKind,
+        source: Source,
         model: str,
-        open_sink: Callable[[str], Sink],
         messages: Callable[[Event], object],
-        player: Player | None = None,
+        looked_at: threading.Event | None = None,
     ) -> None:
-        """Answer requests from now on, about a source of this name and kind, and the model that the run begins with.
+        """Answer requests from now on, about an open source and the model that the run begins with.
 
-        `open_sink` opens the sink to record into; `messages` is called with the events of recordings, which viewers get
-        too. The player is of the recording that is shown, and begins with the first viewer; None if there is none.
+        `messages` is called with an event if the page ends early, and `looked_at` is set with the first viewer.
         """
         self._messages = messages
-        self._recorder.open_sink = open_sink
-        self._server.begin(Run(name, kind, model, self._contract, secrets.token_hex(8)), player)
+        run = Run(source.name, source.kind, model, self._contract, source.length_s, secrets.token_hex(8))
+        self._server.begin(run, threading.Event() if looked_at is None else looked_at)
 
     def show_map(self, state: MapState) -> None:
         """Show a state of the map. Never waits."""
@@ -336,7 +349,3 @@ class LiveView:
 
     def _failed(self, why: str) -> None:
         self._messages(Event(time.monotonic_ns(), "trouble", None, why))
-
-    def _tell(self, event: Event) -> None:
-        self._messages(event)
-        self._snapshot.tell(event, {})

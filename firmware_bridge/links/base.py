@@ -24,7 +24,7 @@ class Notice(NamedTuple):
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
             longer does; "note", a remark on a recording or on time stamps.
-        text: message to the user; empty where a recording goes on elsewhere, at a user's wish or its end.
+        text: message to the user; empty where the demo begins again.
         sensors: common prefix of the names of the sensors concerned.
     """
 
@@ -57,6 +57,7 @@ class Link(Protocol):
         unix_offset_ns: offset from the times of a patient link's scans to [ns] since 1970; None if it is not available.
         origin: kind of source of a recording's scans, however often it was played and recorded again; None if it is
             not available, or equals `kind`.
+        length_s: length of a recording, in [s]; None of anything else.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
         states_poses: True where poses of the sensors come with the scans.
         prefix: beginning of the names of all its sensors.
@@ -71,6 +72,7 @@ class Link(Protocol):
     patient: bool = False
     unix_offset_ns: int | None = None
     origin: SourceKind | None = None
+    length_s: float | None = None
     mountings: Mapping[str, Mounting] = MappingProxyType({})
     states_poses: bool = False
     prefix: str = ""

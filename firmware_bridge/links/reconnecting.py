@@ -55,6 +55,7 @@ class LastingLink(Link):
         self.patient = link.patient
         self.unix_offset_ns = link.unix_offset_ns
         self.origin = link.origin
+        self.length_s = link.length_s
         self.states_poses = link.states_poses
         self.fetches = link.fetches
         self.prefix = f"{name}/" if name else ""

@@ -1,6 +1,7 @@
 """Link that plays recordings, at their own speed or as fast as they are read."""
 
 import math
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -37,11 +38,6 @@ class PoseLane:
         self._due_ns = np.fromiter(used_from_ns, np.int64, len(poses)) - first_ns
         self._row = 0
 
-    def begin_at(self, due_ns: int) -> None:
-        """Go on with the poses around a scan, at its time in [ns] since the first one of the recording."""
-        later = self._due_ns >= due_ns - GAP_NS
-        self._row = int(later.argmax()) if later.any() else len(self._poses)
-
     def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
         """Yield the next poses that a scan uses, at `due_ns` [ns] after the first, which is played at `start_ns`."""
         while self._row < len(self._poses) and self._due_ns[self._row] <= due_ns:
@@ -67,13 +63,15 @@ class ReplayLink(Link):
         rate_hz: float | None = None,
         *,
         paced: bool = True,
+        begins: threading.Event | None = None,
         clock: Clock = time.monotonic_ns,
         sleep: Sleep = time.sleep,
     ) -> None:
         """Load the recordings, from their paths or in memory.
 
         They are played by their recorded times, else at their recorded rate, or at `rate_hz` scans a second of each
-        sensor. If `paced`, that is so from now on; else each `read` returns a scan at its recorded time.
+        sensor. If `paced`, that is so from now on, or once `begins` is set; else each `read` returns a scan at its
+        recorded time.
 
         Raises:
             RecordingError: a file cannot be used.
@@ -96,6 +94,7 @@ class ReplayLink(Link):
             for track in recording.tracks
         }
         self.notes: list[str] = []
+        self._begins = begins
         self._clock = clock
         self._sleep = sleep
         lanes = [
@@ -119,6 +118,7 @@ class ReplayLink(Link):
         order = np.lexsort((lane, due_ns))
         self._due_ns, self._lane, self._row = due_ns[order], lane[order], row[order]
         self._place = 0
+        self.length_s = int(self._due_ns[-1]) / NS_PER_S
         self.first_ns = _first_ns(self.recordings[0]) or 0
         if not paced:
             self.unix_offset_ns = self.recordings[0].unix_offset_ns
@@ -135,6 +135,10 @@ class ReplayLink(Link):
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans due since the last call; waits at most `timeout_s` for the first. If patient, the next."""
+        if self._begins is not None:
+            if not self._begins.wait(timeout_s):
+                return []
+            self._begins, self.first_ns = None, self._clock()
         next_ns = self._next_ns()
         if next_ns is None:
             return []

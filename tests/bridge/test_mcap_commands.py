@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from bridge_samples import write_recording
 from cli_samples import start
-from edge_samples import BASELINE, ROOT, make_scan, write_model
+from edge_samples import BASELINE, ROOT, fake_source, make_scan, write_model
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
@@ -21,10 +21,9 @@ from mcap_samples import SURE, arrays_of, make_results, messages_of, odd_scans, 
 
 from edge.cli import main as cli
 from edge.doctor.examine import prepare
-from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2 import messages as ros_messages
+from edge.sinks.ros2.messages import image_map, in_si
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -102,7 +101,7 @@ class TestOffline:
         """The recording begins in contact: zeroed again, the press would be gone."""
         path = tmp_path / "press.mcap"
         scans = [make_scan(number, press_counts=3000, noise=1) for number in range(130)]
-        sink = open_sink(f"mcap:{path}", SURE, RunFacts(unix_offset_ns=1_012_400_000_000))
+        sink = open_sink(f"mcap:{path}", SURE, fake_source(unix_offset_ns=1_012_400_000_000))
         for result in make_results(scans, unix_time_s=lambda: 1012.4):
             sink.write(result, {})
         sink.close()

@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_scan
 from mcap_samples import OFFSET_NS, SURE, TURNED, make_results, messages_alone, record_into
 
 from edge import api
 from edge.api import open_recording, open_runtime
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
-from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -94,7 +93,7 @@ def test_an_emulated_sensor_stays_one_in_every_generation(tmp_path, kind, copy):
 def test_another_pad_is_known_without_metadata(tmp_path, rows, cols):
     geometry, grid = SensorGeometry("mine", rows, cols, 5.0, 30.0, 30.0), (rows, cols)
     baseline = replace(BASELINE, counts=np.full((3, *grid), 30_000.0, np.float32))
-    sink = McapSink(tmp_path / "a.mcap", SURE, RunFacts(unix_offset_ns=OFFSET_NS, geometry=geometry))
+    sink = McapSink(tmp_path / "a.mcap", SURE, fake_source(unix_offset_ns=OFFSET_NS, geometry=geometry))
     result = make_results([make_scan()])[0]
     everything = np.ones(grid, bool)
     scan = replace(result.scan, counts=np.full((3, *grid), 30_000, np.int32), fresh=everything, renewed=everything)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, make_contract, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, FakeModel, fake_source, make_contract, make_scan, make_wrench_result
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_samples import (
@@ -29,14 +29,11 @@ from mcap_samples import (
 
 from edge.api import open_runtime, open_source
 from edge.perception.event import Event
-from edge.pipeline.sink import RunFacts
-from edge.sinks import mcap_writer
-from edge.sinks.mcap import McapSink
-from edge.sinks.mcap_writer import CHUNK_S
+from edge.sinks import mcap
+from edge.sinks.mcap import CHUNK_S, McapSink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
-from edge.sinks.ros2.cdr_messages import RESULT
-from edge.sinks.ros2.map_messages import image_map, in_si
+from edge.sinks.ros2 import messages as ros_messages
+from edge.sinks.ros2.messages import RESULT, image_map, in_si
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -120,7 +117,7 @@ class TestSink:
         now_ns = time.monotonic_ns()
         results = make_results([make_scan(number, time_ns=now_ns + number) for number in range(2)])
         before_ns = time.time_ns()
-        sink = open_sink(f"mcap:{tmp_path}/out.mcap", SURE)
+        sink = open_sink(f"mcap:{tmp_path}/out.mcap", SURE, fake_source())
         sink.write(results[0], {})
         monkeypatch.setattr(time, "time_ns", lambda: 0)
         sink.write(results[1], {})
@@ -130,7 +127,7 @@ class TestSink:
 
     def test_scans_are_on_the_disk_within_a_second(self, tmp_path):
         now_s = [0.0]
-        sink = McapSink(tmp_path / "out.mcap", SURE, clock_s=lambda: now_s[0])
+        sink = McapSink(tmp_path / "out.mcap", SURE, fake_source(), clock_s=lambda: now_s[0])
         sink.write(make_results([make_scan()])[0], {})
         now_s[0] = CHUNK_S
         while not sink.scans:
@@ -140,11 +137,13 @@ class TestSink:
 
     @pytest.mark.parametrize("lossless", [True, False])
     def test_a_disk_that_hangs_is_waited_for_by_the_lossless_alone(self, tmp_path, limits, lossless):
-        limits(mcap_writer, MOST_WAITING_BYTES=20_000)
+        limits(mcap, MOST_WAITING_BYTES=20_000)
         path = HangingDisk(tmp_path / "out.mcap")
         path.hangs_s = 0.05 if lossless else None
         results = make_results([make_scan(number) for number in range(50)])
-        sink = McapSink(path, SURE, RunFacts(lossless=lossless), clock_s=itertools.count(0.0, 0.1).__next__)
+        sink = McapSink(
+            path, SURE, fake_source("replay" if lossless else "device"), clock_s=itertools.count(0.0, 0.1).__next__
+        )
         for result in results:
             sink.write(result, {})
         left_out = sink.unwritten
@@ -227,7 +226,7 @@ def test_public_readers_find_units_frames_and_marks(tmp_path):
     results = [replace(one, source="emulated") for one in make_results(odd_scans())]
     path = tmp_path / "press.mcap"
     sink = McapSink(
-        path, make_contract(), RunFacts(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+        path, make_contract(), fake_source(unix_offset_ns=OFFSET_NS, frames={"4": PadFrame("tool0", (0, 0, 50.5))})
     )
     for result in results:
         scan = replace(result.scan, device_ns=result.scan.time_ns - 2_000_000)
@@ -253,7 +252,9 @@ def test_public_readers_find_units_frames_and_marks(tmp_path):
 
 def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
     layout = json.loads((ROOT / "examples/viewers/foxglove.json").read_text())
-    sink = McapSink(tmp_path / "press.mcap", make_contract(), RunFacts(frames={"4": PadFrame("tool0", (0, 0, 50.5))}))
+    sink = McapSink(
+        tmp_path / "press.mcap", make_contract(), fake_source(frames={"4": PadFrame("tool0", (0, 0, 50.5))})
+    )
     result = make_wrench_result()
     sink.write(replace(result, deviation=result.pattern / 10), {})
     sink.tell(Event(time.monotonic_ns(), "note", None, "hello"), {})

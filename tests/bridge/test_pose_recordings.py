@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
 from cli_samples import write_recording as write_npz
-from edge_samples import BASELINE, FakeModel, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_scan
 from mcap_samples import OFFSET_NS, arrays_of
 from pose_samples import PosedModel
 
 from edge import api
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import Stream
-from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.links.replay import ReplayLink
@@ -55,7 +54,7 @@ def record(path, poses=POSES):
         arrays_of(record(path.with_suffix(".mcap"), poses))
         return path
     runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
-    sink = McapSink(path, FakeModel().contract, RunFacts(unix_offset_ns=OFFSET_NS))
+    sink = McapSink(path, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
     for number, scan in enumerate(make_scans()):
         mine = [TimedPose(p.pose, p.time_ns, p.sensor, p.holds, scan.time_ns) for p, first in poses if first == number]
         if mine:
@@ -93,7 +92,7 @@ def test_a_replay_that_is_recorded_again_is_the_same_again(tmp_path):
     again = tmp_path / "again.mcap"
     runtime = PosedRuntime()
     with api.open_recording(first) as source:
-        sink = McapSink(again, FakeModel().contract, RunFacts(unix_offset_ns=OFFSET_NS))
+        sink = McapSink(again, FakeModel().contract, fake_source(unix_offset_ns=OFFSET_NS))
         api.pump(source, runtime, [sink], api.Statistics())
         sink.close()
     assert played(again)[0] == played(first)[0] == expected_order()

@@ -53,7 +53,7 @@ PARSED = {
     r"python tests/system/program_cost\.py.*": "takes a minute; test_bench_timing runs it, shortened",
     r"python tests/system/hot_path\.py.*": "takes ten seconds; .ci/run runs it, and test_bench_timing",
     r"edge-sr (record |replay |--source replay:)FILE(\.\.\.)?( --view)?": "a name to be filled in; press.mcap is run",
-    r"edge-sr replay --example --view": "waits for who looks; test_view_recorder looks at a recording",
+    r"edge-sr replay --example --view": "waits for who looks; test_view_page_recordings looks at a recording",
 }
 LEFT_OUT = {
     r"git clone .*": "needs the network",

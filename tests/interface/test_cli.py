@@ -103,8 +103,6 @@ ZERO = "baseline --rate-hz 1000 --out {tmp}/zero.json --source replay:"
         (2, "baseline --out x --source demo --scans 99", ["scans is 99", "from 100"]),
         (2, "baseline --out x --skip -1", ["--skip"]),
         (2, "--source demo --view-host 0.0.0.0", ["--view-host requires --view"]),
-        (2, "--source demo --view-record-dir .", ["--view-record-dir requires --view"]),
-        (2, "--source demo --view 0 --view-record-dir /no/such", ["--view-record-dir /no/such: expected a folder"]),
         (2, "--source demo --view 0 --view-token short", ["a token of 5 characters for the live page: expected at"]),
         (5, "--source demo --view 0 --view-host 192.0.2.1", ["192.0.2.1 is not an address of this machine; name one"]),
         (5, "--source demo --view 0 --view-host no.invalid", ["no.invalid is not an address of this machine; name"]),

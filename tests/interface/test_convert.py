@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, make_scan
+from edge_samples import ROOT, fake_source, make_scan
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
 
 from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
 from edge.perception.result_fields import MAPS
-from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -41,7 +40,7 @@ def made(tmp_path) -> tuple[Path, list[Result]]:
     """A recording of two sensors with all that scans may have, one of them mounted turned, with poses."""
     results = make_results(odd_scans(), source="emulated", mountings={"4": TURNED})
     path = tmp_path / "press.mcap"
-    sink = open_sink(f"mcap:{path}", SURE, RunFacts(mountings={"4": TURNED}, unix_offset_ns=10**18))
+    sink = open_sink(f"mcap:{path}", SURE, fake_source(mountings={"4": TURNED}, unix_offset_ns=10**18))
     for number, result in enumerate(results):
         if number % 4 == 0:
             pose = PadPose(number, -number / 3, 10 * number, 0.4, 0.5)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from edge_samples import make_pad_contract, make_wrench_result
+from edge_samples import fake_source, make_pad_contract, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
@@ -14,9 +14,7 @@ from edge.inference.trust import features
 from edge.perception.pattern_description import Balance, wrench_of
 from edge.perception.result import LEAST_FORCE_N
 from edge.sinks.mcap import McapSink
-from edge.sinks.ros2.cdr_messages import WRENCH_STAMPED, force_and_torque
-from edge.sinks.ros2.diagnostics import diagnose
-from edge.sinks.ros2.map_messages import image_map
+from edge.sinks.ros2.messages import WRENCH_STAMPED, force_and_torque, image_map
 
 PITCH_MM, PIXELS = 4.7, 8
 PIXEL_MM = 4 * PITCH_MM / PIXELS
@@ -107,7 +105,7 @@ def test_where_nothing_presses_the_traction_stays(press):
 
 
 def test_a_recording_holds_it_as_messages_and_as_arrays(tmp_path):
-    sink = McapSink(tmp_path / "out.mcap", make_pad_contract(interval_factor=1.6))
+    sink = McapSink(tmp_path / "out.mcap", make_pad_contract(interval_factor=1.6), fake_source())
     results = [make_wrench_result(number, press) for number, press in ((0, 0), (1, 20_000))]
     for result in results:
         sink.write(result, {})
@@ -133,4 +131,3 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
     assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
     told = force_and_torque(both, USPA44)
     assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
-    assert diagnose(both, {}, {}, 0.0, None).values["wrench_origin"] == "calibrated"

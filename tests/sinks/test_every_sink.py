@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ROOT, ListSink
+from edge_samples import ROOT, ListSink, fake_source
 from mcap_samples import messages_of
 from sink_samples import (
     CONTRACT,
@@ -27,10 +27,11 @@ from sink_samples import (
 )
 
 from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
+from edge.pipeline.sink import SinkOptions
 from edge.sinks.json_encoding import COUNTED_NS
 from edge.sinks.jsonl import JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
-from edge.sinks.ros2.cdr_messages import RESULT
+from edge.sinks.ros2.messages import RESULT
 
 
 @pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__.lower())
@@ -92,8 +93,9 @@ from pathlib import Path
 from edge.errors import SinkError
 from dataclasses import replace
 from sink_samples import CONTRACT, RUN, every_kind
+from edge_samples import fake_source
 from edge.sinks.registry import open_sink
-sink, contact = open_sink(sys.argv[1], CONTRACT), every_kind()[3]
+sink, contact = open_sink(sys.argv[1], CONTRACT, fake_source()), every_kind()[3]
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 try:
@@ -132,12 +134,16 @@ def gone(tmp_path: Path) -> Sink:
     """Return a sink whose reader has left."""
     os.mkfifo(tmp_path / "fifo")
     reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
-    sink = JsonLinesSink(str(tmp_path / "fifo"))
+    sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source(), SinkOptions())
     os.close(reader)
     return sink
 
 
-@pytest.mark.parametrize("bad", [lambda path: JsonLinesSink("/dev/full"), gone], ids=["full", "gone"])
+def full(tmp_path: Path) -> Sink:
+    return JsonLinesSink("/dev/full", fake_source(), SinkOptions())
+
+
+@pytest.mark.parametrize("bad", [full, gone])
 def test_a_sink_that_fails_leaves_the_others_going_and_each_hears_of_it(bad, tmp_path):
     events: list[Event] = []
     fan, good = Fan(events.append, lambda: 11), ListSink()
@@ -155,7 +161,7 @@ def test_a_sink_that_fails_leaves_the_others_going_and_each_hears_of_it(bad, tmp
 
 
 def test_the_failure_of_the_last_one_ends_the_run_and_a_reader_that_goes_is_an_ordinary_end(tmp_path):
-    for failing, kind in ((JsonLinesSink("/dev/full"), SinkError), (gone(tmp_path), SinkClosedError)):
+    for failing, kind in ((full(tmp_path), SinkError), (gone(tmp_path), SinkClosedError)):
         fan = Fan(lambda event: None)
         fan.add(failing)
         with pytest.raises(SinkError) as ended:
@@ -181,7 +187,10 @@ def test_the_failure_of_the_last_one_ends_the_run_and_a_reader_that_goes_is_an_o
         ("zenoh:a?listen=x", UsageError, "'listen=x' after its key: expected zenoh:KEY, zenoh:KEY?connect="),
         ("zenoh:a?connect=here", UsageError, "'connect=here' after its key"),
         ("zenoh:a?", UsageError, "'' after its key"),
-        *((text, UsageError, ", ".join(FORMS)) for text in ("", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "x")),
+        *(
+            (text, UsageError, ", ".join(one.text for one in FORMS.values()))
+            for text in ("", "jsonl", "jsonl:", "npz:", "csv:a", "status:x", "x")
+        ),
     ],
 )
 def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, error, words, tmp_path, monkeypatch):
@@ -189,7 +198,7 @@ def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, 
     Path("taken.mcap").write_text("mine")
     os.mkfifo("fifo")
     with pytest.raises(error) as refused:
-        open_sink(text, CONTRACT)
+        open_sink(text, CONTRACT, fake_source())
     assert words in str(refused.value) and str(refused.value).isprintable()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo", "taken.mcap"]
     assert Path("taken.mcap").read_text() == "mine"
@@ -202,7 +211,7 @@ def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, 
 def test_metres_need_a_model_whose_unit_is_known(form, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UsageError, match="patterns are in 'counts', expected mm: use another sink"):
-        open_sink(form, replace(CONTRACT, output_unit="counts"))
+        open_sink(form, replace(CONTRACT, output_unit="counts"), fake_source())
     assert not list(tmp_path.iterdir())
 
 

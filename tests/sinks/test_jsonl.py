@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sink_samples import RUN, make_results, make_sure_results
 
 from edge.api import Event, MessageError, Runtime
-from edge.pipeline.sink import RunFacts
+from edge.pipeline.sink import SinkOptions
 from edge.sinks.json_encoding import ALWAYS, pack, unpack
 from edge.sinks.jsonl import JsonLinesSink, has_room, record_line
 from firmware_bridge.scans.scan import VendorReading
@@ -31,7 +31,7 @@ class TestJsonLines:
         assert [result.reused_from for result in results] == [None, None, 0, 1, None, None, None, 6]
         path = tmp_path / "out.jsonl"
         path.write_text("old\n")
-        sink, expected = JsonLinesSink(str(path)), b""
+        sink, expected = JsonLinesSink(str(path), fake_source(), SinkOptions()), b""
         for number, result in enumerate(results):
             sink.write(result, RUN)
             expected += record_line(result, None if number > 1 else RUN | {"unwritten": 0})  # the first of each sensor
@@ -48,7 +48,7 @@ class TestJsonLines:
     )
     def test_a_record_holds_the_fields_that_are_named_and_what_a_robot_must_see(self, chosen, more, tmp_path):
         whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
-        sink = JsonLinesSink(str(path), RunFacts(fields=chosen))
+        sink = JsonLinesSink(str(path), fake_source(), SinkOptions(fields=chosen))
         sink.write(whole, RUN)
         sink.close()
         record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
@@ -81,7 +81,7 @@ class TestJsonLines:
         assert line.endswith(b"}\n") and line.count(b"\n") == 1
 
     def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
-        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), RunFacts(source="replay"))
+        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), fake_source(), SinkOptions())
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
         sink.close()
         assert json.loads((tmp_path / "out.jsonl").read_text()) == {
@@ -99,7 +99,7 @@ class TestJsonLines:
         fifo = tmp_path / "fifo"
         os.mkfifo(fifo)
         reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-        sink = JsonLinesSink(str(fifo), RunFacts(lossless=False))
+        sink = JsonLinesSink(str(fifo), fake_source("device"), SinkOptions())
         result, written = make_results(3)[4], 300
         for _ in range(written):
             sink.write(result, {})  # would wait for ever
@@ -125,7 +125,7 @@ class TestJsonLines:
         os.mkfifo(tmp_path / "fifo")
         with subprocess.Popen(["wc", "-l", tmp_path / "fifo"], stdout=subprocess.PIPE) as reader:
             descriptor = os.open(tmp_path / "fifo", os.O_WRONLY)  # waits for the reader
-            sink = JsonLinesSink(str(tmp_path / "fifo"))
+            sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source(), SinkOptions())
             os.close(descriptor)
             for _ in range(300):
                 sink.write(make_results(3)[4], {})

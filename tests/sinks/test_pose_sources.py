@@ -16,8 +16,7 @@ from edge_samples import BASELINE, FakeModel, make_scan, wait_for
 
 from edge.api import Runtime, UsageError
 from edge.pipeline.pose_queue import PoseError, PoseIntake, PoseQueue
-from edge.pose_sources.open_poses import check_poses, open_poses
-from edge.pose_sources.ros2_poses import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, pad_pose, placed
+from edge.pose_sources import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, check_poses, open_poses, pad_pose, placed
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 

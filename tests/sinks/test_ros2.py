@@ -12,14 +12,12 @@ from ros2_samples import ENVIRONMENT, TAG, Listener, Speaker, contact, keep_publ
 
 pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
-from edge_samples import make_contract, make_wrench_result, wait_for
+from edge_samples import fake_source, make_contract, make_wrench_result, wait_for
 
 from edge.api import Command, Commands, Event
-from edge.pipeline.sink import RunFacts
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2 import cdr_messages as ros_messages
 from edge.sinks.ros2 import dds_domain as ros2_domain
-from edge.sinks.ros2.diagnostics import Level, diagnose
+from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.sink import NUMBERS, Ros2Sink
 from firmware_bridge.pad_geometry import pad_of
 from firmware_bridge.scans.scan import VendorReading
@@ -41,7 +39,6 @@ TOPICS = {
     "skin/left/s4/pattern": IMAGE,
     "skin/left/s4/wrench": WRENCH,
     "skin/events": STRING,
-    "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 
 
@@ -83,7 +80,7 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
     with Listener(TOPICS) as listener:
         talker = Talker(sink)
         wanted = TOPICS.keys() - {"skin/events", "skin/left/s4/wrench"}
-        listener.until(lambda: all(len(listener.of(topic)) >= 3 for topic in wanted - {"diagnostics"}), talker)
+        listener.until(lambda: all(len(listener.of(topic)) >= 3 for topic in wanted), talker)
         for topic, sensor, name in (
             ("skin/s4/pattern", "4", "pattern"),
             ("skin/s4/deviation", "4", "deviation"),
@@ -138,12 +135,8 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
 
         sink.write(contact(2000, source="emulated"), {})
         sink.close()
-        listener.until(lambda: [a for a in listener.of("diagnostics") if a["status"][0]["message"] == "ended"])
-        statuses = {status["hardware_id"]: status for status in listener.of("diagnostics")[-1]["status"]}
-        assert {name: status["name"] for name, status in statuses.items()} == {"4": "skin: 4", "left/4": "skin: left/4"}
-        assert {status["level"] for status in statuses.values()} == {Level.STALE}
-        assert np.isnan(pixels(listener.of("skin/s4/pattern")[-1])).all(), "left standing by a program that has ended"
         listener.until(lambda: listener.of("skin/s4/state")[-1]["data"] == "ended")
+        listener.until(lambda: np.isnan(pixels(listener.of("skin/s4/pattern")[-1])).all())
         for message in listener.of("skin/s4/wrench"):
             assert np.isfinite([*message["wrench"]["force"].values(), *message["wrench"]["torque"].values()]).all()
         assert not listener.of("skin/left/s4/wrench"), "no newtons are known of it"
@@ -205,8 +198,6 @@ def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     assert told(replace(result, scan=scan, force_n=1.9)) == ([], 1.9), "x and y of another calibration than z"
     wrenches, force_z_n = told(result)
     assert not wrenches and math.isnan(force_z_n), "counts in place of newtons"
-    said = {z: diagnose(replace(result, force_n=z), {}, {}, 0.0, None).values["wrench"] for z in (None, 1.9)}
-    assert "counts only" in said[None] and "on force_z_n" in said[1.9]
     assert ros_messages.force_and_torque(replace(result, scan=scan, force_n=2.0), pad_of(3, 3)) is None, "no places"
 
 
@@ -237,7 +228,7 @@ def test_subscribers_get_force_and_torque_of_a_model_with_traction(sink):
 def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back():
     frames = {"left": PadFrame("tool0", (0.0, 12.5, 50.0), (0.0, 1.0, 0.0, 0.0)), "far": PadFrame("base")}
     commands = Commands()
-    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(frames=frames, commands=commands))
+    sink = Ros2Sink("skin", fake_source(frames=frames), commands, environment=ENVIRONMENT)
     for _ in range(2):
         sink.write(contact(1, sensor="left", source="emulated"), {})
     with Listener({"tf_static": FRAMES}) as listener:
@@ -275,7 +266,7 @@ def test_commands_are_taken_only_where_that_was_asked_for(text, listens, monkeyp
         monkeypatch.setenv(name, value)
     commands, asked = Commands(), []
     commands.ask = asked.append
-    open_sink(text, make_contract(), RunFacts(commands=commands)).close()
+    open_sink(text, make_contract(), fake_source(), commands=commands).close()
     assert bool(asked) is listens
 
 
@@ -285,7 +276,7 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
     assert fast_dds in ros2_domain.configuration({})
     cyclone_dds = f"<Compatibility>{fast_dds.replace('1.15', '1.16')}</Compatibility>"
     there = f",<CycloneDDS><Domain>{cyclone_dds}</Domain></CycloneDDS>"
-    sink = Ros2Sink("skin", ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there})
+    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there})
     try:
         talker = Talker(sink)
         with Listener({"skin/s4/pattern": IMAGE}, "signed-bytes", more=there) as listener:
@@ -298,7 +289,7 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():
     published = []
-    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(source="emulated"))
+    sink = Ros2Sink("skin", fake_source("emulated"), environment=ENVIRONMENT)
     keep_published(sink, published)
 
     def forces():

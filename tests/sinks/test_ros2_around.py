@@ -1,4 +1,4 @@
-"""Around the ROS 2 sink: diagnostics, topics, environments, files for ROS, and bytes as ROS itself makes them."""
+"""Around the ROS 2 sink: topics, environments, files for ROS, and bytes as ROS itself makes them."""
 
 import pytest
 
@@ -19,21 +19,19 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import BASELINE, ROOT, make_scan, make_wrench_result
+from edge_samples import ROOT, fake_source, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
-from edge.api import Event, Note, Result, SinkError, UsageError
+from edge.api import Event, SinkError, UsageError
 from edge.cli.main import parser
-from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import record
 from edge.sinks.registry import check_sink
-from edge.sinks.ros2 import cdr_messages, map_messages
-from edge.sinks.ros2.cdr_messages import LONGEST_TOPIC, base_topic, sensor_topic
+from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
-from edge.sinks.ros2.diagnostics import Level
+from edge.sinks.ros2.messages import LONGEST_TOPIC, base_topic, sensor_topic
 from edge.sinks.ros2.sink import Ros2Sink
 from firmware_bridge.errors import CdrError
 from firmware_bridge.links.base import Notice
@@ -51,59 +49,14 @@ class Clock:
         return self.now_ns
 
 
-def test_diagnostics_come_once_a_second_and_tell_of_silence_and_what_it_was():
-    clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock, unix_ns=lambda: 1_700_000_000_123_456_789)
-    keep_published(sink, published)
-
-    def statuses():
-        taken = [status for message in published for status in message.get("status", ())]
-        published.clear()
-        return [(status["level"], status["message"]) for status in taken]
-
-    scan = make_scan(1, time_ns=clock.now_ns)
-    idle = Result(scan, "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
-    for _ in range(250):
-        clock.now_ns += 10_000_000
-        sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns)), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "2 dropped"), (Level.OK, "idle")]
-    sink.tell(Event(clock.now_ns, "trouble", None, "bus-off"), {"dropped": 2})
-    clock.now_ns += 1_500_000_000
-    sink.wait()
-    sink.wait()
-    assert statuses() == [(Level.STALE, "no scan for 2 s; bus-off")]
-    sink.tell(Event(clock.now_ns, "well", None, "well again"), {"dropped": 2})
-    sink.tell(Event(clock.now_ns, "silent", "5", "another is silent"), {"dropped": 2})
-    clock.now_ns += 1_000_000_000
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), dead={3: "stuck"}), {"dropped": 2})
-    assert statuses() == [(Level.WARN, "without taxel 3 (stuck)")]
-    clock.now_ns += 1_000_000_000
-    doubtful = {"state": "contact", "trusted": False, "untrusted_reason": "unexplained"}
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubtful), {"dropped": 2})
-    (status,) = statuses()
-    assert status[0] == Level.WARN
-    assert status[1].startswith("pattern not to be believed: the pattern does not explain its readings")
-    clock.now_ns += 1_000_000_000
-    doubt = {"state": "baseline_in_doubt", "contact": None, "notes": (Note("baseline_in_doubt", "why"),)}
-    sink.write(replace(idle, scan=replace(scan, time_ns=clock.now_ns), **doubt), {"dropped": 2})
-    assert statuses() == [(Level.ERROR, "why")]
-    published.clear()
-    sink.tell(Event(clock.now_ns, "lost", None, "the plug is out"), {})
-    sink.close()
-    began_ns = 1_700_000_000_123_456_789
-    stamp = published[-1]["header"]["stamp"]
-    passed_ns = clock.now_ns - 10**12
-    assert stamp["sec"] * 10**9 + stamp["nanosec"] == began_ns + passed_ns, "wall time, from the start's on"
-
-
 DAYS_NS = 3 * 86_400 * 10**9
 
 
-def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_silent():
+def test_what_is_not_of_now_has_the_times_of_its_recording():
     """Recorded on a machine that was up for three days more than this one."""
     recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, RunFacts(unix_offset_ns=offset_ns, source="replay"), clock_ns=clock)
+    sink = Ros2Sink("skin", fake_source(unix_offset_ns=offset_ns), environment=ENVIRONMENT, clock_ns=clock)
     clock.now_ns += 60 * 10**9
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)
@@ -111,24 +64,28 @@ def test_what_is_not_of_now_has_the_times_of_its_recording_and_is_not_called_sil
     sink.close()
     stamps = [one["header"]["stamp"] for one in published if "header" in one]
     assert {stamp["sec"] * 10**9 + stamp["nanosec"] for stamp in stamps} == {recorded_ns + offset_ns}
-    said = [status for one in published for status in one.get("status", ())]
-    assert [status["message"] for status in said] == ["REPLAY, not a sensor", "ended"]
-    assert "scan_age_s" not in {pair["key"] for status in said for pair in status["values"]}
+
+
+def test_stamps_of_now_are_wall_time_by_the_clock_at_the_start():
+    clock, published, began_ns = Clock(), [], 1_700_000_000_123_456_789
+    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock, unix_ns=lambda: began_ns)
+    keep_published(sink, published)
+    result = contact(1)
+    sink.write(replace(result, scan=replace(result.scan, time_ns=clock.now_ns + 5_000_000_000)), {})
+    stamp = published[0]["header"]["stamp"]
+    assert stamp["sec"] * 10**9 + stamp["nanosec"] == began_ns + 5_000_000_000
+    sink.close()
 
 
 def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another():
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", ENVIRONMENT, clock_ns=clock)
+    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
     for name in ("left/4", "right/4"):
         sink.write(contact(1, sensor=name), {})
     keep_published(sink, published)
     for kind, link in (("lost", "left"), ("trouble", "left"), ("well", "right")):
         sink.tell(Event.of(Notice(clock.now_ns, kind, f"{link}: {kind}", f"{link}/")), {})
     assert [one["data"] for one in published if one.get("data") in ("lost", "silent")] == ["lost"]
-    clock.now_ns += 1_000_000_000
-    sink.wait()
-    (left, right) = (status["message"] for one in published for status in one.get("status", ()))
-    assert left.endswith("left: lost; left: trouble") and "trouble" not in right
     sink.close()
 
 
@@ -167,14 +124,14 @@ NONSENSE = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
 )
 def test_an_environment_that_ros_would_not_take_is_refused(environment, error, said):
     with pytest.raises(error, match=said):
-        Ros2Sink("skin", environment)
+        Ros2Sink("skin", fake_source(), environment=environment)
 
 
 def test_without_the_package_one_line_says_how_to_get_it():
     script = (
         "import sys; sys.modules['cyclonedds'] = None\n"
         "from edge.sinks.registry import open_sink\n"
-        "try: open_sink('ros2:skin', None)\n"
+        "try: open_sink('ros2:skin', None, None)\n"
         "except ValueError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -195,7 +152,7 @@ def test_the_launch_file_starts_a_command_that_edge_sr_takes():
     program, *words = shlex.split(command)
     options = parser().parse_args(words)
     assert (program, str(options.sensor)) == ("edge-sr", "s.toml")
-    assert [check_sink(one) for one in options.sink] == [("ros2", "skin?commands")]
+    assert [(form.text, target) for form, target in map(check_sink, options.sink)] == [("ros2:TOPIC", "skin?commands")]
     (node,) = launch.iter("node")
     assert (FILES / node.get("args").removeprefix("-d $(dirname)/")).is_file()
 
@@ -215,7 +172,7 @@ def test_rviz_shows_topics_that_are_published(sink):
     assert (qos["durability"], qos["reliability"]) == ("transient_local", "reliable")
 
 
-KINDS = [one for one in cdr_messages.TYPES.values() if one.name in TYPE_HASHES]
+KINDS = [one for one in ros_messages.TYPES.values() if one.name in TYPE_HASHES]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
@@ -229,7 +186,7 @@ def test_types_are_called_described_and_hashed_as_ros_does(kind):
 def test_every_type_is_ros_own():
     """Also those of recordings, which are not published."""
     assert TYPE_HASHES.keys() == {one.name for one in KINDS}
-    for kind in cdr_messages.TYPES.values():
+    for kind in ros_messages.TYPES.values():
         assert [(field.name, field.kind) for field in kind.fields] == [
             (name, ros_kind.replace("/msg/", "/")) for name, ros_kind, _ in ros2_messages.fields(kind.name)
         ]
@@ -247,7 +204,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
     event = Event(3, "refused", "4", "not done, ä")
     sink.write(replace(result, deviation=result.pattern / 10, centroid_mm=(1.0, 2.0), events=(event,)), {"dropped": 1})
     sink.close()
-    sent += [("tf2_msgs/msg/TFMessage", cdr_messages.transforms(frames, UNIX_NS))]
+    sent += [("tf2_msgs/msg/TFMessage", ros_messages.transforms(frames, UNIX_NS))]
     assert {name for name, _ in sent} == TYPE_HASHES.keys(), "every type that is published"
     for name, message in sent:
         again = ros2_messages.dds_type(name).deserialize(message).serialize(use_version_2=False)
@@ -256,7 +213,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
 
 
 def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
-    image = map_messages.image(map_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
+    image = ros_messages.image(ros_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
     values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", image)["data"]), "<f4")
     assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
 
@@ -265,14 +222,14 @@ UNIX_NS = 1_700_000_000_123_456_789
 
 
 def test_another_image_is_not_taken_for_a_map():
-    said = cdr_messages.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    said = ros_messages.IMAGE.decode(ros_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
-        map_messages.image_map(cdr_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+        ros_messages.image_map(ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():
     for result in make_results(odd_scans(4)):
-        said = cdr_messages.RESULT.decode(cdr_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
+        said = ros_messages.RESULT.decode(ros_messages.result_message(result, record(result, {"late": 1}), UNIX_NS))
         told = json.loads(said["record"])
         assert told["counts"][2][1][1] == (result.scan.counts[2, 1, 1] if result.scan.fresh[1, 1] else None)
         assert told["counters"] == {"late": 1} and said["header"]["frame_id"] == result.scan.sensor

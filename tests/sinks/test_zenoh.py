@@ -16,13 +16,12 @@ import orjson
 import pytest
 import zenoh_samples
 from bridge_samples import write_recording
-from edge_samples import ROOT, ended, make_scan, wait_for, write_model
+from edge_samples import ROOT, ended, fake_source, make_scan, wait_for, write_model
 from test_listening import reachable
 from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
-from edge.pipeline.sink import RunFacts
 from edge.sinks.json_encoding import event_record, record, unpack
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
@@ -43,7 +42,7 @@ class TestMessages:
         consumer, results = consume(endpoint), make_results(40)
         assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
         event = Event(5, "lost", None, "the cable is out")
-        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, RunFacts(source="emulated"))
+        sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         expected = []
         for number, result in enumerate(results):
             counters = {"scans": number}
@@ -56,7 +55,7 @@ class TestMessages:
                 expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
             if number == 20:
                 sink.tell(event, counters)
-                said = plain(event_record(event, counters, "emulated"))
+                said = plain(event_record(event, counters, "replay"))
                 expected.append(("grip/event", "application/json", said, {}))
         sink.close()
         messages, lives = consumer.until_gone()
@@ -68,7 +67,6 @@ class TestMessages:
             header, got = unpack(payload) if key.endswith("pattern") else (json.loads(payload), {})
             header.pop("maps", None)
             assert header == said
-            assert header["source"] == "emulated"
             assert got.keys() == maps.keys()
             for name, values in maps.items():
                 np.testing.assert_array_equal(got[name], values)
@@ -108,7 +106,7 @@ class TestMessages:
 class TestWhoComesAndGoes:
     def test_that_nobody_subscribes_is_told_until_somebody_does(self, endpoint):
         with listening(endpoint) as place:
-            sink, (result,) = ZenohSink(f"grip?connect={endpoint}"), make_results(1)
+            sink, (result,) = ZenohSink(f"grip?connect={endpoint}", fake_source()), make_results(1)
             assert sink.trouble is None
             sink.write(result, {})
             assert str(sink.trouble).startswith(f"nobody subscribes to zenoh:grip?connect={endpoint}: check its ")
@@ -121,7 +119,7 @@ class TestWhoComesAndGoes:
 
     def test_a_reader_that_stands_still_holds_up_nobody(self, endpoint, consume):
         consumer, result = consume(endpoint), make_results(2)[1]
-        sink = ZenohSink(f"grip?connect={endpoint}", RunFacts(lossless=False))
+        sink = ZenohSink(f"grip?connect={endpoint}", fake_source("device"))
         wait_for(lambda: sink.write(result, {}) or sink.trouble is None)
         consumer.process.send_signal(signal.SIGSTOP)
         for number in range(1000):  # 15 MB, more than sockets and queues hold
@@ -138,7 +136,8 @@ class TestWhoComesAndGoes:
 
     def test_a_killed_writer_is_told_to_have_gone(self, endpoint, consume):
         consumer = consume(endpoint)
-        script = f"from edge.sinks.zenoh import ZenohSink; sink = ZenohSink('grip?connect={endpoint}'); input()"
+        imports = "from edge.sinks.zenoh import ZenohSink; from edge_samples import fake_source"
+        script = f"{imports}; sink = ZenohSink('grip?connect={endpoint}', fake_source()); input()"
         with subprocess.Popen([sys.executable, "-c", script], env=ENVIRONMENT, stdin=subprocess.PIPE) as writer:
             assert consumer.next()[0] == "came"
             writer.kill()
@@ -150,7 +149,7 @@ class TestWhoComesAndGoes:
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
             assert listener.stdout.readline() == "listens\n"
-            sink, (free, pressed) = ZenohSink(f"grip/left?connect={endpoint}"), make_results(2)
+            sink, (free, pressed) = ZenohSink(f"grip/left?connect={endpoint}", fake_source()), make_results(2)
             wait_for(lambda: sink.write(free, {}) or sink.trouble is None)
             sink.write(pressed, {})
             sink.tell(Event(5, "lost", None, "the cable is out"), {})
@@ -171,19 +170,19 @@ class TestWhoComesAndGoes:
 class TestOpening:
     def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
         with pytest.raises(SinkError, match=r"none.json5 is not a zenoh configuration: No such file"):
-            open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT)
+            open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT, fake_source())
         (tmp_path / "bad.json5").write_text("{mode: ")
         with pytest.raises(SinkError, match=r"bad.json5 is not a zenoh configuration: expected"):
-            open_sink(f"zenoh:a?config={tmp_path}/bad.json5", CONTRACT)
+            open_sink(f"zenoh:a?config={tmp_path}/bad.json5", CONTRACT, fake_source())
 
     def test_an_endpoint_that_zenoh_does_not_know_is_told(self):
         with pytest.raises(SinkError, match=r"zenoh cannot be opened: Unicast not supported for smoke protocol$"):
-            open_sink("zenoh:a?connect=smoke/1:2", CONTRACT)
+            open_sink("zenoh:a?connect=smoke/1:2", CONTRACT, fake_source())
 
     def test_without_the_package_it_says_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "zenoh", None)
         with pytest.raises(SinkError, match=rf"needs eclipse-zenoh: pip install '{ROOT}\[zenoh\]'"):
-            open_sink("zenoh:a", CONTRACT)
+            open_sink("zenoh:a", CONTRACT, fake_source())
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
@@ -200,7 +199,7 @@ class TestListening:
     def test_nobody_can_reach_it_unless_a_configuration_says_so(self, tmp_path, configuration, protocol):
         (tmp_path / "zenoh.json5").write_text(configuration or "")
         before = reachable(os.getpid())
-        sink = ZenohSink("grip" if configuration is None else f"grip?config={tmp_path}/zenoh.json5")
+        sink = ZenohSink("grip" if configuration is None else f"grip?config={tmp_path}/zenoh.json5", fake_source())
         opened = {one.split()[0] for one in reachable(os.getpid()) if one not in before}
         sink.close()
         assert protocol in opened if protocol else not opened
@@ -214,7 +213,7 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
     config.write_text(json.dumps({"connect": {"endpoints": [endpoint]}}))
     with listening(endpoint) as known, listening(others, endpoint) as other:
         wait_for(lambda: known.info.peers_zid())
-        sink = ZenohSink(f"grip?config={config}" if by_file else f"grip?connect={endpoint}")
+        sink = ZenohSink(f"grip?config={config}" if by_file else f"grip?connect={endpoint}", fake_source())
         wait_for(lambda: sink.zid in map(str, known.info.peers_zid()))
         time.sleep(0.3)  # for a call to another, were there one
         assert sink.zid not in map(str, other.info.peers_zid())

@@ -6,6 +6,8 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import onnx
@@ -23,6 +25,7 @@ from edge.inference.contract import (
 from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
 from firmware_bridge.links.base import Link, SourceKind
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.zeroing.baseline import Baseline
 
@@ -303,6 +306,12 @@ class FakeLink(Link):
 
     def counters(self) -> dict[str, int]:
         return {"scans": self._given}
+
+
+def fake_source(kind: SourceKind = "replay", *, unix_offset_ns=None, origin=None, **of_sensors) -> Any:
+    """Return what sinks see of an open source: `of_sensors` is what its sensor file says."""
+    file = SimpleNamespace(**{"mountings": {}, "frames": {}, "geometry": USPA44} | of_sensors)
+    return SimpleNamespace(kind=kind, unix_offset_ns=unix_offset_ns, origin=origin, sensor_file=file)
 
 
 class ListSink(Sink):

@@ -5,13 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from edge.cli import main as cli
 from edge.perception.runtime import Runtime
-from edge.pipeline.sink import RunFacts
 from edge.sinks.mcap import McapSink
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, VendorReading
@@ -43,7 +42,7 @@ def make_results(scans: list[Scan], **settings):
 
 
 def record_into(path: Path, results, **settings) -> Path:
-    sink = McapSink(path, SURE, RunFacts(unix_offset_ns=OFFSET_NS, **settings))
+    sink = McapSink(path, SURE, fake_source(unix_offset_ns=OFFSET_NS, **settings))
     for result in results:
         sink.write(result, {"dropped": 2})
     sink.close()

@@ -9,16 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from mcap_samples import messages_of
 
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.sink import RunFacts, Sink
+from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2.cdr_messages import LOG, RESULT
-from edge.sinks.ros2.map_messages import image_map
+from edge.sinks.ros2.messages import LOG, RESULT, image_map
 
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
 CONTRACT = make_contract(interval_factor=1.6)
@@ -124,7 +123,7 @@ class Jsonl(Opened):
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "out.jsonl"
-        self.sink = open_sink(f"jsonl:{self.path}", CONTRACT, RunFacts(source="emulated"))
+        self.sink = open_sink(f"jsonl:{self.path}", CONTRACT, fake_source("emulated"))
 
     def lines(self) -> list[dict[str, Any]]:
         return [json.loads(line) for line in self.path.read_text().splitlines()]
@@ -141,7 +140,7 @@ class Mcap(Opened):
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "out.mcap"
-        self.sink = open_sink(f"mcap:{self.path}", CONTRACT, RunFacts(unix_offset_ns=0))
+        self.sink = open_sink(f"mcap:{self.path}", CONTRACT, fake_source(unix_offset_ns=0))
 
     def results(self) -> list[Back]:
         by_topic = messages_of(self.path)
@@ -167,7 +166,7 @@ class Shm(Opened):
 
         self._fields, self._newest, self._values = fields, reading.newest, values
         self.name = f"every-sink-test-{os.getpid()}"
-        self.sink = open_sink(f"shm:{self.name}", CONTRACT)
+        self.sink = open_sink(f"shm:{self.name}", CONTRACT, fake_source())
         self._memory = reading.attach(self.name)
         self._found: list[Back] = []
 
@@ -204,7 +203,7 @@ class Zenoh(Opened):
 
         endpoint = free_endpoint()
         self._consumer = Consumer(endpoint)
-        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, RunFacts(source="emulated"))
+        self.sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         self._heard: list[Any] = []
 
     def end(self) -> None:
@@ -234,7 +233,7 @@ class Ros2(Opened):
 
         from edge.sinks.ros2.sink import Ros2Sink
 
-        self.sink = Ros2Sink("/skin", ENVIRONMENT)
+        self.sink = Ros2Sink("/skin", fake_source("device"), environment=ENVIRONMENT)
         self._kept: list[Any] = []
         self._found: list[Back] = []
         self._events: list[tuple[str, str]] = []

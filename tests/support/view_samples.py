@@ -5,10 +5,9 @@ import socket
 import threading
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_contract, make_scan
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, fake_source, make_contract, make_scan
 from map_samples import result_of
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -20,7 +19,6 @@ from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.sinks.json_encoding import unpack
-from edge.sinks.registry import open_sink
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose
 
@@ -185,12 +183,13 @@ class Swallowing:
 
 
 @contextmanager
-def live_page(tmp_path, host="127.0.0.1", port=0, token=None, contract=CONTRACT, name="pretended", player=None):
+def live_page(host="127.0.0.1", port=0, token=None, contract=CONTRACT, **facts):
     commands = Commands()
-    with LiveView(host, port, token, tmp_path, contract, commands) as view:
+    with LiveView(host, port, token, contract, commands) as view:
         page = Page(view, commands)
-        opener = partial(open_sink, contract=contract)
-        view.begin(name, "emulated", "fake", opener, page.messages.append, player)
+        source = fake_source("emulated")
+        source.name, source.length_s = "pretended", None
+        view.begin(source, "fake", page.messages.append, **facts)
         yield page
 
 
@@ -208,8 +207,8 @@ def frame(viewer, kind=None, sensor=None):
 
 
 @pytest.fixture
-def page(tmp_path):
-    with live_page(tmp_path) as page:
+def page():
+    with live_page() as page:
         yield page
 
 

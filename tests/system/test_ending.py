@@ -30,14 +30,13 @@ NARROW = """
 import socket, sys
 from edge.cli import main as cli
 from edge.view import server
-from edge.view import viewers as attended
 
 def listen(host, port, listen=server.listen):
     listening = listen(host, port)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
     return listening
 
-server.listen, attended.GONE_S = listen, 60.0
+server.listen, server.GONE_S = listen, 60.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 WATCHED = (sys.executable, "-c", NARROW, "--source", "demo:loop", "--view", "0")

@@ -21,10 +21,8 @@ from edge.view.frames import (
     Run,
     RunSnapshot,
     hello,
-    state,
 )
 from edge.view.viewers import Viewer
-from firmware_bridge.links.replay_player import PlayerState
 
 
 class Clock:
@@ -155,17 +153,10 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
     assert result[0]["scan"] == 2
 
 
-def test_state_tells_of_what_is_recorded_and_played():
-    played = PlayerState(1.5, 6.7, 0.5, paused=True, waiting=False, rounds=2)
-    header = unpack(state(Path("edge.mcap"), 3, {}, played, (2.5, 70_000)))[0]
-    assert (header["recorded_s"], header["recorded_bytes"], header["replay"]) == (2.5, 70_000, played._asdict())
-
-
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     path = Path(os.fsdecode(b"\xff.mcap"))
-    header, _ = unpack(hello(Run(f"replay:{path}", "replay", "mtsr4", CONTRACT, "c0ffee"), path))
-    assert (header["name"], header["recording"]) == (r"replay:\xff.mcap", r"\xff.mcap")
-    assert unpack(state(path, 1, {}))[0]["recording"] == r"\xff.mcap"
+    header, _ = unpack(hello(Run(f"replay:{path}", "replay", "mtsr4", CONTRACT, 6.7, "c0ffee")))
+    assert (header["name"], header["length_s"]) == (r"replay:\xff.mcap", 6.7)
     heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
     assert look(Viewer(), heard, clock)[0][0]["note"] == r"recording into \xff.mcap stopped"
 

@@ -51,11 +51,11 @@ def red_share(page):
     return float(np.mean((picture[..., 0] > 0.55) & (picture[..., 0] > 2 * picture[..., 1])))
 
 
-def test_force_and_torque_are_told_and_drawn(open_page, tmp_path):
+def test_force_and_torque_are_told_and_drawn(open_page):
     contract = make_pad_contract(interval_factor=1.6)
     wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35))
     made = replace(Press(contract=contract).next(), wrench=wrench)
-    with live_page(tmp_path, contract=contract) as shown, shown.playing(lambda: made):
+    with live_page(contract=contract) as shown, shown.playing(lambda: made):
         page = open_page(shown.view.url)
         live(page)
         for name, text in {
@@ -71,11 +71,11 @@ def test_force_and_torque_are_told_and_drawn(open_page, tmp_path):
         assert not drawn(page, centre - 0.1, centre) and not drawn(page, centre + 0.3, centre)
 
 
-def test_the_pad_is_outlined_where_to_touch_next(open_page, tmp_path):
+def test_the_pad_is_outlined_where_to_touch_next(open_page):
     press = Press()
     idle, contact = press.next(0), press.next(3000)
     shows = [idle]
-    with live_page(tmp_path) as shown, shown.playing(lambda: shows[0]):
+    with live_page() as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
         next_tap, state = playwright.expect(number(page, "next_tap")), playwright.expect(part(page, "word"))
         for result, text in ((idle, "idle"), (contact, "contact")):
@@ -106,7 +106,7 @@ def test_the_pad_is_outlined_where_to_touch_next(open_page, tmp_path):
         assert not drawn(page, *mirrored)
 
 
-def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page, tmp_path):
+def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page):
     contact = Press().next()
     believed = replace(contact, trusted=True, mismatch=0.021, tap_mismatch=(0.0, 0.25))
     unbelieved = replace(contact, trusted=False, mismatch=0.4, untrusted_reason="unfamiliar")
@@ -115,7 +115,7 @@ def test_a_doubted_pattern_cannot_be_taken_for_a_believed_one(open_page, tmp_pat
     in_doubt = replace(contact, notes=(Note("baseline_in_doubt", text),), area_mm2=None, **doubt)
     shows = [believed]
     contract = replace(CONTRACT, trust={"made": "of something"})
-    with live_page(tmp_path, contract=contract) as shown, shown.playing(lambda: shows[0]):
+    with live_page(contract=contract) as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
         verdict, trusted = playwright.expect(part(page, "verdict")), playwright.expect(number(page, "trusted"))
         live(page)
@@ -175,8 +175,8 @@ def outline(page):
     return (x_mm[pad].min(), x_mm[pad].max(), y_mm[pad].min()) if pad.any() else (np.nan,) * 3
 
 
-def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page, tmp_path):
-    with live_page(tmp_path) as shown:
+def test_a_map_grows_and_who_pauses_or_comes_late_misses_nothing(open_page):
+    with live_page() as shown:
         mapped = Mapped(shown, letter)
         page = open_page(shown.view.url)
         counts = playwright.expect(page.locator("#map-counts"))
@@ -271,15 +271,15 @@ def proxy(port, *, below="/edge/", host=None, sockets=True):
     ("settings", "token", "query", "words"),
     [
         ({}, None, "", None),
-        ({"below": "/", "host": "127.0.0.1:{port}"}, None, "", None),
         ({"host": "edge_up"}, browser_samples.TOKEN, f"?token={browser_samples.TOKEN}", None),
+        ({"host": "127.0.0.1:{port}"}, None, "", "may not send requests to this server"),
         ({}, browser_samples.TOKEN, "", "the token is missing or wrong"),
         ({"sockets": False}, None, "", "a proxy must send HTTP/1.1 with the headers Upgrade and Connection"),
         ({"sockets": None}, None, "", "answers 502 for /edge/ws, and not edge-sr"),
     ],
 )
-def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(tmp_path, open_page, settings, token, query, words):
-    with live_page(tmp_path, token=token) as view, proxy(view.port, **settings) as url:
+def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(open_page, settings, token, query, words):
+    with live_page(token=token) as view, proxy(view.port, **settings) as url:
         page = open_page(url + query)
         if words is not None:
             playwright.expect(page.locator("#trouble")).to_contain_text(words)
@@ -288,11 +288,3 @@ def test_through_a_proxy_the_page_finds_its_socket_or_shows_why_not(tmp_path, op
         page.reload()
         playwright.expect(page.locator("#link")).to_have_attribute("data-up", "yes")
         page.close()  # before what it is connected to
-
-
-def test_a_page_of_another_name_shows_that_it_needs_the_token(tmp_path, open_page):
-    """Chromium resolves every name that ends in .localhost to this machine, as a stranger's server may."""
-    with live_page(tmp_path) as view, proxy(view.port, host="127.0.0.1:{port}") as url:
-        trouble = open_page(url.replace("127.0.0.1", "robot.localhost")).locator("#trouble")
-        playwright.expect(trouble).to_contain_text("may not send requests to this server")
-        playwright.expect(trouble).to_contain_text("--view-token")

@@ -17,10 +17,11 @@ from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
-from edge.pipeline.sink import NOW, RunFacts, Sink
+from edge.pipeline.scan_reader import Source
+from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record
-from edge.sinks.ros2.cdr_messages import (
-    DIAGNOSTIC_ARRAY,
+from edge.sinks.ros2.dds_domain import join, reader, taken, writer
+from edge.sinks.ros2.messages import (
     FLOAT64,
     IMAGE,
     INT8,
@@ -32,14 +33,15 @@ from edge.sinks.ros2.cdr_messages import (
     base_topic,
     frame_of,
     header,
+    image,
+    in_si,
+    points,
     sensor_topic,
+    taxels,
     transforms,
     wrench,
     wrench_message,
 )
-from edge.sinks.ros2.dds_domain import join, reader, taken, writer
-from edge.sinks.ros2.diagnostics import Diagnosis, Level, diagnose, diagnostics_message
-from edge.sinks.ros2.map_messages import image, in_si, points, taxels
 from firmware_bridge.errors import CdrError
 from firmware_bridge.recording.cdr import MessageType
 
@@ -64,11 +66,10 @@ class _Sensor:
     writers: dict[str, DataWriter[Any]] = field(default_factory=dict)
     shown: dict[str, tuple[int, ...]] = field(default_factory=dict)  # shapes of maps whose last message still holds
     forced: bool = False  # the last wrench was of a pattern
-    trouble: dict[str, str] = field(default_factory=dict)  # of the link, not withdrawn, by the kind of event
 
 
 class Ros2Sink(Sink):
-    """Publisher of patterns, taxels, forces, numbers, diagnostics and events; with the run's commands a subscriber too.
+    """Publisher of patterns, taxels, forces, numbers and events; with the run's commands a subscriber too.
 
     Commands are texts on TOPIC/zero and TOPIC/reset, as any node or `ros2 topic pub` writes them. Topics serve nodes of
     every middleware; a service's calls are understood by those of one vendor alone.
@@ -77,29 +78,28 @@ class Ros2Sink(Sink):
     def __init__(
         self,
         topic: str,
-        environment: Mapping[str, str] = os.environ,
-        run: RunFacts = NOW,
+        source: Source,
+        commands: Commands | None = None,
         *,
+        environment: Mapping[str, str] = os.environ,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Join the domain of the environment; `topic` is the first part of all topics but diagnostics and frames.
+        """Join the domain of the environment; `topic` is the first part of all topics but frames.
 
         `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
-        self._base, self._run, self._clock_ns = base_topic(topic), run, clock_ns
-        self._of_now = run.unix_offset_ns is None
-        self.unix_offset_ns = unix_ns() - clock_ns() if run.unix_offset_ns is None else run.unix_offset_ns
+        self._base, self._source, self._clock_ns = base_topic(topic), source.kind, clock_ns
+        self._geometry, self._frames = source.sensor_file.geometry, source.sensor_file.frames
+        offset_ns = source.unix_offset_ns
+        self._of_now = offset_ns is None
+        self.unix_offset_ns = unix_ns() - clock_ns() if offset_ns is None else offset_ns
         self.unwritten = 0
         self._sensors: dict[str, _Sensor] = {}
-        self._counters: Mapping[str, int] = {}
-        self._counters_before: Mapping[str, int] = {}
-        self._diagnosed_ns = clock_ns()
         self._domain, self._participant = join(environment)
-        self._diagnostics = writer(self._participant, "diagnostics", DIAGNOSTIC_ARRAY)  # the topic of ROS's own tools
         self._events = writer(self._participant, f"{self._base}/events", STRING, depth=100)
-        self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if run.frames else None
-        self._asked = None if run.commands is None else self._subscribed(run.commands)
+        self._placed = writer(self._participant, "tf_static", TF_MESSAGE, latched=True) if self._frames else None
+        self._asked = None if commands is None else self._subscribed(commands)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Publish one result: taxels and numbers, its pattern if it has one, and its wrench if that is available."""
@@ -108,55 +108,38 @@ class Ros2Sink(Sink):
         if sensor is None:
             sensor = self._sensors[scan.sensor] = _Sensor(frame_of(result), result)
             self._place_pads()
-        sensor.last, self._counters = result, counters
-        for kind in _OUTAGES:
-            sensor.trouble.pop(kind, None)
+        sensor.last = result
         unix_ns = scan.on_bus_ns + self.unix_offset_ns
         self._publish_to(sensor, "taxels", IMAGE, lambda: image(taxels(scan), sensor.frame, unix_ns))
         if result.pattern is not None:
             self._show(sensor, result, unix_ns)
         elif result.state != "dropped":  # a newer scan has already published a pattern
             self._clear(sensor, unix_ns, 0.0 if result.contact is False else np.nan)
-        force = wrench(result, self._run.geometry, unix_ns)
+        force = wrench(result, self._geometry, unix_ns)
         if force is not None:
             self._publish_to(sensor, "wrench", WRENCH_STAMPED, lambda: force)
             sensor.forced = result.wrench is not None
         if result.state != "dropped":
             self._publish_numbers(sensor, result, result.state)
         for event in result.events:
-            self._tell(event)
-        self.wait()
+            self._tell(event, counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Publish an event; values that an outage makes unknown are published as NaN."""
-        self._counters = counters
         for name, sensor in self._sensors.items():
-            if event.sensor not in (None, name) or not name.startswith(event.sensors):
-                continue
-            if event.kind in _OUTAGES:
+            if event.kind in _OUTAGES and event.sensor in (None, name) and name.startswith(event.sensors):
                 self._clear_of_all(sensor, event.time_ns, event.kind)
-            if event.kind in (*_OUTAGES, "trouble"):
-                sensor.trouble[event.kind] = event.text
-            elif event.kind == "well":
-                sensor.trouble.pop("trouble", None)
-        self._tell(event)
-        self.wait()
-
-    def wait(self) -> None:
-        """Publish the diagnostics once a second, also while no scan comes."""
-        if self._clock_ns() - self._diagnosed_ns >= 1e9:
-            self._diagnose()
+        self._tell(event, counters)
 
     def close(self) -> None:
         """Publish that the run has ended, and leave the domain."""
         for sensor in self._sensors.values():
             self._clear_of_all(sensor, self._now_ns(), "ended")
-        self._diagnose(ended=True)
         self._sensors.clear()
         if self._asked is not None:
             self._asked.clear()
         # Each is deleted with its last reference: writers before the participant, the participant before its domain.
-        del self._diagnostics, self._events, self._placed, self._participant, self._domain
+        del self._events, self._placed, self._participant, self._domain
 
     def _subscribed(self, commands: Commands) -> dict[str, Any]:
         """Return the readers of commands by name; the loop reads them before each scan, for they have no thread."""
@@ -210,7 +193,7 @@ class Ros2Sink(Sink):
             x, y = (place / 1e3 for place in result.centroid_mm)
             message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
             self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
-        self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._run.geometry, frame, unix_ns))
+        self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
 
     def _clear(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
@@ -228,7 +211,7 @@ class Ros2Sink(Sink):
             values = np.full(shape, pattern_value if name == "pattern" else np.nan, dtype=np.float32)
             self._publish_to(sensor, name, IMAGE, partial(image, values, sensor.frame, unix_ns))
         sensor.shown.clear()
-        empty = partial(points, replace(sensor.last, pattern=None), self._run.geometry, sensor.frame, unix_ns)
+        empty = partial(points, replace(sensor.last, pattern=None), self._geometry, sensor.frame, unix_ns)
         self._publish_to(sensor, "points", POINT_CLOUD, empty)
 
     def _clear_of_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
@@ -250,26 +233,14 @@ class Ros2Sink(Sink):
 
     def _place_pads(self) -> None:
         """Publish where the pads are that have been seen so far; late subscribers get it as well."""
-        places = self._run.frames
+        places = self._frames
         frames = {sensor.frame: places[name] for name, sensor in self._sensors.items() if name in places}
         if self._placed is not None and frames:
             self.publish(self._placed, transforms(frames, self._now_ns() + self.unix_offset_ns))
 
-    def _tell(self, event: Event) -> None:
-        text = orjson.dumps(event_record(event, self._counters, self._run.source)).decode()
+    def _tell(self, event: Event, counters: Mapping[str, int]) -> None:
+        text = orjson.dumps(event_record(event, counters, self._source)).decode()
         self.publish(self._events, STRING.encode({"data": text}))
-
-    def _diagnose(self, *, ended: bool = False) -> None:
-        self._diagnosed_ns, now_ns = self._clock_ns(), self._now_ns()
-        statuses = []
-        for name, sensor in self._sensors.items():
-            trouble = "; ".join(sensor.trouble.values()) or None
-            silence_s = (now_ns - sensor.last.scan.time_ns) / 1e9 if self._of_now else None
-            diagnosis = diagnose(sensor.last, self._counters, self._counters_before, silence_s, trouble)
-            diagnosis = Diagnosis(Level.STALE, "ended", diagnosis.values) if ended else diagnosis
-            statuses.append((f"{self._base}: {name}", name, diagnosis))
-        self._counters_before = self._counters
-        self.publish(self._diagnostics, diagnostics_message(statuses, now_ns + self.unix_offset_ns))
 
     def _now_ns(self) -> int:
         """Return the time on the scans' clock; where that is of another time, the time of the newest scan."""

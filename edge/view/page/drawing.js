@@ -150,7 +150,6 @@ function paintOver(sensor, canvas, current) {
   const place = ([xMm, yMm]) => [width / 2 + (xMm / widthMm) * width, height / 2 + (yMm / widthMm) * width];
   const ellipse = current && !sensor.doubted() ? sensor.ellipse() : null;
   if (ellipse !== null) drawEllipse(context, ink, place, width / widthMm, ellipse);
-  if (current) sensor.path.draw(context, ink, place, page.atS ?? sensor.trace.newestS);
   const centre = current ? sensor.touched.centroid_mm : null;
   if (centre) {
     const [x, y] = place(centre);
@@ -197,7 +196,7 @@ function paintShear(sensor, context, width, height, rows, cols, values, high) {
   }
 }
 
-// ---- Shape of the contact: its ellipse, and the path of its centre ----
+// ---- Shape of the contact: its ellipse ----
 
 /** Return the ellipse with the moments of the touched pixels: centre and half axes in mm, and the turn of the long one in degrees; null without any, or if they fill the pad. */
 function contactEllipse({ values, shape: [rows, cols] }, pitchMm, share) {
@@ -234,64 +233,3 @@ function drawEllipse(context, ink, place, pxPerMm, ellipse) {
 }
 
 const isRound = ({ halves: [long, wide] }) => long < 1.15 * wide;
-
-/** Path of the centre of pressure, or of the touched area where the model gives no force. */
-class Path {
-  constructor() { this.points = []; }
-
-  add(atS, { state, trusted, wrench, centroid_mm: centroid }) {
-    if (!known(atS)) return;
-    const touched = state === "contact" && trusted !== false;
-    const centre = touched ? wrench?.centre_of_pressure_mm ?? centroid : null;
-    if (!centre && this.points.at(-1)?.[1] === null) return; // one point parts two contacts
-    this.points.push([atS, centre ?? null]);
-    if (this.points.length > 600) this.points.shift();
-  }
-
-  draw(context, ink, place, endS) {
-    const shown = this.points.filter(([atS]) => atS <= endS + 1e-6 && endS - atS <= 5);
-    haloed(context, ink, 1.2, () => {
-      let drawing = false;
-      for (const [, centre] of shown) {
-        if (centre !== null) context[drawing ? "lineTo" : "moveTo"](...place(centre));
-        drawing = centre !== null;
-      }
-    });
-  }
-}
-
-// ---- Relief: the pattern as a surface, seen from above at a slant ----
-
-const RELIEF_SHARE = 0.3; // height of the scale's end, as a share of the width
-
-/** Paint the surface from its far edge to its near one, in the colours of the map and lit from the upper left. */
-function paintRelief(canvas, { values, shape: [rows, cols] }, high, table) {
-  const [context, width, height] = blank(canvas);
-  if (width === 0) return;
-  const rise = RELIEF_SHARE * width;
-  const [across, along] = [0.86 * width, 0.56 * height];
-  const value = (row, col) => Math.max(0, Math.min(1.2, values[row * cols + col] / high));
-  const place = (row, col) => {
-    const near = row / (rows - 1);
-    const span = across * (0.8 + 0.2 * near);
-    return [width / 2 + (col / (cols - 1) - 0.5) * span, 0.36 * height + near * along - value(row, col) * rise];
-  };
-  const steep = (RELIEF_SHARE * cols) / 1.4;
-  for (let row = 0; row < rows - 1; row++) {
-    for (let col = 0; col < cols - 1; col++) {
-      const corners = [[row, col], [row, col + 1], [row + 1, col + 1], [row + 1, col]];
-      const [a, b, c, d] = corners.map(([r, k]) => value(r, k));
-      const slope = [-(b + c - a - d) * 0.5 * steep, -(c + d - a - b) * 0.5 * steep, 1];
-      const lit = (-0.5 * slope[0] - 0.6 * slope[1] + 0.62) / Math.hypot(...slope);
-      const shade = 0.45 + 0.75 * Math.max(0, lit);
-      const at = 3 * level((a + b + c + d) / 4, 1);
-      context.fillStyle = `rgb(${[0, 1, 2].map((channel) => Math.min(255, Math.round(table[at + channel] * shade))).join()})`;
-      context.strokeStyle = context.fillStyle;
-      context.beginPath();
-      corners.forEach(([r, k], corner) => context[corner === 0 ? "moveTo" : "lineTo"](...place(r, k)));
-      context.closePath();
-      context.fill();
-      context.stroke(); // closes the hair lines between neighbours
-    }
-  }
-}

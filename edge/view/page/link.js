@@ -47,7 +47,6 @@ class Link {
     Object.assign(this, { onFrame, onChange, socket: null, up: false, tries: 0, timer: 0, receivedS: nowS(), nextS: null, ended: false, why: null });
     // Beside the page, which a proxy may serve below a path.
     this.url = new URL(`${location.pathname.replace(/\/?$/, "/")}ws`, location.href);
-    this.url.searchParams.set("key", document.querySelector("meta[name=edge-sr-key]").content);
     const token = takeToken();
     if (token !== null) this.url.searchParams.set("token", token);
   }
@@ -60,7 +59,7 @@ class Link {
     const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => this.take(socket, data);
-    socket.onclose = (event) => this.lose(socket, event.code);
+    socket.onclose = ({ code, reason }) => this.lose(socket, code, reason);
     this.receivedS = nowS();
     this.socket = socket;
     this.onChange();
@@ -75,14 +74,15 @@ class Link {
       this.why = null;
       this.onChange();
     }
-    this.onFrame(unpack(data), data);
+    this.onFrame(unpack(data));
   }
 
-  lose(socket, code = null) {
+  lose(socket, code = null, reason = null) {
     if (socket !== this.socket) return;
     socket.onmessage = socket.onclose = null;
     this.socket = null;
     if (this.up) this.ended = code === 1001; // "going away": the run has ended
+    else if (code === 1013) this.why = reason; // "try again later": too many viewers
     else this.inquire();
     this.up = false;
     const wait = WAITS_S[Math.min(this.tries++, WAITS_S.length - 1)];
@@ -99,7 +99,7 @@ class Link {
     try {
       const answer = await fetch(address, { signal: AbortSignal.timeout(1000 * SILENT_S) });
       const plain = answer.headers.get("Content-Type")?.startsWith("text/plain");
-      if ([403, 503].includes(answer.status) && plain) why = (await answer.text()).trim(); // access refused; too many viewers
+      if (answer.status === 403 && plain) why = (await answer.text()).trim(); // access is refused
       else if (answer.status !== 426) why = `${location.host} answers ${answer.status} for ${address.pathname}, and not edge-sr`;
       // A plain request is answered by 426 where a socket is granted. One lost may be chance, as where the program has just begun.
       else if (this.tries >= 3) why = "something between does not pass the socket on: a proxy must send HTTP/1.1 with the headers Upgrade and Connection";

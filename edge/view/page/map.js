@@ -2,42 +2,22 @@
 
 class MapPane {
   constructor() {
-    Object.assign(this, { header: null, shown: null, contact: null, doubted: null, dirty: false });
+    Object.assign(this, { header: null, shown: null, contact: null, dirty: false });
     this.root = byId("map");
     sizes.observe(byId("map-over"));
   }
 
-  /** Take what has changed; the first frame of a run holds the whole map. */
-  take(header, { contact, doubted }) {
-    const count = header.pixels;
-    if (this.contact === null || this.header.pixels !== count) {
-      this.contact = new Float32Array(count * count).fill(NaN);
-      this.doubted = new Float32Array(count * count);
-    }
-    this.header = header;
-    const [top, left] = header.from;
-    if (contact) {
-      const [rows, cols] = contact.shape;
-      for (let row = 0; row < rows; row++) {
-        const to = (top + row) * count + left;
-        this.contact.set(contact.values.subarray(row * cols, (row + 1) * cols), to);
-        this.doubted.set(doubted.values.subarray(row * cols, (row + 1) * cols), to);
-      }
-    }
-    this.dirty = true;
-  }
+  take(header, { contact }) { Object.assign(this, { header, contact, dirty: true }); }
 
-  forget() {
-    Object.assign(this, { header: null, contact: null, doubted: null, dirty: true });
-  }
+  forget() { Object.assign(this, { header: null, contact: null, dirty: true }); }
 
   paint() {
     this.dirty = false;
     show(this.root, this.header !== null);
     this.shown = this.header;
     if (this.header === null) return;
-    const { pixels, counts } = this.header;
-    this.paintContact(byId("map-contact"), pixels);
+    const { counts } = this.header;
+    this.paintContact(byId("map-contact"));
     paintBar(byId("map-bar"), VIRIDIS);
     const fates = { doubted: "not believed", light: "too light", outside: "outside the map", without_pose: "without a pose", together: "of two pads at one place" };
     const left = Object.entries(fates).filter(([key]) => counts[key] > 0).map(([key, why]) => `${counts[key]} ${why}`);
@@ -48,16 +28,16 @@ class MapPane {
     this.paintPads();
   }
 
-  paintContact(canvas, count) {
+  paintContact(canvas) {
+    const [count] = this.contact.shape;
     if (canvas.width !== count) [canvas.width, canvas.height] = [count, count];
     const context = canvas.getContext("2d");
     const image = context.createImageData(count, count);
-    for (let pixel = 0; pixel < count * count; pixel++) {
-      const unknown = Number.isNaN(this.contact[pixel]);
-      if (unknown && !(this.doubted[pixel] > 0)) continue; // transparent
-      const at = 3 * level(this.contact[pixel], 1);
-      image.data.set(unknown ? [200, 40, 30, 255] : [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255], 4 * pixel);
-    }
+    this.contact.values.forEach((value, pixel) => {
+      if (Number.isNaN(value)) return; // nothing came there: transparent
+      const at = 3 * level(value, 1);
+      image.data.set(value < 0 ? [200, 40, 30, 255] : [VIRIDIS[at], VIRIDIS[at + 1], VIRIDIS[at + 2], 255], 4 * pixel);
+    });
     context.putImageData(image, 0, 0);
   }
 
@@ -65,7 +45,7 @@ class MapPane {
   paintPads() {
     const [context, width, height] = blank(byId("map-over"));
     if (width === 0 || page.hello === null || this.shown === null) return;
-    const sizeMm = this.shown.pixels / this.shown.px_per_mm;
+    const sizeMm = this.shown.size_mm;
     const { rows, cols, taxel_pitch_mm: pitch } = page.hello;
     const [halfX, halfY] = [(cols * pitch) / 2, (rows * pitch) / 2];
     const [centreX, centreY] = this.shown.centre_mm;

@@ -86,7 +86,7 @@ const NUMBERS = {
     ["force x y z", "wrench_force", "Force on the pad along x, y and z, as the model integrates it.", ({ made }) => list(made.wrench?.force_n, 2, "N")],
     ["torque x y", "wrench_torque", "Torque about x and y at the pad's centre.", ({ made }) => list(made.wrench?.torque_n_mm.slice(0, 2), 1, "N\u00a0mm")],
     ["twist", "wrench_twist", "Torque about the pad's normal.", ({ made }) => amount(made.wrench?.torque_n_mm[2], 1, "N\u00a0mm")],
-    ["pressure centre", "centre_of_pressure_mm", "Point where the normal force acts; the ring on the pattern. Its line is the path of the last five seconds.",
+    ["pressure centre", "centre_of_pressure_mm", "Point where the normal force acts; the ring on the pattern.",
       ({ made }) => list(made.wrench?.centre_of_pressure_mm, 1, "mm")],
     ["sensitivity", "wrench_origin", "Where the force scale comes from: nominal is that of the average sensor.", ({ made }) => made.wrench_origin ?? "\u2013"],
   ],

@@ -18,8 +18,6 @@ const painter = {
   paint() {
     this.asked = 0;
     paintPage();
-    past.paint();
-    replay.paint();
     for (const sensor of page.sensors.values()) if (sensor.dirty) sensor.paint();
     if (page.map.dirty && !page.paused) page.map.paint();
   },
@@ -33,14 +31,12 @@ const page = {
   hello: null,
   sensors: new Map(),
   map: new MapPane(),
-  state: { recording: false },
+  state: {},
   eventNumber: 0, // number of the run's latest event that is in the log
   paused: false,
   pausedS: 0,
   auto: memory.get("scale") !== "fixed",
-  relief: memory.get("relief") === "on",
   shear: memory.get("shear") === "on",
-  atS: null, // time of the run that is looked back at; null: live
   spanS: memory.get("span") === "60" ? 60 : 10,
   asked: null, // latest request of this page to zero: {sensor, or undefined for all; untilS}
   forcible: new Set(), // sensors whose zeroing was refused, while it may be forced
@@ -83,22 +79,17 @@ function paintPage() {
   const source = hello?.source ?? "device";
   show(origin, hello !== null && source !== "device");
   origin.dataset.source = source;
-  say(origin, source === "replay" ? "REPLAY: a recording, not live data" : "EMULATED: these are not data of a sensor");
+  say(origin, source === "replay" ? `REPLAY: a recording, not live data${placeText()}` : "EMULATED: these are not data of a sensor");
   const models = new Set([...page.sensors.values()].map((sensor) => sensor.result?.model ?? hello.model));
   const about = byId("about");
   const modelNames = [...(models.size ? models : hello === null ? [] : [hello.model])];
   say(about, hello === null ? "" : [shortName(hello.name), ...modelNames].join(", "));
   if (hello !== null) explain(about, [hello.name, ...modelNames].join(", "));
   paintTrouble();
-  const held = page.paused || (replay.at?.paused ?? false);
-  byId("pause").setAttribute("aria-pressed", String(held));
-  byId("pause").firstChild.textContent = held ? "Resume " : "Pause ";
-  byId("relief").setAttribute("aria-pressed", String(page.relief));
-  const recording = Boolean(page.state.recording);
-  byId("record").setAttribute("aria-pressed", String(recording));
-  byId("record").firstChild.textContent = recording ? `Recording ${recordedText(page.state)}` : "Record ";
+  byId("pause").setAttribute("aria-pressed", String(page.paused));
+  byId("pause").firstChild.textContent = page.paused ? "Resume " : "Pause ";
   say(byId("scale").firstElementChild, `Scale: ${page.auto ? "auto" : "fixed"}`);
-  for (const id of ["zero", "reset", "record", "force"]) byId(id).disabled = !link.up;
+  for (const id of ["zero", "reset", "force"]) byId(id).disabled = !link.up;
   show(byId("waiting"), page.sensors.size === 0);
   say(byId("waiting"), `Waiting for ${hello === null ? "edge-sr" : "the first scan"}`);
   document.title = titleText(source);
@@ -109,7 +100,7 @@ function paintTrouble() {
   const [trouble, state] = [byId("trouble"), byId("link")];
   const waitS = link.nextS === null ? 0 : Math.max(0, Math.ceil(link.nextS - nowS()));
   const next = waitS > 0 ? `next try in ${waitS}${THIN}s` : "trying again";
-  const silent = [...page.sensors.values()].filter((sensor) => sensor.silentS !== null && !replay.rests);
+  const silent = [...page.sensors.values()].filter((sensor) => sensor.silentS !== null);
   state.dataset.up = link.up ? (silent.length > 0 ? "part" : "yes") : "no";
   const viewers = page.state.viewers > 1 ? `, ${page.state.viewers} viewers` : "";
   say(state, link.up ? `connected${viewers}${silent.length > 0 ? `; no scan from ${silent.map((sensor) => sensor.name).join(", ")}` : ""}` : page.hello === null && link.tries === 0 ? "connecting" : "not connected");
@@ -121,7 +112,13 @@ function paintTrouble() {
   say(trouble, lost ? [what, link.why, next].filter((text) => text !== null).join("; ") : `paused ${ago(nowS() - page.pausedS)}; the sensor continues. Press space to resume`);
 }
 
-const recordedText = ({ recorded_s: seconds, recorded_bytes: bytes }) => (seconds == null ? "" : `${duration(seconds)}, ${(bytes / 1e6).toFixed(1)}${THIN}MB `);
+/** Return how far the recording is that is played. */
+function placeText() {
+  const lengthS = page.hello.length_s;
+  const atS = Math.max(0, ...[...page.sensors.values()].map((sensor) => sensor.trace.newestS));
+  return known(lengthS) ? `, ${number(Math.min(atS, lengthS), 1)} of ${number(lengthS, 1)}${THIN}s` : "";
+}
+
 const lostWord = () => (page.link.ended ? "run ended" : "connection lost");
 
 /** Return the name of a source with files by their names alone. */
@@ -141,17 +138,16 @@ const frameHandlers = {
     if (page.hello !== null && page.hello.run !== header.run) forgetRun();
     page.hello = header;
     document.documentElement.style.setProperty("--pad", `${header.cols} / ${header.rows}`);
-    page.state.recording = header.recording;
     if (page.paused) page.link.send({ cmd: "pause", on: true });
   },
-  result(header, maps, buffer) {
+  result(header, maps) {
     if (page.hello === null) return;
     const sensor = sensorOf(header.sensor);
     if (page.paused) sensor.trace.add(header.trace ?? []); // sent before the pause reached the program, and not again
-    else sensor.take(header, maps, buffer);
+    else sensor.take(header, maps);
   },
   map(header, maps) {
-    page.map.take(header, maps); // also while paused, since each frame holds what has changed since the one before
+    page.map.take(header, maps); // also while paused: it is sent once
   },
   event({ note, event, sensor, number, age_s = 0 }) {
     if (number <= page.eventNumber) return; // a new connection, also a reconnect, gets the latest events again
@@ -164,7 +160,6 @@ const frameHandlers = {
   },
   state(header) {
     page.state = header;
-    replay.take(header.replay);
     if (page.hello === null) return;
     for (const [name, sensor] of page.sensors) {
       const silentS = header.silent?.[name] ?? null;
@@ -214,8 +209,6 @@ function forgetRun() {
   page.sensors.clear();
   hand.arrange();
   page.map.forget();
-  page.atS = null;
-  replay.take(null);
   page.paused = false;
   page.eventNumber = 0;
   forgetRefusal();
@@ -230,13 +223,6 @@ function command(what) {
   return sent;
 }
 
-/** Switch what the page draws, and let the browser keep it. */
-function toggle(name) {
-  page[name] = !page[name];
-  memory.set(name, page[name] ? "on" : "off");
-  painter.all();
-}
-
 const act = {
   zero(sensor) {
     forgetRefusal();
@@ -247,27 +233,21 @@ const act = {
     forgetRefusal();
   },
   reset() { command({ cmd: "reset" }); },
-  record() { command({ cmd: "record", on: !page.state.recording }); },
   pause() {
-    if (replay.at !== null && !page.paused) return replay.play(replay.at.paused);
     page.paused = !page.paused;
     page.pausedS = nowS();
     for (const sensor of page.sensors.values()) sensor.trace.hold(page.paused);
     page.link.send({ cmd: "pause", on: page.paused });
     painter.all();
-    return undefined;
   },
-  relief() { toggle("relief"); },
-  shear() { toggle("shear"); },
-  save() { if (!byId("saving").open) byId("saving").showModal(); },
+  shear() {
+    page.shear = !page.shear;
+    memory.set("shear", page.shear ? "on" : "off");
+    painter.all();
+  },
   before() { hand.step(-1); },
   after() { hand.step(1); },
   close() { hand.open(null); },
-  live() { past.live(); },
-  back() { past.step(-1); },
-  on() { past.step(1); },
-  slower() { replay.speed(-1); },
-  faster() { replay.speed(1); },
   scale() {
     page.auto = !page.auto;
     for (const sensor of page.sensors.values()) sensor.highest = sensor.pattern ? largest(sensor.pattern.values) : 0;
@@ -282,12 +262,11 @@ const act = {
   help() { if (!byId("manual").open) byId("manual").showModal(); },
 };
 
-const KEYS = { z: "zero", "shift z": "force", r: "reset", "shift r": "record", " ": "pause", s: "scale", t: "span", v: "relief", e: "save", l: "live", ",": "back", ".": "on", "<": "slower", ">": "faster", "?": "help", "[": "before", "]": "after", escape: "close" };
+const KEYS = { z: "zero", "shift z": "force", r: "reset", " ": "pause", s: "scale", t: "span", "?": "help", "[": "before", "]": "after", escape: "close" };
 
 function pressed(event) {
-  if (event.ctrlKey || event.altKey || event.metaKey || (event.repeat && !",.".includes(event.key)) || document.querySelector("dialog[open]")) return;
+  if (event.ctrlKey || event.altKey || event.metaKey || event.repeat || document.querySelector("dialog[open]")) return;
   if (event.key === " " && event.target instanceof HTMLButtonElement) return; // the space bar presses that button
-  if (event.target.matches?.("input[type=number]")) return; // digits of a limit
   const letter = event.key.toLowerCase(); // independent of Caps Lock
   const action = KEYS[event.shiftKey && /[a-z]/.test(letter) ? `shift ${letter}` : letter];
   if (action === undefined) return;
@@ -298,8 +277,8 @@ function pressed(event) {
 // ---- Start ----
 
 page.link = new Link({
-  onFrame({ header, maps }, buffer) {
-    frameHandlers[header.kind]?.(header, maps, buffer);
+  onFrame({ header, maps }) {
+    frameHandlers[header.kind]?.(header, maps);
     painter.ask();
   },
   onChange() {
@@ -317,13 +296,7 @@ page.link = new Link({
   },
 });
 
-for (const id of ["zero", "force", "reset", "record", "pause", "scale", "relief", "save", "help", "slower", "faster"]) byId(id).onclick = () => act[id]();
-byId("to-live").onclick = () => act.live();
-byId("play").onclick = () => replay.play(replay.at.paused);
-byId("back").oninput = ({ target }) => (Number(target.value) >= 0 ? past.live() : past.show(past.newestS() + Number(target.value)));
-byId("place").oninput = ({ target }) => { replay.dragged = true; replay.seek(Number(target.value)); };
-byId("place").onchange = () => { replay.dragged = false; };
-for (const ending of ["png", "csv", "npz"]) byId(`save-${ending}`).onclick = () => saveMoment(ending);
+for (const id of ["zero", "force", "reset", "pause", "scale", "help"]) byId(id).onclick = () => act[id]();
 tip.listen();
 document.addEventListener("keydown", pressed);
 document.addEventListener("visibilitychange", () => { page.link.hurry(); painter.all(); });
@@ -331,7 +304,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => pain
 // Only ages and waits change without a new frame.
 setInterval(() => {
   page.link.look();
-  const moving = !page.link.up || page.paused || page.atS !== null || replay.at !== null || [...page.sensors.values()].some((sensor) => !sensor.live());
+  const moving = !page.link.up || page.paused || [...page.sensors.values()].some((sensor) => !sensor.live());
   if (moving) painter.all();
 }, 500);
 page.link.open();

@@ -1,12 +1,10 @@
 // ---- A sensor ----
 
-const NOTHING = { result: null, receivedS: 0, pattern: null, deviation: null, touchedS: 0, touched: null, zeroed: null, taps: null };
-const SHOWN = Object.keys(NOTHING);
-
 class Sensor {
   constructor(name) {
-    Object.assign(this, NOTHING, { name, cursor: null, trace: new Trace(), history: new History(), path: new Path() });
-    Object.assign(this, { later: null, silentS: null, highest: 0, noteKinds: "", dirty: true });
+    Object.assign(this, { result: null, receivedS: 0, zeroed: null, taps: null }); // of the newest scan
+    Object.assign(this, { pattern: null, deviation: null, touched: null, touchedS: 0 }); // of the newest with a pattern
+    Object.assign(this, { name, cursor: null, trace: new Trace(), silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
     this.part = Object.fromEntries([...root.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
@@ -17,8 +15,7 @@ class Sensor {
     this.part.field.setAttribute("aria-label", `pattern of sensor ${name}; arrow keys read out a pixel`);
     this.part.taxels.setAttribute("aria-label", `taxels of sensor ${name}, z in colour and shear as arrows`);
     this.fields = this.addNumbers();
-    this.limits = new Limits(this);
-    this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"], this.part.relief];
+    this.sized = [this.part.over, this.part.shear, this.part["force-plot"], this.part["area-plot"]];
     for (const canvas of this.sized) sizes.observe(canvas);
     paintBar(this.part["pattern-bar"], VIRIDIS);
     paintBar(this.part["taxels-bar"], CIVIDIS);
@@ -58,14 +55,6 @@ class Sensor {
       this.point((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height);
     };
     field.onpointerleave = (event) => { if (event.pointerType === "mouse") this.point(null); }; // a finger's pixel stays
-    for (const name of ["force-plot", "area-plot"]) {
-      this.part[name].onpointerdown = (event) => {
-        const box = this.part[name].getBoundingClientRect();
-        const share = (box.right - 6 - event.clientX) / (box.width - 46);
-        const endS = page.atS === null ? this.trace.newestS : Math.min(this.trace.newestS, page.atS + page.spanS / 2);
-        if (share >= 0 && share <= 1) past.show(endS - share * page.spanS);
-      };
-    }
     field.onblur = () => this.point(null);
     field.onkeydown = (event) => this.steer(event);
   }
@@ -77,39 +66,16 @@ class Sensor {
 
   // -- frames --
 
-  take(header, maps, buffer) {
+  take(header, maps) {
     const first = this.result === null;
     this.silentS = null;
     this.trace.add(header.trace ?? []);
-    const atS = header.trace?.at(-1)?.[0];
-    this.history.add(atS, buffer, HISTORY_BYTES / page.sensors.size);
-    this.path.add(atS, header);
-    this.absorb(page.atS === null ? this : this.later, header, maps, nowS() - (header.age_s ?? 0));
+    const receivedS = nowS() - (header.age_s ?? 0);
+    Object.assign(this, { result: header, receivedS, zeroed: maps.zeroed ?? null, taps: maps.taps ?? null });
+    if (maps.pattern) Object.assign(this, { pattern: maps.pattern, deviation: maps.deviation ?? null, touched: header, touchedS: receivedS });
+    else if (header.baseline === null) this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
     if (maps.pattern) this.highest = largest(maps.pattern.values, this.highest);
     this.logNotes(header, first);
-    this.limits.watch();
-    this.dirty = true;
-  }
-
-  /** Take a frame into what is shown, or will be once nobody looks back. */
-  absorb(shown, header, maps, receivedS) {
-    Object.assign(shown, { result: header, receivedS, zeroed: maps.zeroed ?? null, taps: maps.taps ?? null });
-    if (maps.pattern) Object.assign(shown, { pattern: maps.pattern, deviation: maps.deviation ?? null, touchedS: receivedS, touched: header });
-    else if (header.baseline === null) shown.pattern = shown.deviation = null; // no earlier pattern is valid without a baseline
-  }
-
-  /** Show what was at this time of the run; live data are kept for later. */
-  recall(atS) {
-    this.later ??= Object.fromEntries(SHOWN.map((name) => [name, this[name]]));
-    Object.assign(this, NOTHING);
-    const frame = this.history.at(atS);
-    if (frame !== null) this.absorb(this, frame.header, frame.maps, frame.atS);
-    this.dirty = true;
-  }
-
-  comeBack() {
-    if (this.later !== null) Object.assign(this, this.later);
-    this.later = null;
     this.dirty = true;
   }
 
@@ -160,7 +126,7 @@ class Sensor {
     const unit = this.unit();
     const at = row * cols + col;
     const uncertainty = this.deviation === null ? "" : ` \u00b1 ${amount(this.deviation.values[at], 3, unit)}`;
-    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${uncertainty}${this.live() ? "" : page.atS === null ? ", not live" : ", then"}`;
+    return `${place}: ${amount(this.pattern.values[at], 3, unit)}${uncertainty}${this.live() ? "" : ", not live"}`;
   }
 
   // -- state --
@@ -171,12 +137,7 @@ class Sensor {
   unsure() { return this.result?.state === "baseline_in_doubt"; }
 
   /** True if the sensor is silent: the program reports it, or the newest result is old. */
-  away() { return page.atS === null && !replay.rests && this.quiet(); }
-
-  quiet() {
-    const { result, receivedS } = this.later ?? this;
-    return this.silentS !== null || (result !== null && nowS() - receivedS > 1);
-  }
+  away() { return this.silentS !== null || (this.result !== null && this.ageS() > 1); }
 
   /** True if the pattern shown is of the newest scan; after a dropped scan the pattern before stays for a moment. */
   newest() {
@@ -184,10 +145,10 @@ class Sensor {
     return this.touchedS === this.receivedS || (this.result.state === "dropped" && this.receivedS - this.touchedS < 0.3);
   }
 
-  live() { return page.atS === null && !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
+  live() { return !this.unsure() && this.newest() && page.link.up && !this.away() && !page.paused; }
 
   /** True if the pattern is shown in grey, as where the baseline is in doubt; while paused it keeps its colours. */
-  old() { return this.unsure() || (page.atS === null && this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest())); }
+  old() { return this.unsure() || (this.pattern !== null && !this.live() && !(page.paused && page.link.up && this.newest())); }
 
   /** Return the result of the pattern shown if that is the newest; else the newest result. */
   made() { return this.newest() ? this.touched : this.result; }
@@ -205,13 +166,11 @@ class Sensor {
   ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
 
   word() {
-    if (page.atS !== null) return ["past", this.result === null ? "no scan then" : `${this.newest() && this.doubted() ? "contact, not believed" : this.result.state}, ${number(this.trace.newestS - page.atS, 1)}${THIN}s ago`];
     if (!page.link.up) return ["lost", lostWord()];
     if (page.paused) return ["paused", "paused"];
     if (this.result === null) return ["silent", this.silentS === null ? "no scan yet" : "no scan"];
     if (this.away()) return ["silent", `no scan for ${duration(this.silentS ?? this.ageS())}`];
     if (this.unsure()) return ["doubted", "baseline in doubt"];
-    if (replay.rests) return ["paused", `${this.result.state}, held`];
     if (this.newest() && this.doubted()) return ["doubted", "contact, not believed"];
     const state = this.result.state === "dropped" ? "contact" : this.result.state; // a newer scan was already waiting
     return [state, state];
@@ -254,15 +213,15 @@ class Sensor {
     this.paintLink();
   }
 
-  /** Return whether scans come from this sensor now, also while the page looks back: not only that the page is connected. */
-  comes() { return page.link.up && (this.later ?? this).result !== null && (replay.rests || !this.quiet()); }
+  /** Return whether scans come from this sensor now: not only that the page is connected. */
+  comes() { return page.link.up && this.result !== null && !this.away(); }
 
   paintLink() {
     const up = this.comes();
     this.part.link.dataset.up = up ? "yes" : "no";
-    const rate = (this.later ?? this).result?.rate_hz;
+    const rate = this.result?.rate_hz;
     const away = this.silentS === null ? "no scan" : `no scan for ${duration(this.silentS)}`;
-    say(this.part.link, !page.link.up ? "no connection" : replay.rests ? "recording held" : up ? `${known(rate) ? amount(rate, 0, "scans/s") : "scans come"}` : away);
+    say(this.part.link, !page.link.up ? "no connection" : up ? `${known(rate) ? amount(rate, 0, "scans/s") : "scans come"}` : away);
   }
 
   high() {
@@ -277,26 +236,22 @@ class Sensor {
     stamp.classList.toggle("aside", page.paused);
     field.dataset.live = live ? "yes" : "no";
     say(stamp, this.stampText());
-    show(stamp, this.unsure() || (!live && !(page.atS !== null && this.newest())));
+    show(stamp, this.unsure() || !live);
     say(this.part["pattern-high"], `${number(high, high < 0.1 ? 3 : 2)}${THIN}${unit}, ${page.auto ? "largest so far" : "full scale"}`);
     paintMap(pattern, this.pattern, high, VIRIDIS);
-    const most = this.pattern !== null && (live || page.atS !== null) ? largest(this.pattern.values) : null;
+    const most = this.pattern !== null && live ? largest(this.pattern.values) : null;
     say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
-    const relief = page.relief && this.pattern !== null;
-    field.classList.toggle("relief", relief);
-    if (relief) paintRelief(this.part.relief, this.pattern, high, VIRIDIS);
     const verdict = this.verdict();
     show(this.part.verdict, verdict !== null);
     say(this.part.verdict, verdict ?? "");
     this.root.classList.toggle("doubted", this.doubted());
-    paintOver(this, over, live || (page.atS !== null && this.newest() && !this.unsure()));
+    paintOver(this, over, live);
     readout.classList.toggle("read", this.cursor !== null);
     say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover, or use the arrow keys, to read a pixel") : this.reading());
   }
 
   stampText() {
     if (this.unsure()) return `${this.result.note} (key z)`;
-    if (page.atS !== null) return this.result === null ? "no scan then" : "no contact then";
     if (page.paused && this.newest()) return `paused ${ago(nowS() - page.pausedS)}`;
     if (this.pattern === null) return this.result === null ? "no scan yet" : this.result.baseline === null ? this.result.note ?? "no baseline yet" : "no contact yet";
     return `last contact ${ago(nowS() - this.touchedS)}`;
@@ -331,7 +286,7 @@ class Sensor {
     const [field, stamp] = [this.part["deviation-field"], this.part["deviation-stamp"]];
     field.classList.toggle("old", this.old());
     show(stamp, this.deviation === null);
-    say(stamp, this.pattern !== null ? "not given by this model" : page.atS === null ? "no contact yet" : "no contact then");
+    say(stamp, this.pattern !== null ? "not given by this model" : "no contact yet");
     const high = this.deviation === null ? null : roundUp(largest(this.deviation.values, 0.01));
     paintMap(deviation, this.deviation, high, MAGMA);
     say(this.part["deviation-high"], high === null ? this.unit() : `${short(high)}${THIN}${this.unit()}`);
@@ -355,12 +310,11 @@ class Sensor {
     const newtons = known(this.result?.force_n);
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
-    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts", page.atS, this.limits.of("force"));
-    if (page.shear && page.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force", page.atS);
-    else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2", page.atS, this.limits.of("area"));
+    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
+    if (page.shear && page.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force");
+    else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2");
     show(this.part.shear_toggle, page.hello.wrench);
     this.part.shear_toggle.setAttribute("aria-pressed", String(page.shear));
-    this.limits.paint();
     say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
     say(this.part["area-now"], amount(this.made()?.area_mm2, 0, "mm\u00b2"));
   }

@@ -2,9 +2,9 @@
 
 const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
-const POINTS = Math.ceil(1.1 * HISTORY_S / STEP_S);
+const POINTS = 66 / STEP_S; // the longest span, and some more for a trace that is held
 
-/** Ring buffer of the last minutes of force, area and shear. */
+/** Ring buffer of the last minute of force, area and shear. */
 class Trace {
   constructor() {
     this.time = new Float64Array(POINTS);
@@ -36,8 +36,8 @@ class Trace {
   }
 
   /** Call visit(time, value) for each point of the last `spanS` seconds, oldest first. */
-  each(name, spanS, visit, endS = this.endS) {
-    const series = this.series[name];
+  each(name, spanS, visit) {
+    const [series, endS] = [this.series[name], this.endS];
     for (let back = this.count; back > 0; back--) {
       const place = (this.next + POINTS - back) % POINTS;
       const atS = this.time[place];
@@ -65,17 +65,16 @@ function blank(canvas) {
 
 const FONT = '11px system-ui, "DejaVu Sans", sans-serif';
 
-/** Paint a trace up to now; or around a moment looked back at, which is marked. */
-function paintTrace(canvas, trace, name, spanS, least, ink, unit, markS = null, limit = null) {
+/** Paint a trace up to now. */
+function paintTrace(canvas, trace, name, spanS, least, ink, unit) {
   const [context, width, height] = blank(canvas);
   const [left, right, top, bottom] = [40, width - 6, 7, height - 17];
   if (right <= left) return;
-  const endS = markS === null ? trace.endS : Math.min(trace.newestS, markS + spanS / 2);
-  let [low, high] = [0, Math.max(least, limit ?? 0)];
-  trace.each(name, spanS, (_, value) => { if (value > high) high = value; if (value < low) low = value; }, endS);
+  let [low, high] = [0, least];
+  trace.each(name, spanS, (_, value) => { if (value > high) high = value; if (value < low) low = value; });
   high = roundUp(1.03 * high);
   low = low < -0.02 * high ? -roundUp(-low) : 0;
-  const x = (atS) => right - ((endS - atS) / spanS) * (right - left);
+  const x = (atS) => right - ((trace.endS - atS) / spanS) * (right - left);
   const y = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
   context.font = FONT;
   context.fillStyle = colour("quiet");
@@ -91,23 +90,20 @@ function paintTrace(canvas, trace, name, spanS, least, ink, unit, markS = null, 
   }
   context.textBaseline = "alphabetic";
   for (let part = 0; part <= 2; part++) {
-    const ago = (spanS * part) / 2 + (markS === null ? 0 : trace.newestS - endS);
     const at = Math.round(right - (part / 2) * (right - left)) - 0.5;
     context.moveTo(at, top);
     context.lineTo(at, bottom);
     context.textAlign = part === 0 ? "right" : part === 2 ? "left" : "center";
-    context.fillText(ago < 0.05 ? "now" : `${MINUS}${short(Math.round(10 * ago) / 10)}${THIN}s`, at, height - 4);
+    context.fillText(part === 0 ? "now" : `${MINUS}${(spanS * part) / 2}${THIN}s`, at, height - 4);
   }
   context.stroke();
   context.textAlign = "left";
   context.fillText(unit, left + 4, top + 9);
-  paintLine(context, trace, name, spanS, x, y, ink, endS);
-  paintLimit(context, limit, y, left, right);
-  if (markS !== null) haloed(context, [colour("text"), colour("card")], 1, () => { context.moveTo(x(markS), top); context.lineTo(x(markS), bottom); });
+  paintLine(context, trace, name, spanS, x, y, ink);
 }
 
 /** Draw a line through all points; those on one column are one stroke from the least to the largest. */
-function paintLine(context, trace, name, spanS, x, y, ink, endS) {
+function paintLine(context, trace, name, spanS, x, y, ink) {
   context.strokeStyle = ink;
   context.lineWidth = 1.6;
   context.lineJoin = "round";
@@ -126,72 +122,6 @@ function paintLine(context, trace, name, spanS, x, y, ink, endS) {
       column = at;
     }
     beforeS = atS;
-  }, endS);
+  });
   context.stroke();
-}
-
-// ---- Limits of force and area that this page watches ----
-
-const LIMITED = { force: ["force_n", "force_counts"], area: ["area_mm2"] };
-
-/** Watch of one sensor's newest values; a limit is kept by the browser, for each unit and for all sensors. */
-class Limits {
-  constructor(sensor) {
-    Object.assign(this, { sensor, over: {} });
-    for (const what of Object.keys(LIMITED)) {
-      const field = sensor.part[`${what}-limit`];
-      field.setAttribute("aria-label", `limit of the ${what}, above which this page marks it`);
-      explain(field, `mark the ${what}, here and in the log, when it is above this limit; it stops no robot`);
-      field.onchange = () => {
-        memory.set(this.key(what), field.value);
-        for (const other of page.sensors.values()) other.limits.watch();
-        painter.all();
-      };
-    }
-  }
-
-  /** Return the field of the result that is watched. */
-  field(what) { return LIMITED[what].find((name) => this.sensor.result?.[name] != null) ?? LIMITED[what].at(-1); }
-
-  key(what) { return `limit ${this.field(what)}`; }
-
-  /** Return the limit; null where none is set. */
-  of(what) {
-    const limit = Number(memory.get(this.key(what)));
-    return limit > 0 ? limit : null;
-  }
-
-  /** Compare the newest values, and log each time that one has risen above its limit. */
-  watch() {
-    const newest = this.sensor.later?.result ?? this.sensor.result; // also while a person looks back
-    for (const what of Object.keys(LIMITED)) {
-      const [limit, value] = [this.of(what), newest?.[this.field(what)] ?? null];
-      const over = limit !== null && value !== null && value > limit;
-      if (over && !this.over[what]) log(`sensor ${this.sensor.name}: ${what} above the limit of ${limit}`, { bad: true });
-      this.over[what] = over;
-    }
-  }
-
-  paint() {
-    for (const what of Object.keys(LIMITED)) {
-      const field = this.sensor.part[`${what}-limit`];
-      if (document.activeElement !== field) field.value = this.of(what) ?? "";
-      field.closest("div").dataset.over = this.over[what] ? "yes" : "no";
-    }
-    this.sensor.root.dataset.over = Object.values(this.over).some(Boolean) ? "yes" : "no";
-  }
-}
-
-/** Draw a limit over a plot. */
-function paintLimit(context, limit, y, left, right) {
-  if (limit === null) return;
-  context.save();
-  context.strokeStyle = colour("bad");
-  context.setLineDash([5, 4]);
-  context.lineWidth = 1.2;
-  context.beginPath();
-  context.moveTo(left, y(limit));
-  context.lineTo(right, y(limit));
-  context.stroke();
-  context.restore();
 }

@@ -1,27 +1,90 @@
-"""Poses from ROS 2 over DDS, as a ROS node would subscribe to them, with no ROS installed.
+"""Sources of poses beside stdin, by the names that a user writes: zenoh, and ROS 2 with no ROS installed.
 
-docs/poses.md draws how a stamped pose of a tool frame becomes the pose of a pad in the plane of an object.
+They steer nothing else, and put what they receive into the queue of poses. docs/poses.md draws how a stamped pose of a
+tool frame becomes the pose of a pad in the plane of an object.
 """
 
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from math import acos, atan2, degrees, hypot, isfinite, sqrt
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
-from cyclonedds.core import GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
-from cyclonedds.util import duration
 from numpy.typing import NDArray
 
+from edge.errors import UsageError
 from edge.pipeline.pose_queue import PoseError, PoseQueue
-from edge.sinks.ros2.cdr_messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED
-from edge.sinks.ros2.dds_domain import join, reader, taken
+from edge.sinks.registry import needs_cyclone_dds
+from edge.sinks.ros2.messages import POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, TRANSFORM_STAMPED, base_topic
+from edge.sinks.zenoh import close_session, open_session, opening, parsed_target
 from firmware_bridge.errors import CdrError
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.scans.device_clock import DeviceClock
+
+if TYPE_CHECKING:
+    import zenoh
+
+FORMS: Final = ("zenoh[:KEY]", "ros2:TOPIC")
+
+
+class PoseSource(Protocol):
+    """Open source of poses, which receives in a thread of its own until it is closed."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+def check_poses(text: str) -> tuple[str | None, str, str]:
+    """Return sensor, form and target of the source that `text` names, FORM or SENSOR=FORM, or raise a UsageError."""
+    match = re.fullmatch(r"([A-Za-z0-9_/-]{1,64})=(.+)", text, re.DOTALL)
+    sensor, form_text = (match[1], match[2]) if match else (None, text)
+    form, _, target = form_text.partition(":")
+    if form == "zenoh":
+        target = target or "pose"
+        parsed_target(target)
+    elif form == "ros2" and target:
+        target = base_topic(target)
+    else:
+        raise UsageError(f"no source of poses {text!r}; they are {', '.join(FORMS)}, or SENSOR= before one of them")
+    return sensor, form, target
+
+
+def open_poses(text: str, queue: PoseQueue) -> PoseSource:
+    """Open the source of poses that `text` names, as for `check_poses`; they go to the queue.
+
+    Raises a UsageError where a package is not installed, and a SinkError where it cannot be opened.
+    """
+    sensor, form, target = check_poses(text)
+    if form == "zenoh":
+        return ZenohPoses(target, queue, sensor)
+    with needs_cyclone_dds(text):
+        return Ros2Poses(target, queue, sensor)
+
+
+class ZenohPoses:
+    """Subscriber to a key of poses, the same JSON as on stdin, one a message; `sensor` is that of those with none."""
+
+    def __init__(self, target: str, queue: PoseQueue, sensor: str | None) -> None:
+        """Open a session; it does not matter whether a publisher is there, now or later."""
+        key, self._session = open_session(target)
+        import zenoh
+
+        def take(sample: "zenoh.Sample") -> None:
+            queue.put_json(sample.payload.to_bytes(), time.monotonic_ns(), sensor)
+
+        with opening():
+            # In zenoh's thread, since a thread in between would add its own delay to a time of arrival.
+            called = zenoh.handlers.Callback(take, indirect=False)
+            self._subscriber = self._session.declare_subscriber(key, called)
+
+    def close(self) -> None:
+        """End the session."""
+        close_session(self._session)
+
 
 _KEPT: Final = 128  # messages of a topic that wait until they are read
 MOST_TILT_DEG: Final = 10.0
@@ -117,6 +180,11 @@ class Ros2Poses:
 
     def __init__(self, topic: str, queue: PoseQueue, sensor: str | None = None) -> None:
         """Subscribe to a topic, whichever type of pose is published there, now or later; for a sensor, or for all."""
+        from cyclonedds.core import GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+        from cyclonedds.util import duration
+
+        from edge.sinks.ros2.dds_domain import join, reader, taken
+
         self._queue, self._sensor = queue, sensor
         self._clock = StampClock(lambda line: queue.warn("clock", line))
         self._domain, self._participant = join(os.environ)
@@ -129,7 +197,7 @@ class Ros2Poses:
         self._conditions = [ReadCondition(one, state) for one, _ in self._readers]
         for condition in self._conditions:
             self._waiting.attach(condition)
-        self._ended = False
+        self._ended, self._taken, self._second = False, taken, duration(seconds=1)
         self._thread = threading.Thread(target=self._follow, name="ros2-poses", daemon=True)
         self._thread.start()
 
@@ -143,9 +211,9 @@ class Ros2Poses:
 
     def _follow(self) -> None:
         while not self._ended:
-            self._waiting.wait(duration(seconds=1))
+            self._waiting.wait(self._second)
             for waiting, kind in self._readers:
-                for data in taken(waiting, _KEPT):
+                for data in self._taken(waiting, _KEPT):
                     self._take(data, kind, time.monotonic_ns())
 
     def _take(self, data: bytes, kind: MessageType, arrival_ns: int) -> None:
