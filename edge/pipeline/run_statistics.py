@@ -17,11 +17,12 @@ BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
 OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
-_COUNTERS: Final = (
+COUNTED: Final = (
     *("dropped", "overruns", "late", "missed"),
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
 )
-_COUNTS: Final = attrgetter(*_COUNTERS)
+"""Counts of which records have counters."""
+_COUNTS: Final = attrgetter(*COUNTED)
 
 
 class Histogram:
@@ -91,7 +92,7 @@ class Statistics:
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
-        return dict(zip(_COUNTERS, _COUNTS(self), strict=True))
+        return dict(zip(COUNTED, _COUNTS(self), strict=True))
 
     def add(self, result: Result) -> None:
         """Count one result."""
