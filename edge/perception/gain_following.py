@@ -25,7 +25,7 @@ class SensorPad:
     Attributes:
         counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
         row: the constants as model input.
-        gains: (3, rows, cols) that the model takes readings divided by; None where it takes them as they are.
+        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
         gains_certainty: of these gains; None without.
         wrench_origin: whether the model gets the sensor's counts per newton.
     """
@@ -43,9 +43,10 @@ class SensorPad:
         if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
             pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
         self.row: NDArray[np.float32] = contract.pad_row(pad)
-        self.gains: NDArray[np.float32] | None = None
+        self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
         if contract.takes_gains and pad is not None and pad.gains is not None:
-            self.gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+            self.counts_per_unit = self.counts_per_unit * gains
         if self._check is not None:
             self._check.use_pad(self.row, outside=contract.is_outside(pad))
         self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.intervals import doubt
 from edge.inference.trust import Trust, contact_features, pose_tap_features
-from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
 from edge.perception.result import Estimate, Reason, Step, Window
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.taxel_health import TaxelWatch
+from edge.perception.taxel_health import Health
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
@@ -91,14 +89,15 @@ class PatternCheck:
         tap: int,
         newest: NDArray[np.float32],
         pattern: NDArray[np.float32],
-        deviation: NDArray[np.float32] | None,
+        doubt: float | None,
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> Verdict:
         """Return the verdict on a contact's pattern, and remember what the contact shows of the sensor.
 
-        Readings (3, rows, cols) are in network units, pattern and deviation (H, W) in [mm], traction (3, h, w) in
-        [kPa]; repeats are scans for which some taxel has repeated itself while most others were new.
+        Readings (3, rows, cols) are in network units, the pattern (H, W) in [mm], its doubt as `intervals.doubt` gives
+        it, the traction (3, h, w) in [kPa]; repeats are scans for which some taxel has repeated itself while most
+        others were new.
         """
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
@@ -122,7 +121,7 @@ class PatternCheck:
             reason = "beyond"  # than all presses of the training, up to 40 N, but for one in a thousand
         elif not explained:
             reason = "unexplained"
-        elif deviation is not None and not doubt(pattern, deviation)[0] <= most_doubt(z_counts):
+        elif doubt is not None and not 0 <= doubt <= most_doubt(z_counts):
             reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
@@ -174,8 +173,8 @@ def _share(log_odds: float) -> float:
 class Check:
     """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from."""
 
-    def __init__(self, check: PatternCheck | None, taps: TapTracker, watch: TaxelWatch, report: Report) -> None:
-        self._check, self._taps, self._watch, self._report = check, taps, watch, report
+    def __init__(self, check: PatternCheck | None, taps: TapTracker, health: Health, report: Report) -> None:
+        self._check, self._taps, self._health, self._report = check, taps, health, report
 
     def belonging(
         self, step: Step, window: Window, scaled: NDArray[np.float32]
@@ -186,13 +185,11 @@ class Check:
         `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
-        if self._check is None or window.taps < 2 or window.poses is None or step.doubted:
+        if self._check is None:
             return every, None
         belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
-        posed = step.pose is not None and window.poses is not None
+        posed = step.pose is not None
         dropped = foreign_taps(belonging, posed=posed)
-        if not dropped:
-            return every, belonging
         settled = [
             number
             for number in (dropped if posed else dropped[:1])
@@ -205,16 +202,19 @@ class Check:
             self._taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
         return [number for number in every if number not in dropped], belonging
 
-    def __call__(self, step: Step, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
-        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units."""
-        if made.deviation is not None and step.dead:
-            made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
+    def __call__(
+        self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
+    ) -> None:
+        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units.
+
+        `about` is the pattern's doubt, and its RMS.
+        """
         check = self._check
         if check is None or made.pattern is None:
             return
         suspected = check.suspected
         made.trusted, made.untrusted_reason, made.mismatch = check.judge(
-            tap, newest, made.pattern, made.deviation, made.traction, self._watch.most_repeats
+            tap, newest, made.pattern, None if about is None else about[0], made.traction, self._health.most_repeats
         )
         if check.suspected != suspected:
             self._report("cleared" if suspected else "suspected")

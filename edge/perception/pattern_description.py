@@ -160,17 +160,19 @@ class Describe:
         self._balance = None if trust is None else Balance(trust.forward, geometry)
         self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
 
-    def __call__(self, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
-        """Add to an estimate what follows from its pattern; tap and newest readings as `Check` takes them."""
+    def __call__(
+        self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
+    ) -> None:
+        """Add to an estimate what follows from its pattern; all others as `Check` takes them."""
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")
         touching = touched(pattern, contract.contact_level)
         made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
-        if deviation is not None:
-            expected = expect(contract.confidence, made.taps_used, pattern, deviation)
+        if deviation is not None and about is not None:
+            expected = expect(contract.confidence, made.taps_used, *about)
             if expected is not None:
-                made.expected_rmse_mm, made.another_tap = expected.rmse, expected.another_tap
+                made.expected_rmse_mm, made.another_tap = expected
             if contract.interval_factor is not None and touching.any():
                 made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
         if (traction := made.traction) is not None:

@@ -23,8 +23,8 @@ from edge.evaluation.classical_methods import fit_linear_map, fitted_methods
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import load_estimator
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
