@@ -9,6 +9,7 @@ so that the same reading gets the same verdict as far as their patterns agree.
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -17,10 +18,11 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.trust import Trust, contact_features, pose_tap_features
 from edge.perception.event import Report
-from edge.perception.result import Estimate, Reason, Step, Window
+from edge.perception.result import Estimate, Reason, Step, Window, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import Health
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD
+from firmware_bridge.pad_geometry import AXES
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
 MOST_MISMATCH: Final = 0.8
@@ -224,3 +226,40 @@ def _which(number: int, *, alone: bool) -> str:
     if number == 1:
         return "the tap before does"
     return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
+
+
+class SensorPad:
+    """Constants and gains of a sensor, which may be learned while it runs.
+
+    Attributes:
+        check: of the sensor's patterns, which takes the pad, too; None without.
+        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
+        pad: as it was given; None if nothing is known.
+        row: the constants as model input.
+        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
+        gains_certainty: of these gains; None without.
+        wrench_origin: whether the model gets the sensor's counts per newton.
+    """
+
+    def __init__(
+        self, contract: Contract, pad: Pad | None, counts_per_newton: float | None, check: PatternCheck | None
+    ) -> None:
+        self.check, self.counts_per_newton, self._contract = check, counts_per_newton, contract
+        self.use(pad)
+
+    def use(self, pad: Pad | None) -> None:
+        """Take a pad from now on, converted once for all runs of the model."""
+        contract, self.pad = self._contract, pad
+        if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
+            pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
+        self.row: NDArray[np.float32] = contract.pad_row(pad)
+        self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+            self.counts_per_unit = self.counts_per_unit * gains
+        if self.check is not None:
+            self.check.use_pad(self.row, outside=contract.is_outside(pad))
+        self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
+        calibrated = pad is not None and pad.counts_per_newton is not None
+        takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
+        self.wrench_origin: WrenchOrigin = "calibrated" if calibrated and takes else "nominal"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.intervals import expect
 from edge.inference.trust import GRID, KPA, ForwardModel, Trust, pooling
-from edge.perception.gain_following import SensorPad
+from edge.perception.pattern_check import SensorPad
 from edge.perception.result import LEAST_FORCE_N, Estimate, Wrench
 from firmware_bridge.pad_geometry import SensorGeometry
 

@@ -17,9 +17,8 @@ from edge.inference.intervals import doubt
 from edge.inference.trust import Trust
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
-from edge.perception.gain_following import Learn, SensorPad
-from edge.perception.gain_learning import ContactModel
-from edge.perception.pattern_check import Check, PatternCheck
+from edge.perception.gain_learning import ContactModel, Learn
+from edge.perception.pattern_check import Check, PatternCheck, SensorPad
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, Origin, Result, Step, Window
 from edge.perception.tap_tracker import TapTracker
@@ -91,7 +90,7 @@ class Sensor:
         self.learn: Learn | None = None
         if settings.contacts is not None:
             measured = pad if settings.measured is None else settings.measured.get(name)
-            self.learn = Learn(settings.contacts, measured, pad, self.pad, check, self.report)
+            self.learn = Learn(settings.contacts, measured, self.pad, self.report)
         if baseline is not None:
             age_s = baseline.age_s(settings.unix_time_s())
             # A baseline from the future means that one of the two clocks was wrong.
