@@ -4,7 +4,7 @@
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -248,6 +248,7 @@ class Runtime:
         self.unposed = None if contract.takes_poses else model.name
         self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
         self._model, self._clock_ns = model, clock_ns
+        self._scan_shape = geometry.scan_shape
         self._origin = Origin(source, model.name, contract.output_unit)
         self._settings = Settings(
             contract=contract,
@@ -322,11 +323,11 @@ class Runtime:
         ready = self.take(scan)
         if scan.sensor not in self.waiting:
             return ready[-1]
-        due = self.waiting.pop(scan.sensor)
         if infer:
-            return self._infer([due])[0]
-        due[1].overtake()
-        return due[1].freeze()
+            return self.infer(only=scan.sensor)[0]
+        _, step, _ = self.waiting.pop(scan.sensor)
+        step.overtake()
+        return step.freeze()
 
     def take(self, scan: Scan, clock_ns: Callable[[], int] | None = None) -> list[Result]:
         """Take a scan and return the results that are ready, in the order of their scans.
@@ -337,12 +338,12 @@ class Runtime:
         Raises:
             WindowError: the scan is not of this sensor geometry.
         """
-        name, settings = scan.sensor, self._settings
-        if scan.counts.shape != settings.geometry.scan_shape:
-            raise WindowError(f"scan has shape {scan.counts.shape}, expected {settings.geometry.scan_shape}")
+        name = scan.sensor
+        if scan.counts.shape != self._scan_shape:
+            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
         sensor = self._sensors.get(name)
         if sensor is None:
-            sensor = self._sensors[name] = Sensor(name, scan.time_ns, settings)
+            sensor = self._sensors[name] = Sensor(name, scan.time_ns, self._settings)
         step = Step(scan, self._origin)
         # Without a pose of any pad, which is the rule, this is all that poses cost.
         track = (self._tracks.get(name) or self._tracks.get(None) or None) if self._tracks else None
@@ -360,20 +361,16 @@ class Runtime:
         ready.append(step.freeze(clock_ns() if step.estimate is not None and clock_ns is not None else None))
         return ready
 
-    def infer(self, clock_ns: Callable[[], int] | None = None) -> list[Result]:
-        """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call.
+    def infer(self, clock_ns: Callable[[], int] | None = None, *, only: str | None = None) -> list[Result]:
+        """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call, or of one alone.
 
         Raises:
             ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
                 above zero.
         """
-        due = list(map(self.waiting.pop, list(self.waiting)[:MOST_TOGETHER]))
-        return self._infer(due, clock_ns) if due else []
-
-    def _infer(
-        self, due: Sequence[tuple[Sensor, Step, Window]], clock_ns: Callable[[], int] | None = None
-    ) -> list[Result]:
-        """Return the results of steps, whose patterns are inferred in one call."""
+        due = list(map(self.waiting.pop, list(self.waiting)[:MOST_TOGETHER] if only is None else [only]))
+        if not due:
+            return []
         model, start_ns = self._model, self._clock_ns()
         begun = [sensor.begin(step, window) for sensor, step, window in due]
         poses = [made.poses for made, _ in begun if made.poses is not None]
@@ -382,9 +379,9 @@ class Runtime:
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         deviations, tractions = model.deviation, model.traction
         for row, ((sensor, step, window), (made, given)) in enumerate(zip(due, begun, strict=True)):
-            made.pattern, step.run_time_us = patterns[row].copy(), run_time_us
-            made.deviation = None if deviations is None else deviations[row].copy()
-            made.traction = None if tractions is None else tractions[row].copy()
+            made.pattern, step.run_time_us = patterns[row], run_time_us
+            made.deviation = None if deviations is None else deviations[row]
+            made.traction = None if tractions is None else tractions[row]
             sensor.finish(step, window, made, given[0])
         done_ns = None if clock_ns is None else clock_ns()
         return [step.freeze(done_ns) for _, step, _ in due]

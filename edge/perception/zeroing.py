@@ -240,18 +240,19 @@ class BaselineDoubt:
         """Mark the step where its readings are in doubt."""
         if step.readings is None or step.force_counts is None:
             return
-        doubt = self.weigh(step.readings, step.force_counts, step.scan.time_ns)
-        if doubt is not self.reported:
-            self.reported = doubt
-            if doubt is None:
-                self._report("baseline_cleared", "")
-            else:
-                text = doubt_text(doubt, self.counts, step.baseline_age_s)
-                self.notes = (Note("baseline_in_doubt", text),)
-                self._report("baseline_doubted", text)
+        doubt = self._weigh(step.readings, step.force_counts, step.scan.time_ns)
         step.doubted = doubt is not None
+        if doubt is self.reported:
+            return
+        self.reported = doubt
+        if doubt is None:
+            self._report("baseline_cleared", "")
+        else:
+            text = doubt_text(doubt, self.counts, step.baseline_age_s)
+            self.notes = (Note("baseline_in_doubt", text),)
+            self._report("baseline_doubted", text)
 
-    def weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
+    def _weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
         """Return why readings (3, rows, cols) over the baseline, of a summed z, are in doubt; None if they are not."""
         self._newest = zeroed
         if self._held:

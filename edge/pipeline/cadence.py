@@ -202,7 +202,11 @@ class Cadences:
         return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
 
     def look(self) -> list[Event]:
-        """Return events of sensors newly silent while another is not; the link reports a silence of all of them."""
+        """Return events of sensors newly silent while another is not, and choose the pace anew.
+
+        The link reports a silence of all of them.
+        """
+        self._choose_pace()
         if len(self._sensors) + len(self._expected) < 2 or self._first_ns is None:
             return []
         heard = {name: (one, one.last.time_ns) for name, one in self._sensors.items() if one.last is not None}
@@ -229,10 +233,11 @@ class Cadences:
         since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
         return max([time_ns, *since_ns])
 
-    def choose_pace(self) -> Pace:
-        """Return the pace for the sensors so far, by the fastest of them."""
-        periods_ns = [one.period_ns for one in self._sensors.values() if one.period_ns]
-        period_s = min(periods_ns) / NS_PER_S if periods_ns else math.inf
+    def _choose_pace(self) -> None:
+        """Choose the pace for the sensors so far, by the fastest of them."""
+        period_s = math.inf
+        for cadence in self._sensors.values():
+            period_s = min(period_s, (cadence.period_ns or math.inf) / NS_PER_S)
         pace, before = Pace(), self.pace
         rests = self._newest_ns - self._restless_ns > RESTLESS_NS
         if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self._patience_s / 2):  # faster ones never wait
@@ -240,10 +245,9 @@ class Cadences:
         elif len(self._sensors) >= 4 and period_s < LONGEST_PERIOD_S:
             pace = Pace(period_s / 4)
         if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < 0.1 * pace.every_s:
-            return before  # a measured period jitters
+            return  # a measured period jitters
         if pace.reads > 1:
             self.waited_ns = math.inf
         elif before.reads > 1:
             self.waited_ns = self._newest_ns + 2e9 * before.every_s
         self.pace = pace
-        return pace

@@ -170,8 +170,11 @@ class Loop:
             self._make_patterns()
             self._end()
             return
-        if self._commands is not None:
-            self._carry_out(self._commands)
+        if (commands := self._commands) is not None:
+            carry_out(commands, runtime, self._may_come)
+            self.statistics.commands_refused = commands.refused
+            if commands.reason is not None:
+                self._tell_refusal(commands, commands.reason)
         if self._poses.begun or source.states_poses:
             self._take_poses(taken)
         for one in taken:
@@ -196,7 +199,7 @@ class Loop:
         self._left = 0
         for event in self._cadences.look():
             self._tell(event)
-        source.pace = self._cadences.choose_pace()
+        source.pace = self._cadences.pace
         if not taken:
             self._rest(wait_s)
 
@@ -238,13 +241,11 @@ class Loop:
     def _may_come(self, name: str) -> bool:
         return name not in self.statistics.scans_of_each() and self._no_sensor(name) is None
 
-    def _carry_out(self, commands: Commands) -> None:
-        carry_out(commands, self._runtime, self._may_come)
-        self.statistics.commands_refused = commands.refused
-        if commands.reason is not None and self._clock_s() - self._refused_s >= 10:
-            self._refused_s = self._clock_s()  # a stream of refused ones must not flood
-            self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
-            commands.reason = None
+    def _tell_refusal(self, commands: Commands, reason: str) -> None:
+        now_s = self._clock_s()
+        if now_s - self._refused_s >= 10:  # a stream of refused ones must not flood
+            self._refused_s, commands.reason = now_s, None
+            self._tell(Event(self._clock_ns(), "refused", None, reason))
 
     def _rest(self, wait_s: float) -> None:
         """Let the sinks do what is due, four times a second while no scan comes."""

@@ -183,7 +183,7 @@ class Stream(Loop):
 
     def run(self) -> None:
         """Make all results for the sinks alone; raises as `__iter__`."""
-        while not self.ended or self._error is not None:
+        while self._error is not None or not self._newest.ended:
             self._step(POLL_S)
             self._pass_over()
 

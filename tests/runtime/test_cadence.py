@@ -182,12 +182,13 @@ def rest(cadences, scans, state="idle", *, begin=0, period_ms=10, stamped=True):
     for number in range(begin, begin + scans):
         time_ms = round(number * period_ms)
         follow(cadences, scan(number, time_ms, device_ms=time_ms if stamped else None), state)
-    return cadences.choose_pace()
+    cadences.look()
+    return cadences.pace
 
 
 def test_rest_is_a_second_without_contact_of_stamped_sensors():
     cadences = Cadences(patience_s=0.1)
-    assert cadences.choose_pace() == rest(cadences, 50, "contact") == rest(cadences, 100, begin=50) == Pace()
+    assert rest(cadences, 0) == rest(cadences, 50, "contact") == rest(cadences, 100, begin=50) == Pace()
     assert cadences.waited_ns <= 1490 * MS
     resting = rest(cadences, 2, begin=150)
     assert resting == Pace(0.01, 10) and cadences.waited_ns > 1600 * MS
@@ -201,7 +202,8 @@ def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
         for number in range(9):
             for name in range(sensors):
                 follow(cadences, scan(number, number * period_ms, f"{name}"), "contact")
-        assert cadences.choose_pace() == pace
+        cadences.look()
+        assert cadences.pace == pace
     assert rest(Cadences(patience_s=0.1), 200, stamped=False) == Pace()
     assert rest(Cadences(patience_s=0.1), 1000, period_ms=2) == Pace()
-    assert Cadences(patience_s=0.1).choose_pace() == Pace()
+    assert rest(Cadences(patience_s=0.1), 0) == Pace()
