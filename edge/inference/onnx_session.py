@@ -190,18 +190,16 @@ class ModelSession:
 
     def _outputs_of(self, feeds: Mapping[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
         """Return the outputs of the graph for inputs by name, one after the other where it takes one window a run."""
+        run: Any = self._session.run
         count = len(feeds[INPUT_NAME])
-        at_once = count if self.contract.batch == ANY_BATCH else 1
         try:
-            parts: list[Any] = [
-                self._session.run(
-                    self._names, {name: one[start : start + at_once] for name, one in feeds.items()}, self._options
-                )
-                for start in range(0, count, at_once)
-            ]
+            if count == 1 or self.contract.batch == ANY_BATCH:
+                return run(self._names, feeds, self._options)
+            single = ({name: one[index : index + 1] for name, one in feeds.items()} for index in range(count))
+            parts = [run(self._names, one, self._options) for one in single]
         except ORT_ERRORS as error:
             raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        return parts[0] if len(parts) == 1 else list(map(np.concatenate, zip(*parts, strict=True)))
+        return list(map(np.concatenate, zip(*parts, strict=True)))
 
     def _check_window(self, window: NDArray[np.float32]) -> None:
         shape, expected = window.shape, str(self._shape)
