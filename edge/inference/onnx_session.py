@@ -173,7 +173,7 @@ class ModelSession:
             raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
         else:
             feeds[INPUT_NAME] = np.array(windows).reshape(len(windows), -1, *self._shape[2:])
-        if self.contract.pad_width:
+        if self._unknown_pad.size:
             feeds[PAD_NAME] = np.array(pads)
         outputs = dict(zip(self._names, self._outputs_of(feeds), strict=True))
         pattern = outputs[OUTPUT_NAME]

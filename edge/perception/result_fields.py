@@ -223,9 +223,9 @@ def _rounded(numbers: Iterable[float], decimals: int = 3) -> list[float]:
 def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
     centre = wrench.centre_of_pressure_mm
     return {
-        "force_n": _rounded(wrench.force_n, 4),
-        "torque_n_mm": _rounded(wrench.torque_n_mm),
-        "centre_of_pressure_mm": None if centre is None else _rounded(centre),
+        "force_n": list(map(round, wrench.force_n, repeat(4))),
+        "torque_n_mm": list(map(round, wrench.torque_n_mm, repeat(3))),
+        "centre_of_pressure_mm": None if centre is None else list(map(round, centre, repeat(3))),
     }
 
 

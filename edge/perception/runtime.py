@@ -372,16 +372,24 @@ class Runtime:
         if not due:
             return []
         model, start_ns = self._model, self._clock_ns()
-        begun = [sensor.begin(step, window) for sensor, step, window in due]
-        poses = [made.poses for made, _ in begun if made.poses is not None]
-        pads = [sensor.pad.row for sensor, _, _ in due]
-        patterns = model.run_together([given for _, given in begun], pads, *([poses] if poses else []))
+        begun: list[Estimate] = []
+        inputs: list[NDArray[np.float32]] = []
+        pads: list[NDArray[np.float32]] = []
+        poses: list[NDArray[np.float32]] = []
+        for sensor, step, window in due:
+            made, given = sensor.begin(step, window)
+            begun.append(made)
+            inputs.append(given)
+            pads.append(sensor.pad.row)
+            if made.poses is not None:
+                poses.append(made.poses)
+        patterns = model.run_together(inputs, pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         deviations, tractions = model.deviation, model.traction
-        for row, ((sensor, step, window), (made, given)) in enumerate(zip(due, begun, strict=True)):
+        for row, ((sensor, step, window), made) in enumerate(zip(due, begun, strict=True)):
             made.pattern, step.run_time_us = patterns[row], run_time_us
             made.deviation = None if deviations is None else deviations[row]
             made.traction = None if tractions is None else tractions[row]
-            sensor.finish(step, window, made, given[0])
+            sensor.finish(step, window, made, inputs[row][0])
         done_ns = None if clock_ns is None else clock_ns()
         return [step.freeze(done_ns) for _, step, _ in due]
