@@ -167,14 +167,16 @@ class Describe:
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")
-        touching = touched(pattern, contract.contact_level)
+        peak = pattern.max()
+        touching = pattern >= contract.contact_level * peak if peak > 0 else np.zeros(pattern.shape, dtype=bool)
         made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
         if deviation is not None and about is not None:
             expected = expect(contract.confidence, made.taps_used, *about)
             if expected is not None:
                 made.expected_rmse_mm, made.another_tap = expected
-            if contract.interval_factor is not None and touching.any():
-                made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
+            if contract.interval_factor is not None and made.centroid_mm is not None:
+                mean_mm = float(deviation.ravel() @ touching.ravel()) / np.count_nonzero(touching)
+                made.interval_mm = contract.interval_factor * mean_mm
         if (traction := made.traction) is not None:
             if self._balance is not None:
                 made.traction = traction = self._balance(traction, pattern, newest, tap, self._pad.row)
