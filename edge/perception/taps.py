@@ -13,7 +13,7 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.pattern_check import REPEATS
 from edge.perception.result import Estimate, NextTap, Step, Window
-from edge.perception.tap_tracker import TapState, TapTracker
+from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
@@ -34,7 +34,7 @@ class TapPoses:
         self._poses: dict[int, PadPose] = {}
         self._reported: set[int] = set()
 
-    def follow(self, tap: TapState, track: PoseTrack) -> None:
+    def follow(self, tap: TapTracker, track: PoseTrack) -> None:
         """Look up the poses of earlier taps, and forget those that the tracker has forgotten.
 
         A pose may come later than its scan, and a track is short, so that every scan looks for what is missing.
@@ -49,7 +49,7 @@ class TapPoses:
             self._reported &= remembered | {tap.tap}
 
     def choose(
-        self, tap: TapState, pose: PadPose | None, *, scheduled: bool
+        self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
     ) -> tuple[Sequence[int], NDArray[np.float32]]:
         """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
 
@@ -114,7 +114,7 @@ class TapAdvice:
         if before is None or (made.force_counts or 0.0) >= (before.force_counts or 0.0):
             self._strongest = made
 
-    def proposal(self, tap: TapState) -> NextTap | None:
+    def proposal(self, tap: TapTracker) -> NextTap | None:
         """Return where to touch next; None during a tap, and where nothing can be proposed or the tap is forgotten."""
         if tap.contact or not tap.peaks or tap.peaks[0].tap != self._tap:
             self._proposed = None
@@ -190,7 +190,8 @@ class Taps:
         scan, readings, z_counts = step.scan, step.readings, step.force_counts
         if readings is None or z_counts is None:
             return
-        tap = self._tracker.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
+        tap = self._tracker
+        tap.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
         if self._poses is not None and track is not None:
             self._poses.follow(tap, track)
         step.state, step.contact = "idle", tap.contact
@@ -206,7 +207,7 @@ class Taps:
         if self.advice is not None and not step.doubted:
             step.next_tap = self.advice.proposal(tap)
 
-    def _window(self, step: Step, tap: TapState, *, scheduled: bool) -> Window:
+    def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
         taps = min(tap.taps_used, self._most)
         if self._poses is None:
             # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
