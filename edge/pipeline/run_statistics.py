@@ -85,7 +85,6 @@ class Statistics:
     poses_dropped: int = 0
     sink_trouble: str | None = None  # trouble of the sinks at the end; None while all is well
     events: dict[EventKind, int] = field(default_factory=dict)
-    model_patterns: dict[str, int] = field(default_factory=dict)
     run_time_us: Histogram = field(default_factory=Histogram)
     latency_us: Histogram = field(default_factory=Histogram)
     _sensors: dict[str, _Course] = field(default_factory=dict)
@@ -108,7 +107,6 @@ class Statistics:
         self.reused += result.reused_from is not None
         if result.run_time_us is not None:
             self.run_time_us.add(result.run_time_us)
-            self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
         if result.latency_us is not None:
             self.latency_us.add(result.latency_us)
         course = self._sensors.get(scan.sensor)
