@@ -204,12 +204,12 @@ class Loop:
             self._rest(wait_s)
 
     def _is_too_long(self, taken: Sequence[Scan | Notice | TimedPose]) -> bool:
-        """Return whether the time of a patient source, which is that of its scans, is over; one scan at most is new."""
-        for one in taken:
-            if isinstance(one, Scan):
-                self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
-                return one.time_ns - self._first_ns >= self._length_s * 1e9
-        return False
+        """Return whether the time of a patient source, which is that of its scans, is over."""
+        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
+        if not times_ns:
+            return False
+        self._first_ns = times_ns[0] if self._first_ns is None else self._first_ns
+        return times_ns[-1] - self._first_ns >= self._length_s * 1e9
 
     def _end(self) -> None:
         self._finish()
