@@ -23,6 +23,7 @@ from edge.api import infer
 from edge.errors import EdgeError, UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, find_model
 from edge.inference.contract import Contract
+from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession
 from edge.perception.pattern_check import PatternCheck
 from edge.terminal.progress_bar import tracked
@@ -206,7 +207,8 @@ def _graph(name: str, window: NDArray[np.float32], one: ModelSession, several: M
     size, touch = float(np.abs(pattern).max()), name in TOUCHES or name.endswith("taps")
     extreme = name in extreme_windows(one.contract)
     if extreme and not touch and name not in NO_TOUCH and (trust := one.contract.read_trust()):
-        verdict = PatternCheck(trust, one.contract).judge(0, window[0], pattern, one.deviation, one.traction, 0)
+        about = None if one.deviation is None else doubt(pattern, one.deviation)[0]
+        verdict = PatternCheck(trust, one.contract).judge(0, window[0], pattern, about, one.traction, 0)
         yield Case(name, "believed", float(verdict.trusted is True), 0.0, model=one.name)
     strength = max(1.0, float(np.abs(window).max()))  # patterns grow with the readings: no bound beyond them
     yield Case(name, "largest over the largest reading, mm", size_mm / strength, MOST_MM, model=one.name)

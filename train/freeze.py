@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
-from edge.perception.dead_taxel_fill import Kinds, load_estimator, ridged
+from edge.perception.taxel_health import Kinds, load_estimator, ridged
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording

@@ -50,10 +50,10 @@ class Report:
         most = max(float(pattern.max()) for _, pattern in patterns)
         for axes, (name, pattern) in zip(grid.flat, patterns, strict=False):
             axes.set_title(name, fontsize=8)
-            shown = axes.imshow(pattern, vmin=0, vmax=most)
+            axes.imshow(pattern, vmin=0, vmax=most)
         for axes in grid.flat:
             axes.axis("off")
-        figure.colorbar(shown, ax=grid, label="pattern [mm]")
+        figure.colorbar(grid[0, 0].images[0], ax=grid, label="pattern [mm]")
         path = self._path.with_suffix(".png")
         figure.savefig(path, dpi=100, metadata={"Software": None})
         self._parts.append(f"{caption}\n\n![{path.stem}]({path.name})")

@@ -11,7 +11,7 @@ doubt had, and the share of it that one more tap took away.
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, TypeGuard
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,18 +92,6 @@ Table = Mapping[str, Mapping[str, list[float]]]
 pattern's RMS, and the share of the error that another tap takes away; no gain for the largest number of taps."""
 
 
-class Expected(NamedTuple):
-    """Expected error of a pattern."""
-
-    rmse: float  # RMS error over all its pixels, in its unit
-    gain: float | None  # share of it that another tap would take away; None if the network takes no further tap
-
-    @property
-    def another_tap(self) -> bool | None:
-        """True if another tap is expected to be worth it; None if the network takes no further tap."""
-        return None if self.gain is None else self.gain >= WORTH_A_TAP
-
-
 def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple[float, float]:
     """Return the doubt of a pattern (H, W), and its RMS in its unit; infinite and 0 for a pattern of zeros."""
     size = math.sqrt(float(np.vdot(pattern, pattern)) / pattern.size)
@@ -111,19 +99,20 @@ def doubt(pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> tuple
     return (spread / size, size) if size > 0 else (math.inf, 0.0)
 
 
-def expect(table: Table, taps: int, pattern: NDArray[np.float32], deviation: NDArray[np.float32]) -> Expected | None:
-    """Return the expected error of a pattern (H, W) made from so many taps; None if the table has none.
+def expect(table: Table, taps: int, about: float, size: float) -> tuple[float, bool | None] | None:
+    """Return the expected RMS error of a pattern of so many taps, and whether another tap is worth it.
 
-    Between two doubts it is interpolated; beyond the last the error grows with the doubt. A pattern of zeros has none.
+    The pattern's doubt and RMS are as `doubt` gives them, and the error is in the pattern's unit; no other tap is known
+    of where the network takes none. Between two doubts of the table it is interpolated, beyond the last the error grows
+    with the doubt. None if the table has none, and for a pattern of zeros.
     """
-    about, size = doubt(pattern, deviation)
     row = table.get(str(taps))
     if row is None or size == 0:
         return None
     levels = row["doubt"]
     error = float(np.interp(about, levels, row["error"])) * max(1.0, about / levels[-1])
-    gain = float(np.interp(about, levels, row["gain"])) if row["gain"] else None
-    return Expected(error * size, gain)
+    another = bool(np.interp(about, levels, row["gain"]) >= WORTH_A_TAP) if row["gain"] else None
+    return error * size, another
 
 
 def is_confidence(value: Any, taps: int) -> bool:

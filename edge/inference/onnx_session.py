@@ -1,9 +1,9 @@
-"""Model session in onnxruntime: checked against its contract, with arrays bound once per number of windows and taps."""
+"""Model session in onnxruntime, checked against its contract."""
 
 import os
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,6 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors  # pyright
 from edge.errors import ModelError, WindowError
 from edge.inference.contract import (
     ANY_BATCH,
-    ANY_TAPS,
     DEVIATION_NAME,
     INPUT_NAME,
     OUTPUT_NAME,
@@ -30,45 +29,6 @@ from edge.inference.contract import (
 )
 from edge.inference.onnx_guard import read_model, within_limit
 from firmware_bridge.errors import harmless
-
-Outputs = tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32] | None]
-"""Patterns (n, H, W), deviations and tractions of a run; None where the model has none."""
-
-
-class BoundRun:
-    """Arrays for so many windows of so many taps, bound to a session; poses and pad are None where it takes none.
-
-    Attributes:
-        bindings: one for each call that a run needs.
-    """
-
-    def __init__(self, session: onnxruntime.InferenceSession, contract: Contract, count: int, taps: int) -> None:
-        inputs, outputs = (
-            {
-                name: np.zeros([count, *(taps if size == ANY_TAPS else size for size in shape[1:])], dtype=np.float32)
-                for name, shape in shapes.items()
-            }
-            for shapes in (contract.input_shapes, contract.output_shapes)
-        )
-        at_once = count if contract.batch == ANY_BATCH else 1
-        self.bindings = [session.io_binding() for _ in range(0, count, at_once)]
-        for index, binding in enumerate(self.bindings):
-            part = slice(index * at_once, (index + 1) * at_once)
-            for name, given in inputs.items():
-                _bind(binding.bind_input, name, given[part])
-            for name, output in outputs.items():
-                _bind(binding.bind_output, name, output[part])
-        for output in outputs.values():
-            output.setflags(write=False)
-        self.window = inputs[INPUT_NAME]
-        self.poses = inputs.get(POSES_NAME)
-        self.pad = inputs.get(PAD_NAME)
-        self.outputs: Outputs = (outputs[OUTPUT_NAME], outputs.get(DEVIATION_NAME), outputs.get(TRACTION_NAME))
-
-
-def _bind(bind: Callable[..., None], name: str, array: NDArray[np.float32]) -> None:
-    bind(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
-
 
 LOG_FATAL_ONLY: Final = 4
 LONGEST_REASON: Final = 300
@@ -102,7 +62,7 @@ class ModelSession:
         name: of the model.
         contract: of the model.
         deviation: of each pixel of the last run, (H, W) float32 above zero, or (n, H, W) after n windows were run
-            together; None without. Read-only, and overwritten by the next run.
+            together; None without.
         traction: of the last run, (3, h, w) or (n, 3, h, w) float32 in [kPa], as `deviation`.
     """
 
@@ -136,7 +96,7 @@ class ModelSession:
         if taps is not None:
             self.contract = replace(self.contract, taps=taps, unposed_taps=taps)
             self.name = self.name.replace("mtsr", f"mtsr{taps}", 1)
-        self._runs: dict[tuple[int, int], BoundRun] = {}
+        self._names = tuple(self.contract.output_shapes)
         self._options = onnxruntime.RunOptions()
         # onnxruntime looks this entry up at every run, and where it is missing throws and catches an exception.
         self._options.add_run_config_entry("gpu_graph_id", "-1")
@@ -166,8 +126,7 @@ class ModelSession:
                 those of the paper's schedule, and zeros for taps of zeros.
 
         Returns:
-            (H, W) float32 in the contract's output unit: the session's own array, read-only, and
-            overwritten by the next run.
+            (H, W) float32 in the contract's output unit.
 
         Raises:
             WindowError: wrong shape or type, or not finite.
@@ -199,14 +158,26 @@ class ModelSession:
             if pad.shape != self._unknown_pad.shape or pad.dtype != np.float32 or not np.isfinite(pad).all():
                 expected = f"{self._unknown_pad.shape} float32, finite, as the contract's pad_row gives it"
                 raise WindowError(f"pad is {pad.shape} {pad.dtype}, expected {expected}")
+        feeds: dict[str, NDArray[np.float32]] = {}
         if self.contract.takes_poses:
             poses = [self._scheduled(window) for window in windows] if poses is None else poses
-            for window, rows in zip(windows, poses, strict=True):
+            taps = max(map(_present, windows))
+            feeds[INPUT_NAME] = np.zeros((len(windows), taps, *self._shape[1:]), dtype=np.float32)
+            feeds[POSES_NAME] = np.zeros((len(windows), taps, POSE_WIDTH), dtype=np.float32)
+            for index, (window, rows) in enumerate(zip(windows, poses, strict=True)):
                 _check_poses(rows, len(window))
-            windows = [window[: _present(window)] for window in windows]
+                present = _present(window)
+                feeds[INPUT_NAME][index, :present] = window[:present]
+                feeds[POSES_NAME][index, :present] = rows[:present]
         elif poses is not None:
             raise WindowError(f"poses are given, but model '{self.name}' takes none: leave them out")
-        pattern, deviation, traction = self._outputs_of(windows, pads, poses)
+        else:
+            feeds[INPUT_NAME] = np.array(windows).reshape(len(windows), -1, *self._shape[2:])
+        if self._unknown_pad.size:
+            feeds[PAD_NAME] = np.array(pads)
+        outputs = dict(zip(self._names, self._outputs_of(feeds), strict=True))
+        pattern = outputs[OUTPUT_NAME]
+        deviation, traction = outputs.get(DEVIATION_NAME), outputs.get(TRACTION_NAME)
         if not np.isfinite(pattern).all():
             raise ModelError(f"model '{self.name}' gave a pattern that is not finite: export it again")
         if traction is not None and not np.isfinite(traction).all():
@@ -217,34 +188,18 @@ class ModelSession:
         self.deviation, self.traction = deviation, traction
         return pattern
 
-    def _outputs_of(
-        self,
-        windows: Sequence[NDArray[np.float32]],
-        pads: Sequence[NDArray[np.float32]],
-        poses: Sequence[NDArray[np.float32]] | None,
-    ) -> Outputs:
-        """Return the outputs of a run; absent taps of a window, and their poses, are zeros."""
-        key = len(windows), max(map(len, windows))
-        run = self._runs.get(key)
-        if run is None:
-            if len(self._runs) >= 32:  # of four sensors with seven taps there are 28
-                del self._runs[next(iter(self._runs))]
-            run = self._runs[key] = BoundRun(self._session, self.contract, *key)
-        for index, (window, pad) in enumerate(zip(windows, pads, strict=True)):
-            if run.poses is None or poses is None:
-                run.window[index] = window.reshape(run.window.shape[1:])
-            else:
-                taps = len(window)
-                run.window[index, :taps], run.window[index, taps:] = window, 0
-                run.poses[index, :taps], run.poses[index, taps:] = poses[index][:taps], 0
-            if run.pad is not None:
-                run.pad[index] = pad
+    def _outputs_of(self, feeds: Mapping[str, NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """Return the outputs of the graph for inputs by name, one after the other where it takes one window a run."""
+        run: Any = self._session.run
+        count = len(feeds[INPUT_NAME])
         try:
-            for binding in run.bindings:
-                self._session.run_with_iobinding(binding, self._options)
+            if count == 1 or self.contract.batch == ANY_BATCH:
+                return run(self._names, feeds, self._options)
+            single = ({name: one[index : index + 1] for name, one in feeds.items()} for index in range(count))
+            parts = [run(self._names, one, self._options) for one in single]
         except ORT_ERRORS as error:
             raise ModelError(f"{self._path}: cannot be run: {_reason(error)}") from error
-        return run.outputs
+        return list(map(np.concatenate, zip(*parts, strict=True)))
 
     def _check_window(self, window: NDArray[np.float32]) -> None:
         shape, expected = window.shape, str(self._shape)

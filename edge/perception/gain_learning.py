@@ -1,4 +1,7 @@
-"""Gains of a sensor's channels from its ordinary contacts: slow, bounded, drawn to where they began.
+"""Stage that learns the gains of a sensor's channels from its ordinary contacts: slow, bounded, drawn to their start.
+
+Nothing is computed while a pattern is made but a comparison: the strongest scan of a tap is kept, and is learned from
+once the pad is free again, or after HELD_SCANS.
 
 The model is the distribution of contacts on simulated pads (`contacts.npz`): a mixture of normal distributions of a
 contact's 48 readings over the RMS of its z, whose means are linear in what differs from pad to pad. What explains a
@@ -8,7 +11,7 @@ component that a contact belongs to, all of these enter linearly: so a contact a
 size, and now and then the best gains are the solution of one small convex problem.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +20,9 @@ from numpy.typing import NDArray
 
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
+from edge.perception.event import Report
+from edge.perception.pattern_check import SensorPad
+from edge.perception.result import Estimate, Step
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad
@@ -29,6 +35,11 @@ REMEMBERED: Final = 64
 """Newest distinct contacts, of which a further one must differ: always the same contact teaches once."""
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
+HELD_SCANS: Final = 200
+CONTRADICTED: Final = 6.0
+"""Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
+gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
+CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
 _EVEN: Final = 1e-3
 """Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
@@ -37,10 +48,8 @@ _ARRAYS: Final = (
     *("names", "middles", "halves", "constant_widening"),
 )
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
-_ROWS: Final = np.concatenate([np.arange(GAINS), np.arange(2 * TAXELS), np.arange(2 * TAXELS, GAINS), np.arange(GAINS)])
-"""Channel that each parameter acts on: inverse gains, leans, unevenness, offsets."""
-_LINEAR: Final = len(_ROWS)
-_PAIRS: Final = GAINS * _ROWS[:, None] + _ROWS  # places of all pairs of them in a flat matrix of channels
+_LINEAR: Final = GAINS + 2 * TAXELS + TAXELS + GAINS
+"""Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +116,11 @@ class GainLearner:
         constant_deviations: (p,) of the constants.
     """
 
-    def __init__(self, model: ContactModel, start: Pad | None = None) -> None:
-        """Begin with the gains of a pad, and their intervals; None for gains of 1."""
+    def __init__(self, model: ContactModel, start: Pad | None = None, look_from: "GainLearner | None" = None) -> None:
+        """Begin with the gains of a pad, and their intervals; None for gains of 1.
+
+        For a further pass over the same contacts it begins to look from the results of another learner.
+        """
         self.contacts = 0
         self._model = model
         constants = model.means.shape[1] - 1
@@ -127,7 +139,7 @@ class GainLearner:
             self._prior[:GAINS, :GAINS] = np.diag((deviation / model.widening) ** -2.0) + _even_axes()
             # What contacts share does not average out, so that they make no measured gain surer than this.
             self._least_deviations = np.minimum(deviation, 0.04)
-        self._best = self._begin.copy()
+        self._best = self._begin.copy() if look_from is None else look_from._best.copy()
         before = np.diag(np.linalg.inv(self._prior))
         self._before, self._after = before[:GAINS], before[:GAINS]
         self.deviations = model.widening * np.sqrt(before[:GAINS])
@@ -142,7 +154,10 @@ class GainLearner:
     @property
     def gains(self) -> NDArray[np.float64]:
         """Gains (GAINS,) so far, within BOUND of 1."""
-        biased = self._count / (self._count + 30) * self._share_of_contacts
+        # Weight of the contacts beside the beginning, over what it is where nothing is known at the beginning.
+        information = (1 / self._after - 1 / self._before).clip(0)
+        weight, of_unknown = ((information / (information + 1 / one)).sum() for one in (self._before, self._unknown))
+        biased = self._count / (self._count + 30) * weight / max(of_unknown, 1e-9)
         return (np.exp(-biased * self._model.bias) / self._best[:GAINS]).clip(1 - BOUND, 1 + BOUND)
 
     def pad(self) -> Pad:
@@ -153,46 +168,27 @@ class GainLearner:
         for at in np.flatnonzero(self.determined):
             name, middle, spread = self._model.constants[at]
             if name in PAD_RANGES:
-                value = self.constants[at]
-                ends = np.clip(value + LEVEL_90 * self.constant_deviations[at] * np.array([-1, 1]), -1, 1)
-                low, constants[name], high = (
-                    float(f"{middle + spread * one:.4g}") for one in (ends[0], value, ends[1])
-                )
+                ends = self.constants[at] + LEVEL_90 * self.constant_deviations[at] * np.array([-1, 0, 1])
+                low, constants[name], high = (float(f"{middle + spread * one:.4g}") for one in ends.clip(-1, 1))
                 intervals[name] = (low, high)
         gains = tuple(self.gains.round(4).tolist())
         return Pad(**constants, intervals=intervals, gains=gains, gain_half_widths=tuple(half.round(4).tolist()))
 
     @property
-    def disagreement(self) -> float:
-        """Mean square of how far contacts move the gains, over that of a right beginning; then it is about 1."""
-        moved = np.square(self._best[:GAINS] - self._begin[:GAINS])
-        return float(moved.mean() / max(float((self._before - self._after).clip(0).mean()), 1e-9))
-
-    @property
-    def _share_of_contacts(self) -> float:
-        """Weight of the contacts beside the beginning, over what it is where nothing is known at the beginning."""
-        information = (1 / self._after - 1 / self._before).clip(0)
-        weight, of_unknown = (information / (information + 1 / before) for before in (self._before, self._unknown))
-        return float(weight.sum() / max(float(of_unknown.sum()), 1e-9))
+    def constants(self) -> NDArray[np.float64]:
+        """Constants of the pad so far (p,), over half of their ranges."""
+        return self._best[_LINEAR:]
 
     @property
     def determined(self) -> NDArray[np.bool_]:
         """Constants (p,) that are well within the prior, and not at an end of their range."""
         return (self.constant_deviations < 0.7 * _OPEN) & (np.abs(self.constants) < 1)
 
-    def again(self) -> "GainLearner":
-        """Return a learner that has learned nothing yet and begins to look from these results: for a further pass."""
-        learner = GainLearner(self._model)
-        learner._prior, learner._begin = self._prior, self._begin
-        learner._before = learner._after = self._before
-        learner._best = self._best.copy()
-        learner._find_centres()
-        return learner
-
     @property
-    def constants(self) -> NDArray[np.float64]:
-        """Constants of the pad so far (p,), over half of their ranges."""
-        return self._best[_LINEAR:]
+    def disagreement(self) -> float:
+        """Mean square of how far contacts move the gains, over that of a right beginning; then it is about 1."""
+        moved = np.square(self._best[:GAINS] - self._begin[:GAINS])
+        return float(moved.mean() / max(float((self._before - self._after).clip(0).mean()), 1e-9))
 
     def learn(self, counts: NDArray[np.floating], dead: NDArray[np.bool_] | None = None) -> bool:
         """Learn from one contact, and return whether the gains have changed.
@@ -210,11 +206,17 @@ class GainLearner:
         # Two distinct contacts differ by a tenth of the RMS of their z: five times the effect of noise and drift.
         if self.contacts and float(np.square(away).mean(axis=1).min()) < 0.1**2:
             return False
-        before = self.contacts
-        self._add(contact, strength, None if dead is None or not dead.any() else np.tile(dead.ravel(), len(AXES)))
-        if self.contacts == before or self.contacts % 7:  # a step takes half a millisecond
+        if not self._add(
+            contact, strength, None if dead is None or not dead.any() else np.tile(dead.ravel(), len(AXES))
+        ):
             return False
-        self._fade()
+        if self.contacts % 7:  # a step takes half a millisecond
+            return False
+        fading = min(1.0, 400 / max(self._count, 1.0))  # so the oldest contacts fade
+        self._square *= fading
+        self._product *= fading
+        self._weight *= fading
+        self._count *= fading
         self._step()
         return True
 
@@ -224,49 +226,30 @@ class GainLearner:
             if not self._step():
                 break
 
-    def _add(self, contact: NDArray[np.float64], strength: float, dead: NDArray[np.bool_] | None) -> None:
-        values = _values(contact, strength)
-        terms = values * self._best[:_LINEAR]
-        even = terms[:GAINS] + terms[_LINEAR - GAINS :]
-        even[: 2 * TAXELS] += terms[GAINS : GAINS + 2 * TAXELS]
-        even[_Z] += terms[GAINS + 2 * TAXELS : _LINEAR - GAINS]
-        off = even.astype(np.float32) - self._centres
-        pulls = np.matmul(self._model.precisions, off[:, :, None])[:, :, 0]
+    def _add(self, contact: NDArray[np.float64], strength: float, dead: NDArray[np.bool_] | None) -> bool:
+        """Add a contact to the sums, by the component that explains it best; return False if none does."""
+        model, design = self._model, _design(contact, strength)
+        off = (design @ self._best[:_LINEAR]).astype(np.float32) - self._centres
+        pulls = np.matmul(model.precisions, off[:, :, None])[:, :, 0]
         distances = np.einsum("kc,kc->k", pulls, off)
-        component = int((self._model.log_shares - 0.5 * distances).argmax())
+        component = int((model.log_shares - 0.5 * distances).argmax())
         distance = float(distances[component])
         if distance > 40 * GAINS:  # GAINS is the mean on an even sensor
-            return
+            return False
         self._recent[self.contacts % REMEMBERED] = contact
         self.contacts += 1
-        precision = self._model.precisions[component].astype(np.float64)
+        precision, means = model.precisions[component].astype(np.float64), model.means[component]
         if dead is not None:
             precision = _without(precision, dead)
         weight = (_FREEDOM + GAINS) / (_FREEDOM + distance)
-        means = self._model.means[component]
-        weighted = weight * values
-        by_constant = means[1:] @ precision
-        centre = means[0] @ precision
-        pairs = np.take(precision, _PAIRS)
-        pairs *= weighted[:, None]
-        pairs *= values
-        self._square[:_LINEAR, :_LINEAR] += pairs
-        cross = by_constant[:, _ROWS] * weighted
-        self._square[:_LINEAR, _LINEAR:] -= cross.T
-        self._square[_LINEAR:, :_LINEAR] -= cross
-        self._square[_LINEAR:, _LINEAR:] += weight * (by_constant @ means[1:].T)
-        self._product[:_LINEAR] += centre[_ROWS] * weighted
-        self._product[_LINEAR:] -= weight * (means[1:] @ centre)
+        # The constants move what the even readings are to be like: readings less their effect are to be the first mean.
+        design = np.hstack([design, -means[1:].T])
+        pull = weight * design.T @ precision
+        self._square += pull @ design
+        self._product += pull @ means[0]
         self._weight += weight
         self._count += 1
-
-    def _fade(self) -> None:
-        """Let the oldest contacts fade."""
-        share = min(1.0, 400 / max(self._count, 1.0))
-        for sums in (self._square, self._product):
-            sums *= share
-        self._weight *= share
-        self._count *= share
+        return True
 
     def _step(self) -> bool:
         """Take one step of Newton towards the best gains; return whether they still move."""
@@ -294,11 +277,17 @@ class GainLearner:
         self._centres[...] = np.append(1.0, self._best[_LINEAR:]) @ self._model.means
 
 
-def _values(contact: NDArray[np.float64], strength: float) -> NDArray[np.float64]:
-    """Return the factor of each linear parameter in a contact's even readings, (_LINEAR,)."""
+def _design(contact: NDArray[np.float64], strength: float) -> NDArray[np.float64]:
+    """Return the matrix (GAINS, _LINEAR) that makes a contact's even readings of the linear parameters."""
     z = contact[_Z]
-    lean = -np.concatenate([z, z])
-    return np.concatenate([contact, lean, z.clip(0, 1) / strength, np.full(GAINS, 1 / strength)])
+    design = np.zeros((GAINS, _LINEAR))
+    blocks = (contact, -np.concatenate([z, z]), z.clip(0, 1) / strength, np.full(GAINS, 1 / strength))
+    column = 0
+    for row, block in zip((0, 0, 2 * TAXELS, 0), blocks, strict=True):
+        at = np.arange(len(block))
+        design[row + at, column + at] = block
+        column += len(block)
+    return design
 
 
 def _without(precision: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -318,21 +307,91 @@ def _even_axes() -> NDArray[np.floating]:
 
 
 def _prior(constants: int) -> NDArray[np.float64]:
-    """Return the prior precision of all parameters of a new sensor."""
-    every = np.ones((TAXELS, TAXELS))
-    prior = np.zeros((_LINEAR + constants,) * 2)
+    """Return the prior precision of all parameters of a new sensor, in the order of `_design`."""
     # The seat and moment of a magnet change the gains of its three axes together.
     place = np.kron(np.ones((len(AXES), len(AXES))), 0.06**2 * np.eye(TAXELS))
-    prior[:GAINS, :GAINS] = np.linalg.inv(GAIN_SPREAD**2 * np.eye(GAINS) + place)
-    prior[:GAINS, :GAINS] += _even_axes()
+    gains = np.linalg.inv(GAIN_SPREAD**2 * np.eye(GAINS) + place) + _even_axes()
     rest = np.concatenate([np.full(2 * TAXELS, 0.025), np.full(TAXELS, 30.0)])  # leans, and unevenness in counts
-    part = np.arange(GAINS, _LINEAR - GAINS)
-    prior[part, part] = rest**-2.0
-    offsets = np.zeros((GAINS, GAINS))
     # Deviations of drift in counts: of each taxel's own, and of what is common to all.
-    for axis, (own, common) in enumerate(((2.0, 18.0), (2.0, 18.0), (12.0, 45.0))):
-        part = slice(axis * TAXELS, (axis + 1) * TAXELS)
-        offsets[part, part] = own**2 * np.eye(TAXELS) + common**2 * every
-    prior[_LINEAR - GAINS : _LINEAR, _LINEAR - GAINS : _LINEAR] = np.linalg.inv(offsets)
-    prior[_LINEAR:, _LINEAR:] = 3 * np.eye(constants)  # uniform within the range
+    drift = ((2.0, 18.0), (2.0, 18.0), (12.0, 45.0))
+    offsets = [np.linalg.inv(own**2 * np.eye(TAXELS) + common**2) for own, common in drift]
+    blocks = (gains, np.diag(rest**-2.0), *offsets, 3 * np.eye(constants))  # constants: uniform within the range
+    prior, start = np.zeros((_LINEAR + constants,) * 2), 0
+    for block in blocks:
+        part = slice(start, start + len(block))
+        prior[part, part] = block
+        start += len(block)
     return prior
+
+
+class Learn:
+    """Stage: learns the sensor's gains from its contacts, brings them into use, and reports it.
+
+    It begins with what was measured. What an earlier run has learned is in use until this run is as sure, but is no
+    beginning: counted again with each start, the same errors would come to look certain.
+
+    Attributes:
+        waiting: a contact is there to be learned from, once the pad is free.
+    """
+
+    def __init__(self, model: ContactModel, measured: Pad | None, pad: SensorPad, report: Report) -> None:
+        """Begin with the pad as measured, and the one in use, also by what was learned before."""
+        self.waiting = False
+        self._pad, self._check, self._report = pad, pad.check, report
+        self._learner = GainLearner(model, measured)
+        self._from_file = measured is not None and measured.gains is not None
+        self._used = pad.pad or measured or Pad()
+        self._by_hand = Pad() if measured is None else replace(measured, gains=None, gain_half_widths=None)
+        self._strongest = np.zeros(0, dtype=np.float32)
+        self._force_counts = 0.0
+        self._seen = 0
+        self._learned: Pad | None = None
+
+    def __call__(self, step: Step, made: Estimate, counts: NDArray[np.float32], dead: NDArray[np.bool_]) -> bool:
+        """Take a contact's pattern and its readings (3, rows, cols); return whether another pad is in use since.
+
+        A pattern that is not to be trusted teaches nothing, and nor does what came before it in the same contact.
+        """
+        if made.trusted is False:
+            self.waiting, self._force_counts = False, 0.0
+            return False
+        self._seen += 1
+        force_counts = step.force_counts or 0.0
+        if force_counts > self._force_counts:
+            self._strongest, self._force_counts = counts, force_counts
+            self.waiting = True
+        return self._seen >= HELD_SCANS and self.learn(dead)
+
+    def learn(self, dead: NDArray[np.bool_]) -> bool:
+        """Learn from the contact that waits; return whether another pad is in use since."""
+        learner, check = self._learner, self._check
+        self.waiting, self._force_counts, self._seen = False, 0.0, 0
+        learned = learner.learn(self._strongest, dead)
+        enough = self._from_file and learner.contacts >= CONTRADICTED_CONTACTS
+        if check is not None and enough and learner.disagreement > CONTRADICTED:
+            if not check.suspected:
+                why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
+                self._report("suspected", why)
+            check.suspect_file()
+            return False
+        if not learned or not self._is_better(new := learner.pad()):
+            return False
+        self._learned, self._used = new, new.behind(self._by_hand)
+        self._pad.use(self._used)
+        percent = 100 * float(np.sqrt(np.square(self._used.gain_half_widths or ()).mean()))
+        self._report("gains_learned", f"gains learned from {learner.contacts} contacts, each within {percent:.0f} %")
+        return True
+
+    def _is_better(self, new: Pad) -> bool:
+        """Return whether a pad is as sure as the one in use, and noticeably surer or other."""
+        used = self._used
+        if new.gains is None or new.gains_certainty < max(0.1, used.gains_certainty):
+            return False
+        shift = np.log(new.gains) - (0.0 if used.gains is None else np.log(used.gains))
+        surer = new.gains_certainty >= used.gains_certainty + 0.05 or not set(new.constants) <= set(used.constants)
+        return surer or bool(np.sqrt(np.square(shift).mean()) >= 0.01)
+
+    def take_learned(self) -> Pad | None:
+        """Return the pad by contacts alone if it was learned since the last call."""
+        learned, self._learned = self._learned, None
+        return learned

@@ -9,20 +9,20 @@ so that the same reading gets the same verdict as far as their patterns agree.
 import math
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.intervals import doubt
 from edge.inference.trust import Trust, contact_features, pose_tap_features
-from edge.perception.dead_taxel_fill import widening
 from edge.perception.event import Report
-from edge.perception.result import Estimate, Reason, Step, Window
+from edge.perception.result import Estimate, Reason, Step, Window, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.taxel_health import TaxelWatch
-from firmware_bridge.scans.pad_constants import GAIN_SPREAD
+from edge.perception.taxel_health import Health
+from firmware_bridge.pad_geometry import AXES
+from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
 MOST_MISMATCH: Final = 0.8
@@ -91,14 +91,15 @@ class PatternCheck:
         tap: int,
         newest: NDArray[np.float32],
         pattern: NDArray[np.float32],
-        deviation: NDArray[np.float32] | None,
+        doubt: float | None,
         traction: NDArray[np.float32] | None,
         repeats: int,
     ) -> Verdict:
         """Return the verdict on a contact's pattern, and remember what the contact shows of the sensor.
 
-        Readings (3, rows, cols) are in network units, pattern and deviation (H, W) in [mm], traction (3, h, w) in
-        [kPa]; repeats are scans for which some taxel has repeated itself while most others were new.
+        Readings (3, rows, cols) are in network units, the pattern (H, W) in [mm], its doubt as `intervals.doubt` gives
+        it, the traction (3, h, w) in [kPa]; repeats are scans for which some taxel has repeated itself while most
+        others were new.
         """
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
@@ -122,7 +123,7 @@ class PatternCheck:
             reason = "beyond"  # than all presses of the training, up to 40 N, but for one in a thousand
         elif not explained:
             reason = "unexplained"
-        elif deviation is not None and not doubt(pattern, deviation)[0] <= most_doubt(z_counts):
+        elif doubt is not None and not 0 <= doubt <= most_doubt(z_counts):
             reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
@@ -174,8 +175,8 @@ def _share(log_odds: float) -> float:
 class Check:
     """Stage: the checks of one sensor's patterns, and of the earlier taps that they are made from."""
 
-    def __init__(self, check: PatternCheck | None, taps: TapTracker, watch: TaxelWatch, report: Report) -> None:
-        self._check, self._taps, self._watch, self._report = check, taps, watch, report
+    def __init__(self, check: PatternCheck | None, taps: TapTracker, health: Health, report: Report) -> None:
+        self._check, self._taps, self._health, self._report = check, taps, health, report
 
     def belonging(
         self, step: Step, window: Window, scaled: NDArray[np.float32]
@@ -186,13 +187,11 @@ class Check:
         `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
-        if self._check is None or window.taps < 2 or window.poses is None or step.doubted:
+        if self._check is None:
             return every, None
         belonging = tuple(self._check.belonging(scaled, window.taps, window.poses))
-        posed = step.pose is not None and window.poses is not None
+        posed = step.pose is not None
         dropped = foreign_taps(belonging, posed=posed)
-        if not dropped:
-            return every, belonging
         settled = [
             number
             for number in (dropped if posed else dropped[:1])
@@ -205,16 +204,19 @@ class Check:
             self._taps.forget([slots[one] for one in settled] if posed else range(slots[settled[0]], sys.maxsize))
         return [number for number in every if number not in dropped], belonging
 
-    def __call__(self, step: Step, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
-        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units."""
-        if made.deviation is not None and step.dead:
-            made.deviation = made.deviation * np.float32(widening(len(step.dead) / newest[0].size))
+    def __call__(
+        self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
+    ) -> None:
+        """Give the verdict on the estimate of a tap by its newest readings (3, rows, cols) in network units.
+
+        `about` is the pattern's doubt, and its RMS.
+        """
         check = self._check
         if check is None or made.pattern is None:
             return
         suspected = check.suspected
         made.trusted, made.untrusted_reason, made.mismatch = check.judge(
-            tap, newest, made.pattern, made.deviation, made.traction, self._watch.most_repeats
+            tap, newest, made.pattern, None if about is None else about[0], made.traction, self._health.most_repeats
         )
         if check.suspected != suspected:
             self._report("cleared" if suspected else "suspected")
@@ -224,3 +226,40 @@ def _which(number: int, *, alone: bool) -> str:
     if number == 1:
         return "the tap before does"
     return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
+
+
+class SensorPad:
+    """Constants and gains of a sensor, which may be learned while it runs.
+
+    Attributes:
+        check: of the sensor's patterns, which takes the pad, too; None without.
+        counts_per_newton: of the sensor, if known; it stands for those that the pad lacks.
+        pad: as it was given; None if nothing is known.
+        row: the constants as model input.
+        counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
+        gains_certainty: of these gains; None without.
+        wrench_origin: whether the model gets the sensor's counts per newton.
+    """
+
+    def __init__(
+        self, contract: Contract, pad: Pad | None, counts_per_newton: float | None, check: PatternCheck | None
+    ) -> None:
+        self.check, self.counts_per_newton, self._contract = check, counts_per_newton, contract
+        self.use(pad)
+
+    def use(self, pad: Pad | None) -> None:
+        """Take a pad from now on, converted once for all runs of the model."""
+        contract, self.pad = self._contract, pad
+        if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
+            pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
+        self.row: NDArray[np.float32] = contract.pad_row(pad)
+        self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
+        if contract.takes_gains and pad is not None and pad.gains is not None:
+            gains = np.asarray(pad.gains, dtype=np.float32).reshape(len(AXES), contract.rows, contract.cols)
+            self.counts_per_unit = self.counts_per_unit * gains
+        if self.check is not None:
+            self.check.use_pad(self.row, outside=contract.is_outside(pad))
+        self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
+        calibrated = pad is not None and pad.counts_per_newton is not None
+        takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
+        self.wrench_origin: WrenchOrigin = "calibrated" if calibrated and takes else "nominal"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract
 from edge.inference.intervals import expect
 from edge.inference.trust import GRID, KPA, ForwardModel, Trust, pooling
-from edge.perception.gain_following import SensorPad
+from edge.perception.pattern_check import SensorPad
 from edge.perception.result import LEAST_FORCE_N, Estimate, Wrench
 from firmware_bridge.pad_geometry import SensorGeometry
 
@@ -160,19 +160,23 @@ class Describe:
         self._balance = None if trust is None else Balance(trust.forward, geometry)
         self._pixel_mm = geometry.pixel_pitch_mm(contract.scale)
 
-    def __call__(self, made: Estimate, tap: int, newest: NDArray[np.float32]) -> None:
-        """Add to an estimate what follows from its pattern; tap and newest readings as `Check` takes them."""
+    def __call__(
+        self, made: Estimate, tap: int, newest: NDArray[np.float32], about: tuple[float, float] | None
+    ) -> None:
+        """Add to an estimate what follows from its pattern; all others as `Check` takes them."""
         contract, pattern, deviation = self._contract, made.pattern, made.deviation
         if pattern is None:
             raise ValueError("the estimate has no pattern")
-        touching = touched(pattern, contract.contact_level)
+        peak = pattern.max()
+        touching = pattern >= contract.contact_level * peak if peak > 0 else np.zeros(pattern.shape, dtype=bool)
         made.area_mm2, made.centroid_mm = touched_patch(pattern, touching, self._pixel_mm)
-        if deviation is not None:
-            expected = expect(contract.confidence, made.taps_used, pattern, deviation)
+        if deviation is not None and about is not None:
+            expected = expect(contract.confidence, made.taps_used, *about)
             if expected is not None:
-                made.expected_rmse_mm, made.another_tap = expected.rmse, expected.another_tap
-            if contract.interval_factor is not None and touching.any():
-                made.interval_mm = contract.interval_factor * float(deviation[touching].mean())
+                made.expected_rmse_mm, made.another_tap = expected
+            if contract.interval_factor is not None and made.centroid_mm is not None:
+                mean_mm = float(deviation.ravel() @ touching.ravel()) / np.count_nonzero(touching)
+                made.interval_mm = contract.interval_factor * mean_mm
         if (traction := made.traction) is not None:
             if self._balance is not None:
                 made.traction = traction = self._balance(traction, pattern, newest, tap, self._pad.row)

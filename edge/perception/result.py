@@ -277,17 +277,17 @@ class Step:
         if not self.doubted:
             self.state = "dropped"
 
-    def ready(self, done_ns: int) -> None:
-        """State when the pattern was ready, on the clock of the scans, in [ns]."""
-        waited_ns = done_ns - self.scan.time_ns
-        self.latency_us = waited_ns / 1e3
-        if waited_ns > OLD_NS:
-            self.notes = (*self.notes, waited_note(waited_ns))
-
-    def freeze(self) -> Result:
-        """Return the result."""
+    def freeze(self, done_ns: int | None = None) -> Result:
+        """Return the result, whose pattern was ready at a time on the clock of the scans in [ns]; None if unknown."""
+        if done_ns is not None:
+            waited_ns = done_ns - self.scan.time_ns
+            self.latency_us = waited_ns / 1e3
+            if waited_ns > OLD_NS:
+                self.notes = (*self.notes, waited_note(waited_ns))
         # What no stage has set is not in the dictionary, and has its default in the result.
-        values: dict[str, Any] = {name: value for name, value in vars(self).items() if name not in _OF_STAGES}
+        values: dict[str, Any] = dict(vars(self))
+        for name in _OF_STAGES:
+            values.pop(name, None)
         due, made = self.due, self.estimate
         if made is not None:
             values |= vars(made)
@@ -300,4 +300,4 @@ class Step:
         return Result(**values, **self._origin._asdict())
 
 
-_OF_STAGES: Final = frozenset({"readings", "doubted", "due", "estimate", "_origin"})
+_OF_STAGES: Final = ("readings", "doubted", "due", "estimate", "_origin")

@@ -6,21 +6,157 @@ into the pages.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from enum import Flag, auto
+from functools import lru_cache, partial
 from itertools import repeat
-from operator import attrgetter
-from typing import Any, Final
+from operator import attrgetter, methodcaller
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.field import PLACE_IN_HEADER, Field, Kind, Out
 from edge.perception.result import REASONS, NextTap, Result, Wrench, mask_bits
 from firmware_bridge.poses import PadPose
 from firmware_bridge.scans.scan import Scan, VendorReading
 from firmware_bridge.zeroing.drift_tracker import Drift
+
+Function = Callable[[Any], Any]
+PLACE_IN_HEADER: Final = -1
+"""Mark of a map in shared memory: its byte follows from the map's size, so the header states it."""
+
+
+class Out(Flag):
+    """Outputs that hold a field, in addition to shared memory, where a field has a byte.
+
+    Attributes:
+        RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
+        NPZ: arrays that `edge-sr convert` makes of a recording.
+        ROS: members of tactile_edge_sr/msg/Result.
+        MAP: maps next to the record: in lines of JSON, in packed messages and as images of MCAP.
+        ALL: all but maps.
+    """
+
+    RECORD = auto()
+    NPZ = auto()
+    ROS = auto()
+    MAP = auto()
+    ALL = RECORD | NPZ | ROS
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """Type of a value in each output.
+
+    Attributes:
+        label: name of the type in JSON.
+        array: numpy's type, in npz.
+        packed: struct's character, in shared memory.
+        message: ROS's type.
+        unknown: value for "unknown" in outputs without null; None where the value is always available.
+        words: the values of a choice. In shared memory they are numbered from 1, so that memory that nobody wrote is
+            none of them, and the order is part of the format.
+        shape: name of an array's shape: "scan", "pattern", "deviation", "traction" or "poses", which has a row for each
+            tap.
+    """
+
+    label: str
+    array: str = ""
+    packed: str = ""
+    message: str = ""
+    unknown: Any = None
+    words: tuple[str, ...] = ()
+    shape: str = ""
+
+
+class Column(NamedTuple):
+    """One value to read: `make` makes it of an attribute that is not None; `unknown` stands for None."""
+
+    attribute: str
+    make: Function | None
+    unknown: Any
+
+
+class Columns:
+    """Values of several fields of a result, read with one call for all plain attributes."""
+
+    def __init__(self, columns: Iterable[Column]) -> None:
+        columns = tuple(columns)
+        self._get = attrgetter(*(column.attribute for column in columns))
+        self._made = tuple((index, one.make) for index, one in enumerate(columns) if one.make is not None)
+        self._unknown = tuple((index, one.unknown) for index, one in enumerate(columns) if one.unknown is not None)
+        # From the last to the first, so that spreading out a vector does not move those still to come.
+        self._vectors = tuple(index for index, unknown in reversed(self._unknown) if isinstance(unknown, tuple))
+
+    def of(self, result: Result) -> list[Any]:
+        """Return the values, in the order of the columns."""
+        values = list(self._get(result))
+        for index, make in self._made:
+            if (value := values[index]) is not None:
+                values[index] = make(value)
+        for index, unknown in self._unknown:
+            if values[index] is None:
+                values[index] = unknown
+        return values
+
+    def flat(self, result: Result) -> list[Any]:
+        """Return the values with each vector replaced by its components."""
+        values = self.of(result)
+        for index in self._vectors:
+            values[index : index + 1] = values[index]
+        return values
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of a result, in every output that holds it."""
+
+    name: str  # in every output; ends with the unit if it has one
+    kind: Kind  # type of the value, or of each component of a vector
+    attribute: str  # dotted path from the result to the attribute that the value is made of
+    text: str  # description of the value, for the pages
+    make: Function | None = None  # converts the attribute into the value, unless that is None; None takes it as it is
+    decimals: int | None = None  # decimals of a number in JSON
+    parts: tuple[str, ...] = ()  # names of a vector's components, for outputs that hold them one by one
+    json: Function | None = None  # converts the attribute into the JSON value, if `make` and `decimals` do not
+    out: Out = Out.ALL  # outputs that hold it
+    byte: int | None = None  # its first byte in a half of shared memory. The layout only grows at its end.
+    left_out: bool = False  # a record omits the key while the value is unknown
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the components, or the field's own."""
+        return self.parts or (self.name,)
+
+    def in_record(self) -> Column:
+        """Return the column of the JSON record, in which null stands for an unknown value."""
+        make = self.make if self.json is None else self.json
+        if self.decimals is not None:
+            rounded = methodcaller("round" if self.kind.shape else "__round__", self.decimals)
+            make = _then(make, partial(_rounded, decimals=self.decimals) if self.parts else rounded)
+        return Column(self.attribute, make, None)
+
+    def in_message(self) -> Column:
+        """Return the column of ROS messages; a vector is a tuple."""
+        unknown = self.kind.unknown
+        return Column(self.attribute, self.make, (unknown,) * len(self.parts) if self.parts else unknown)
+
+    def in_memory(self) -> Column:
+        """Return the column of shared memory, as struct packs it; a vector is a tuple."""
+        kind = self.kind
+        if kind.words:
+            numbers = {word: number for number, word in enumerate(kind.words, 1)}
+            return Column(self.attribute, _then(self.make, numbers.__getitem__), None if kind.unknown is None else 0)
+        if not kind.packed.endswith("s"):
+            return self.in_message()
+        most = int(kind.packed[:-1])  # the beginning of a text, never half a character
+        return Column(self.attribute, lambda text: text.encode()[:most].decode(errors="ignore").encode(), None)
+
+
+def _then(first: Function | None, second: Function) -> Function:
+    """Chain two functions; the second is never called with None."""
+    return second if first is None else lambda value: None if (made := first(value)) is None else second(made)
 
 
 def _text(characters: int, packed_bytes: int) -> Kind:
@@ -80,12 +216,8 @@ def _drift(drift: Drift) -> dict[str, Any]:
     return {"common": common, "own": round(drift.own_counts, 2), "step": round(drift.step_counts, 1)}
 
 
-def _rounded(shares: tuple[float, ...]) -> list[float]:
-    return list(map(round, shares, repeat(3)))
-
-
-def _force_and_torque(wrench: Wrench) -> tuple[float, ...]:
-    return wrench.force_n + wrench.torque_n_mm
+def _rounded(numbers: Iterable[float], decimals: int = 3) -> list[float]:
+    return list(map(round, numbers, repeat(decimals)))
 
 
 def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
@@ -97,25 +229,17 @@ def _wrench(wrench: Wrench) -> dict[str, list[float] | None]:
     }
 
 
-def _pose_numbers(pose: PadPose) -> tuple[float, ...]:
-    return (pose.x_mm, pose.y_mm, pose.turn_deg, pose.error_mm, pose.error_deg)
-
-
 def _pose(pose: PadPose) -> dict[str, float]:
-    return dict(zip(_POSE_KEYS, map(round, _pose_numbers(pose), repeat(4)), strict=True))
-
-
-def _next_tap_numbers(proposed: NextTap) -> tuple[float, ...]:
-    return (proposed.dx_mm, proposed.dy_mm, proposed.turn_deg)
+    return dict(zip(_POSE_KEYS, _rounded(_pose_numbers(pose), 4), strict=True))
 
 
 def _next_tap(proposed: NextTap) -> dict[str, Any]:
-    numbers = dict(zip(_NEXT_TAP_KEYS, map(round, _next_tap_numbers(proposed), repeat(3)), strict=True))
+    numbers = dict(zip(_NEXT_TAP_KEYS, _rounded(_next_tap_numbers(proposed)), strict=True))
     return numbers | {"target": None if proposed.target is None else _pose(proposed.target)}
 
 
 def _poses(poses: NDArray[np.float32]) -> list[list[float]]:
-    return [list(map(round, row, repeat(4))) for row in poses.tolist()]
+    return [_rounded(row, 4) for row in poses.tolist()]
 
 
 _RECORD_NPZ: Final = Out.RECORD | Out.NPZ
@@ -126,8 +250,10 @@ _WRENCH_PARTS: Final = (
     *("torque_x_n_mm", "torque_y_n_mm", "torque_z_n_mm"),
 )
 _POSE_KEYS: Final = ("x_mm", "y_mm", "turn_deg", "error_mm", "error_deg")
+_pose_numbers: Final = attrgetter(*_POSE_KEYS)
 _POSE_PARTS: Final = tuple(f"pose_{key}" for key in _POSE_KEYS)
 _NEXT_TAP_KEYS: Final = ("dx_mm", "dy_mm", "turn_deg")
+_next_tap_numbers: Final = attrgetter(*_NEXT_TAP_KEYS)
 _NEXT_TAP_PARTS: Final = tuple(f"next_tap_{key}" for key in _NEXT_TAP_KEYS)
 _CENTRE_PARTS: Final = ("centre_of_pressure_x_mm", "centre_of_pressure_y_mm")
 
@@ -178,7 +304,8 @@ FIELDS: Final = (
           "unknown without poses",
           make=_next_tap_numbers, parts=_NEXT_TAP_PARTS, json=_next_tap),
     Field("wrench", _REAL, "wrench", "force x, y, z on the pad in N, torque about x, y, z in N mm: see "
-          "[Wrench](formats.md#wrench)", make=_force_and_torque, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,
+          "[Wrench](formats.md#wrench)",
+          make=lambda wrench: wrench.force_n + wrench.torque_n_mm, parts=_WRENCH_PARTS, json=_wrench, out=_RECORD_NPZ,
           byte=512),
     Field("centre_of_pressure_mm", _REAL, "wrench", "from the pad's centre, x right, y down; in records part of "
           "`wrench`", make=attrgetter("centre_of_pressure_mm"), parts=_CENTRE_PARTS, out=Out.NPZ, byte=560),

@@ -1,18 +1,30 @@
-"""Scan in, result out: all state between scans is kept here, per sensor."""
+"""Scan in, result out: the stages of each sensor in their order, and one call of the model for all that wait.
+
+`Sensor.follow` has the order of the stages before the model, `Sensor.finish` that of those after it.
+"""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from edge.errors import UsageError, WindowError
-from edge.inference.contract import Model
+from edge.inference.contract import Contract, Model
+from edge.inference.intervals import doubt
+from edge.inference.trust import Trust
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
-from edge.perception.dead_taxel_fill import TaxelEstimator
-from edge.perception.event import EventKind, Untimed, notes_on_missing
-from edge.perception.gain_learning import ContactModel
-from edge.perception.result import Origin, Result, Step, Window
-from edge.perception.sensor import Sensor
+from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
+from edge.perception.gain_learning import ContactModel, Learn
+from edge.perception.pattern_check import Check, PatternCheck, SensorPad
+from edge.perception.pattern_description import Describe
+from edge.perception.result import Estimate, Origin, Result, Step, Window
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taps import LastPattern, Taps
+from edge.perception.taxel_health import Health, TaxelEstimator
+from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
@@ -20,9 +32,169 @@ from firmware_bridge.poses import PadPose, PoseTrack
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import Scan
+from firmware_bridge.schedule import TAPS_FORGOTTEN_NS
 from firmware_bridge.zeroing.baseline import Baseline
 
 MOST_TOGETHER: Final = 4  # sensors whose patterns are made in one call: scans that come meanwhile wait for its end
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of a runtime from which its sensors are made; those of single sensors are by name, or one for all."""
+
+    contract: Contract
+    trust: Trust | None
+    geometry: SensorGeometry
+    options: RuntimeOptions
+    estimator: TaxelEstimator | None
+    contacts: ContactModel | None
+    unix_time_s: Callable[[], float]
+    baselines: Mapping[str, Baseline]
+    mountings: Mapping[str, Mounting]
+    counts_per_newton: float | Mapping[str, float] | None
+    pad: Pad | Mapping[str, Pad] | None
+    measured: Mapping[str, Pad] | None
+
+
+class Sensor:
+    """Stages of one sensor, made complete once with what is stored for it.
+
+    Attributes:
+        last: its last pattern, which is used again while nothing changes.
+        pad: its constants and gains.
+        learn: learns its gains; None where nothing is to be learned.
+        tracker: of its taps.
+    """
+
+    def __init__(self, name: str, time_ns: int, settings: Settings) -> None:
+        """Begin with the sensor's first scan, at a time in [ns]."""
+        contract, geometry, options = settings.contract, settings.geometry, settings.options
+        mounting, baseline = settings.mountings.get(name), settings.baselines.get(name)
+        mounting = mounting if mounting is not None and mounting.turns_axes else None
+        pad = _of(name, settings.pad)
+        check = None if settings.trust is None else PatternCheck(settings.trust, contract)
+        self.events: list[Untimed] = []
+        self.last = LastPattern(geometry.scan_shape, every_scan=options.every_scan)
+        self.pad = SensorPad(contract, pad, _of(name, settings.counts_per_newton), check)
+        self._name = name
+        self._received_ns: int | None = None
+        self._checked, self._follows_drift = check is not None, options.follow_drift
+        self.tracker = TapTracker(contract.taps, options, (geometry.rows, geometry.cols))
+        self._health = Health((geometry.rows, geometry.cols), mounting, settings.estimator)
+        notes = notes_on_missing(name, settings.mountings, settings.baselines)
+        self._zeroing = Zeroing(self.tracker, self._health, mounting, self.report, settings.unix_time_s, notes)
+        self._doubt = BaselineDoubt(options, geometry.taxel_count, self.report)
+        self._taps = Taps(self.tracker, self._health, contract, options, self.report)
+        self._check = Check(check, self.tracker, self._health, self.report)
+        self._describe = Describe(contract, settings.trust, geometry, self.pad)
+        self.learn: Learn | None = None
+        if settings.contacts is not None:
+            measured = pad if settings.measured is None else settings.measured.get(name)
+            self.learn = Learn(settings.contacts, measured, self.pad, self.report)
+        if baseline is not None:
+            age_s = baseline.age_s(settings.unix_time_s())
+            # A baseline from the future means that one of the two clocks was wrong.
+            self._zeroing.use(baseline, age_s if age_s >= 0 else None, time_ns)
+            self._doubt.begin(baseline.origin)
+
+    def follow(self, step: Step, track: PoseTrack | None, events: list[Untimed]) -> None:
+        """Pass the step of the sensor's next scan through the stages before the model; a window is due then, or none.
+
+        It takes the events of all sensors with those of its own; `track` has the poses of its pad, None without.
+        """
+        scan = step.scan
+        if self._received_ns is not None and scan.time_ns - self._received_ns > TAPS_FORGOTTEN_NS:
+            self.lose_touch()
+        self._received_ns = scan.time_ns
+        if self._health(step, self._zeroing.baseline):
+            # Earlier taps hold what a taxel read before it was found dead, or estimates that no note would report.
+            self.tracker.reset()
+        if (zeroed := self._zeroing(step)) is not None:
+            self._doubt.begin(zeroed.origin)
+        self._health.fill(step)
+        step.notes = (*step.notes, *self._zeroing.notes, *self._zeroing.drift_notes)
+        if scan.time_ns - scan.not_before_ns > OLD_NS:
+            step.notes = (*step.notes, *age_notes(scan))
+        if events or self.events:
+            step.events = tuple(event.at(scan.time_ns) for event in (*events, *self.events))
+            events.clear()
+            self.events.clear()
+        if step.zeroed is None:
+            return
+        if track is not None:
+            step.pose = track.at(scan.on_bus_ns)
+        if step.readings is None:
+            step.state = "incomplete"
+            return
+        self._doubt(step)
+        self._taps(step, track)
+        if self._follows_drift:
+            self._zeroing.follow_drift(step)
+        if not step.contact and self.learn is not None and self.learn.waiting and self.learn.learn(self._health.dead):
+            self.last.estimate = None
+        if step.doubted:
+            step.notes = (*step.notes, *self._doubt.notes)
+        elif step.contact and not self._checked:
+            step.notes = (*step.notes, UNCHECKED)
+        step.gains_certainty = self.pad.gains_certainty
+        per_newton = self.pad.counts_per_newton
+        if per_newton is not None and step.force_counts is not None:
+            step.force_n = step.force_counts / per_newton
+        elif scan.vendor_force_n is not None:
+            step.force_n = scan.vendor_force_n[2]
+
+    def begin(self, step: Step, due: Window) -> tuple[Estimate, NDArray[np.float32]]:
+        """Return an estimate of the taps of a window that belong together, and the model's input for its pattern."""
+        scaled = due.counts / self.pad.counts_per_unit
+        taps, belonging, dropped = list(range(due.taps)), None, None
+        if due.poses is not None and due.taps > 1 and self._checked and not step.doubted:
+            taps, belonging = self._check.belonging(step, due, scaled)
+            dropped = due.taps - len(taps)
+        if due.poses is not None:
+            return Estimate(len(taps), due.counts[taps], due.poses[taps], belonging, dropped), scaled[taps]
+        scaled[due.taps :] = 0
+        return Estimate(due.taps, due.counts[: due.taps], None), scaled
+
+    def finish(self, step: Step, due: Window, made: Estimate, newest: NDArray[np.float32]) -> None:
+        """Pass a step through the stages after the model; the newest readings (3, rows, cols) are in network units."""
+        step.estimate = made
+        self.last.keep(step, due, made)
+        if step.doubted:  # nothing follows from it, and nothing is learned
+            made.traction = None
+            return
+        if made.deviation is not None and step.dead:
+            made.deviation = made.deviation * self._health.widening
+        about = None if made.pattern is None or made.deviation is None else doubt(made.pattern, made.deviation)
+        self._check(made, due.tap, newest, about)
+        self._describe(made, due.tap, newest, about)
+        if self._taps.advice is not None:
+            self._taps.advice.see(step, due.tap)
+        if self.learn is not None and self.learn(step, made, due.counts[0], self._health.dead):
+            self.last.estimate = None  # it was made with other gains
+
+    def zero_again(self, *, force: bool) -> None:
+        """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
+        self._zeroing.zero_again(force=force, doubted=self._doubt.reported is not None)
+
+    def lose_touch(self, *, same_pad: bool = False) -> None:
+        """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
+
+        Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
+        a contact is believed again once the pad was seen at rest, unless it is the `same_pad` for sure.
+        """
+        self.tracker.reset()
+        self.last.estimate = None
+        self._health.forget()
+        self._doubt.lose_touch(same_pad=same_pad)
+        self._zeroing.lose_touch()
+
+    def report(self, kind: EventKind, detail: str = "") -> None:
+        """Report an event with the sensor's next scan."""
+        self.events.append(Untimed(kind, self._name, detail))
+
+
+def _of(name: str, setting: Any) -> Any:
+    return setting.get(name) if isinstance(setting, Mapping) else setting
 
 
 class Runtime:
@@ -38,7 +210,8 @@ class Runtime:
 
     Attributes:
         unposed: name of the model if it takes no poses, reported to a user who states some; None if it takes them.
-        waiting: the newest scan of each sensor that waits for its pattern.
+        waiting: the newest scan of each sensor that waits for its pattern. A newer scan keeps the place of the one it
+            overtakes: the sensor that has waited longest is the first.
 
     Raises:
         ModelError: the model is for another sensor.
@@ -63,22 +236,21 @@ class Runtime:
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
     ) -> None:
-        model.contract.check_sensor(geometry)
+        contract = model.contract
+        contract.check_sensor(geometry)
         check_baselines(baselines or {}, geometry)
         check_counts_per_newton(counts_per_newton)
         check_pads(pad, geometry)
         check_pads(measured, geometry)
         check_mountings(mountings or {}, geometry)
-        contract = model.contract
         if options.taps is not None and options.taps > contract.taps:
             raise UsageError(f"taps is {options.taps}, but model '{model.name}' takes {contract.taps} at most")
-        self._model = model
         self.unposed = None if contract.takes_poses else model.name
-        self._events: list[Untimed] = []
-        self._origin = Origin(source, model.name, contract.output_unit)
+        self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
+        self._model, self._clock_ns = model, clock_ns
         self._scan_shape = geometry.scan_shape
-        self._new_sensor = partial(
-            Sensor,
+        self._origin = Origin(source, model.name, contract.output_unit)
+        self._settings = Settings(
             contract=contract,
             trust=contract.read_trust(),
             geometry=geometry,
@@ -86,16 +258,14 @@ class Runtime:
             estimator=estimator,
             contacts=contacts if options.learn else None,
             unix_time_s=unix_time_s,
+            baselines=dict(baselines or {}),
+            mountings=dict(mountings or {}),
+            counts_per_newton=counts_per_newton,
+            pad=pad,
+            measured=measured,
         )
-        self._baselines = dict(baselines or {})
-        self._counts_per_newton = counts_per_newton
-        self._pad, self._measured = pad, measured
-        self._mounted = frozenset(mountings or ())
-        self._mountings = {name: one for name, one in (mountings or {}).items() if one.turns_axes}
-        self._clock_ns = clock_ns
         self._sensors: dict[str, Sensor] = {}
-        # A newer scan keeps the place of the one it overtakes: the sensor that has waited longest is the first.
-        self.waiting: dict[str, tuple[Sensor, Step, Window]] = {}
+        self._events: list[Untimed] = []
         self._tracks: dict[str | None, PoseTrack] = {}
 
     def __repr__(self) -> str:
@@ -105,32 +275,32 @@ class Runtime:
     @property
     def expected(self) -> frozenset[str]:
         """Names of the sensors with stored baselines or counts per newton."""
-        per_newton = self._counts_per_newton
-        return frozenset({*self._baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
+        per_newton = self._settings.counts_per_newton
+        return frozenset({*self._settings.baselines, *(per_newton if isinstance(per_newton, Mapping) else ())})
 
     def take_learned(self) -> dict[str, Pad]:
         """Return the pads with gains learned since the last call, by sensor name."""
-        learned = {name: sensor.take_learned() for name, sensor in self._sensors.items()}
+        learned = {name: one.learn.take_learned() for name, one in self._sensors.items() if one.learn is not None}
         return {name: pad for name, pad in learned.items() if pad is not None}
 
     def reset(self) -> None:
         """Forget the taps of every sensor, as for a new object, and report it as an event; zeroing stays."""
         for sensor in self._sensors.values():
-            sensor.reset_taps()
-        self._report("reset")
+            sensor.tracker.reset()
+        self._events.append(Untimed("reset"))
 
     def zero(self, name: str | None = None, *, force: bool = False) -> None:
         """Zero a sensor or all from the next scans, also in contact if forced; an event reports the outcome.
 
         The old baselines stay in use until then.
         """
-        if not self._sensors:
-            self._report("refused", "zeroing refused: no scan has arrived yet")
-        elif name is not None and name not in self._sensors:
+        chosen = list(self._sensors) if name is None else [name] if name in self._sensors else []
+        for one in chosen:
+            self._sensors[one].zero_again(force=force)
+        if not chosen:
             known = ", ".join(sorted(self._sensors))
-            self._report("refused", f"zeroing refused: no sensor {name}, there are {known}")
-        for sensor in self._sensors.values() if name is None else filter(None, [self._sensors.get(name)]):
-            sensor.zero_again(force=force)
+            why = f"no sensor {name}, there are {known}" if known else "no scan has arrived yet"
+            self._events.append(Untimed("refused", None, f"zeroing refused: {why}"))
 
     def pose(self, pose: PadPose, time_ns: int, sensor: str | None = None, *, holds: bool = False) -> bool:
         """Take a pose of a pad at a monotonic time in [ns]; False unless it is later than the one before.
@@ -148,16 +318,15 @@ class Runtime:
             if name.startswith(sensors):
                 sensor.lose_touch(same_pad=same_pad)
 
-    def _report(self, kind: EventKind, detail: str = "") -> None:
-        self._events.append(Untimed(kind, None, detail))
-
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""
-        sensor, step = self._follow(scan)
-        if step.due is not None and not infer:
-            step.overtake()
-        elif step.due is not None and not sensor.reuse(step, step.due):
-            self._infer([(sensor, step, step.due)])
+        ready = self.take(scan)
+        if scan.sensor not in self.waiting:
+            return ready[-1]
+        if infer:
+            return self.infer(only=scan.sensor)[0]
+        _, step, _ = self.waiting.pop(scan.sensor)
+        step.overtake()
         return step.freeze()
 
     def take(self, scan: Scan, clock_ns: Callable[[], int] | None = None) -> list[Result]:
@@ -169,78 +338,58 @@ class Runtime:
         Raises:
             WindowError: the scan is not of this sensor geometry.
         """
-        sensor, step = self._follow(scan)
-        overtaken = self.waiting.get(scan.sensor) if self.waiting else None
+        name = scan.sensor
+        if scan.counts.shape != self._scan_shape:
+            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            sensor = self._sensors[name] = Sensor(name, scan.time_ns, self._settings)
+        step = Step(scan, self._origin)
+        # Without a pose of any pad, which is the rule, this is all that poses cost.
+        track = (self._tracks.get(name) or self._tracks.get(None) or None) if self._tracks else None
+        sensor.follow(step, track, self._events)
         ready: list[Result] = []
+        overtaken = self.waiting.get(name) if self.waiting else None
         if overtaken is not None:
             overtaken[1].overtake()
             ready.append(overtaken[1].freeze())
-        if step.due is not None and not sensor.reuse(step, step.due):
-            self.waiting[scan.sensor] = sensor, step, step.due
+        if step.due is not None and not sensor.last.reuse(step, step.due):
+            self.waiting[name] = sensor, step, step.due
             return ready
         if overtaken is not None:
-            del self.waiting[scan.sensor]
-        if step.estimate is not None and clock_ns is not None:
-            step.ready(clock_ns())
-        ready.append(step.freeze())
+            del self.waiting[name]
+        ready.append(step.freeze(clock_ns() if step.estimate is not None and clock_ns is not None else None))
         return ready
 
-    def infer(self, clock_ns: Callable[[], int] | None = None) -> list[Result]:
-        """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call.
+    def infer(self, clock_ns: Callable[[], int] | None = None, *, only: str | None = None) -> list[Result]:
+        """Infer the patterns of the sensors that have waited longest, MOST_TOGETHER in one call, or of one alone.
 
         Raises:
             ModelError: the model gave a pattern or a traction that is not finite, or a deviation that is not finite and
                 above zero.
         """
-        due = [self.waiting.pop(sensor) for sensor in list(self.waiting)[:MOST_TOGETHER]]
+        due = list(map(self.waiting.pop, list(self.waiting)[:MOST_TOGETHER] if only is None else [only]))
         if not due:
             return []
-        self._infer(due)
-        if clock_ns is not None:
-            done_ns = clock_ns()
-            for _, step, _ in due:
-                step.ready(done_ns)
-        return [step.freeze() for _, step, _ in due]
-
-    def _follow(self, scan: Scan) -> tuple[Sensor, Step]:
-        """Pass a scan through the stages of its sensor before the model."""
-        if scan.counts.shape != self._scan_shape:
-            raise WindowError(f"scan has shape {scan.counts.shape}, expected {self._scan_shape}")
-        sensor = self._sensors.get(scan.sensor) or self._meet(scan)
-        step = Step(scan, self._origin)
-        # Without a pose of any pad, which is the rule, this is all that poses cost.
-        track = (self._tracks.get(scan.sensor) or self._tracks.get(None) or None) if self._tracks else None
-        sensor.follow(step, track, self._events)
-        return sensor, step
-
-    def _infer(self, due: Sequence[tuple[Sensor, Step, Window]]) -> None:
-        """Give steps the patterns that are due, inferred in one call."""
         model, start_ns = self._model, self._clock_ns()
-        begun = [sensor.begin(step, window) for sensor, step, window in due]
-        poses = [made.poses for made, _ in begun if made.poses is not None]
-        pads = [sensor.pad.row for sensor, _, _ in due]
-        patterns = model.run_together([given for _, given in begun], pads, *([poses] if poses else []))
+        begun: list[Estimate] = []
+        inputs: list[NDArray[np.float32]] = []
+        pads: list[NDArray[np.float32]] = []
+        poses: list[NDArray[np.float32]] = []
+        for sensor, step, window in due:
+            made, given = sensor.begin(step, window)
+            begun.append(made)
+            inputs.append(given)
+            pads.append(sensor.pad.row)
+            if made.poses is not None:
+                poses.append(made.poses)
+        patterns = model.run_together(inputs, pads, *([poses] if poses else []))
         run_time_us = (self._clock_ns() - start_ns) / 1e3
         deviations, tractions = model.deviation, model.traction
-        for row, ((sensor, step, window), (made, given)) in enumerate(zip(due, begun, strict=True)):
-            made.pattern, step.run_time_us = patterns[row].copy(), run_time_us
-            made.deviation = None if deviations is None else deviations[row].copy()
-            made.traction = None if tractions is None else tractions[row].copy()
-            sensor.finish(step, window, made, given[0])
-
-    def _meet(self, scan: Scan) -> Sensor:
-        """Return a new sensor, with what is stored for it."""
-        name = scan.sensor
-        per_newton, pad, measured = self._counts_per_newton, self._pad, self._measured
-        pad = pad.get(name) if isinstance(pad, Mapping) else pad
-        self._sensors[name] = sensor = self._new_sensor(
-            name,
-            scan.time_ns,
-            mounting=self._mountings.get(name),
-            baseline=self._baselines.get(name),
-            counts_per_newton=per_newton.get(name) if isinstance(per_newton, Mapping) else per_newton,
-            pad=pad,
-            measured=pad if measured is None else measured.get(name),
-            notes=notes_on_missing(name, self._mounted, self._baselines),
-        )
-        return sensor
+        for row, ((sensor, step, window), made) in enumerate(zip(due, begun, strict=True)):
+            made.pattern, step.run_time_us = patterns[row], run_time_us
+            made.deviation = None if deviations is None else deviations[row]
+            made.traction = None if tractions is None else tractions[row]
+            sensor.finish(step, window, made, inputs[row][0])
+        done_ns = None if clock_ns is None else clock_ns()
+        return [step.freeze(done_ns) for _, step, _ in due]

@@ -7,7 +7,6 @@ taps are remembered by their peaks.
 
 import math
 from collections.abc import Container
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,28 +27,17 @@ class TapPeak(NamedTuple):
     time_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class TapState:
-    """State of the tracker after a scan.
+class TapTracker:
+    """Tracker of the taps of one sensor; allocates no array after construction.
 
     Attributes:
         contact: True while a tap goes on.
         tap: number of the tap, from 0; without contact that of the last one.
         taps_used: taps in the window, the current one included; 0 without contact.
-        window: (K, 3, rows, cols) float32, newest first, zeros in place of missing taps. It is the
-            tracker's own array: read-only, and overwritten by the next push.
+        window: (K, 3, rows, cols) float32, newest first, zeros in place of missing taps; read-only, and overwritten by
+            the next push.
         peaks: of the earlier taps in the window, newest first.
     """
-
-    contact: bool
-    tap: int
-    taps_used: int
-    window: NDArray[np.float32]
-    peaks: tuple[TapPeak, ...] = ()
-
-
-class TapTracker:
-    """Tracker of the taps of one sensor; allocates no array after construction."""
 
     def __init__(
         self,
@@ -68,35 +56,32 @@ class TapTracker:
         self._off_counts = options.contact_off_counts
         self._idle_reset_ns = options.idle_reset_s * 1e9
         self._window = np.zeros((taps, 3, *grid_shape), dtype=np.float32)
-        self._shown = self._window.view()
-        self._shown.setflags(write=False)
+        self.window = self._window.view()
+        self.window.setflags(write=False)
         self._peak = np.zeros((3, *grid_shape), dtype=np.float32)
-        self._contact = False
-        self._tap = -1
+        self.contact = False
+        self.tap = -1
         self._last_contact_ns = 0
         self.reset()
 
     @property
-    def contact(self) -> bool:
-        """True while a tap goes on."""
-        return self._contact
+    def taps_used(self) -> int:  # noqa: D102 - above
+        return 1 + len(self.peaks) if self.contact else 0
 
     def reset(self) -> None:
         """Forget every tap. A tap in progress continues as the first one, with a new number."""
-        self._tap += self._contact
+        self.tap += self.contact
         self._window.fill(0)
-        self._earlier = 0
-        self._peaks: tuple[TapPeak, ...] = ()
+        self.peaks: tuple[TapPeak, ...] = ()
         self._tap_scans = 0
         self._peak_counts, self._peak_ns = -math.inf, 0
 
     def forget(self, slots: Container[int]) -> None:
         """Forget the earlier taps at these places of the window; those before them move up."""
-        kept = [slot for slot in range(1, 1 + self._earlier) if slot not in slots]
-        self._earlier = len(kept)
+        kept = [slot for slot in range(1, 1 + len(self.peaks)) if slot not in slots]
         self._window[1 : 1 + len(kept)] = self._window[kept]
         self._window[1 + len(kept) :] = 0
-        self._peaks = tuple(self._peaks[slot - 1] for slot in kept)
+        self.peaks = tuple(self.peaks[slot - 1] for slot in kept)
 
     def push(
         self,
@@ -106,23 +91,23 @@ class TapTracker:
         taken_ns: int | None = None,
         *,
         doubted: bool = False,
-    ) -> TapState:
-        """Take one scan of zeroed counts (3, rows, cols) and return the new state.
+    ) -> None:
+        """Take one scan of zeroed counts (3, rows, cols).
 
         The idle time is measured between scans, from the last one in contact. Time that runs backwards counts as no
         time; a gap within a tap does not end the tap. A doubted scan is no contact, whatever its z.
         """
         z_counts = float(deformation[2].sum()) if z_counts is None else z_counts
-        if self._contact:
-            self._contact = z_counts >= self._off_counts and not doubted
-            if not self._contact:
+        if self.contact:
+            self.contact = z_counts >= self._off_counts and not doubted
+            if not self.contact:
                 self._release()
         elif z_counts >= self._on_counts and not doubted:
             self._forget_if_idle(time_ns)
-            self._contact = True
-            self._tap += 1
+            self.contact = True
+            self.tap += 1
 
-        if self._contact:
+        if self.contact:
             self._last_contact_ns = time_ns
             self._tap_scans += 1
             self._window[0] = deformation
@@ -132,16 +117,13 @@ class TapTracker:
                 self._peak[...] = deformation
         else:
             self._forget_if_idle(time_ns)
-        taps_used = 1 + self._earlier if self._contact else 0
-        return TapState(self._contact, self._tap, taps_used, self._shown, self._peaks)
 
     def _release(self) -> None:
         if self._tap_scans >= MIN_TAP_SCANS and len(self._window) > 1:
             for slot in range(len(self._window) - 1, 1, -1):
                 self._window[slot] = self._window[slot - 1]
             self._window[1] = self._peak
-            self._earlier = min(self._earlier + 1, len(self._window) - 1)
-            self._peaks = (TapPeak(self._tap, self._peak_ns), *self._peaks)[: self._earlier]
+            self.peaks = (TapPeak(self.tap, self._peak_ns), *self.peaks)[: len(self._window) - 1]
         self._window[0].fill(0)
         self._tap_scans = 0
         self._peak_counts = -math.inf

@@ -1,7 +1,7 @@
-"""Stage that follows the taps of one sensor: the window of a due pattern, its poses, and where to touch next."""
+"""Stage that follows the taps of one sensor: the window of a due pattern, its poses, where to touch next, and reuse."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from math import hypot, radians, sqrt
 from typing import Final
 
@@ -12,9 +12,9 @@ from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
 from edge.perception.pattern_check import REPEATS
-from edge.perception.result import NextTap, Step, Window
-from edge.perception.tap_tracker import TapState, TapTracker
-from edge.perception.taxel_health import TaxelWatch
+from edge.perception.result import Estimate, NextTap, Step, Window
+from edge.perception.tap_tracker import TapTracker
+from edge.perception.taxel_health import Health
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
 
@@ -34,7 +34,7 @@ class TapPoses:
         self._poses: dict[int, PadPose] = {}
         self._reported: set[int] = set()
 
-    def follow(self, tap: TapState, track: PoseTrack) -> None:
+    def follow(self, tap: TapTracker, track: PoseTrack) -> None:
         """Look up the poses of earlier taps, and forget those that the tracker has forgotten.
 
         A pose may come later than its scan, and a track is short, so that every scan looks for what is missing.
@@ -49,7 +49,7 @@ class TapPoses:
             self._reported &= remembered | {tap.tap}
 
     def choose(
-        self, tap: TapState, pose: PadPose | None, *, scheduled: bool
+        self, tap: TapTracker, pose: PadPose | None, *, scheduled: bool
     ) -> tuple[Sequence[int], NDArray[np.float32]]:
         """Return the taps to use during contact: places in the window, newest first, and their poses as model input.
 
@@ -114,7 +114,7 @@ class TapAdvice:
         if before is None or (made.force_counts or 0.0) >= (before.force_counts or 0.0):
             self._strongest = made
 
-    def proposal(self, tap: TapState) -> NextTap | None:
+    def proposal(self, tap: TapTracker) -> NextTap | None:
         """Return where to touch next; None during a tap, and where nothing can be proposed or the tap is forgotten."""
         if tap.contact or not tap.peaks or tap.peaks[0].tap != self._tap:
             self._proposed = None
@@ -176,9 +176,9 @@ class Taps:
     """
 
     def __init__(
-        self, tracker: TapTracker, watch: TaxelWatch, contract: Contract, options: RuntimeOptions, report: Report
+        self, tracker: TapTracker, health: Health, contract: Contract, options: RuntimeOptions, report: Report
     ) -> None:
-        self._tracker, self._watch = tracker, watch
+        self._tracker, self._health = tracker, health
         self._most = contract.taps if options.taps is None else options.taps
         self._on_counts = options.contact_on_counts
         posed = contract.takes_poses
@@ -190,7 +190,8 @@ class Taps:
         scan, readings, z_counts = step.scan, step.readings, step.force_counts
         if readings is None or z_counts is None:
             return
-        tap = self._tracker.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
+        tap = self._tracker
+        tap.push(readings, scan.time_ns, z_counts, scan.on_bus_ns, doubted=step.doubted)
         if self._poses is not None and track is not None:
             self._poses.follow(tap, track)
         step.state, step.contact = "idle", tap.contact
@@ -206,7 +207,7 @@ class Taps:
         if self.advice is not None and not step.doubted:
             step.next_tap = self.advice.proposal(tap)
 
-    def _window(self, step: Step, tap: TapState, *, scheduled: bool) -> Window:
+    def _window(self, step: Step, tap: TapTracker, *, scheduled: bool) -> Window:
         taps = min(tap.taps_used, self._most)
         if self._poses is None:
             # A copy, since the tracker overwrites its own if the sensor's next scan comes in the same call.
@@ -216,5 +217,57 @@ class Taps:
             taps = min(taps, len(slots))
             slots, rows = slots[:taps], rows[:taps]
             counts = tap.window[list(slots)]
-        made_by = (tap.tap, tuple(slots), taps, step.filled, self._watch.most_repeats >= REPEATS)
+        made_by = (tap.tap, tuple(slots), taps, step.filled, self._health.most_repeats >= REPEATS)
         return Window(counts, taps, slots, rows, tap.tap, made_by)
+
+
+NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
+_CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
+MOVED: Final = np.array([0.05, 0.05, 0.25, 0.05, 0.25], dtype=np.float32)
+"""Change of a relative pose, in [mm] and [deg] as model input has them: a quarter of the usual errors."""
+
+
+class LastPattern:
+    """Estimate of a sensor's last pattern, and what it was made from; allocates no array after construction.
+
+    Attributes:
+        estimate: None before the first, and where it must not be used again.
+    """
+
+    def __init__(self, scan_shape: tuple[int, int, int], *, every_scan: bool = False) -> None:
+        """Begin without one; with `every_scan` none is used again."""
+        self._every_scan = every_scan
+        self.estimate: Estimate | None = None
+        self._scan_number = -1
+        self._counts = np.zeros(scan_shape, dtype=np.float32)
+        self._change = np.zeros(scan_shape, dtype=np.float32)
+        self._made_by: Hashable = None
+        self._poses: NDArray[np.float32] | None = None
+
+    def reuse(self, step: Step, due: Window) -> bool:
+        """Give a step the estimate if readings and poses have not changed beyond noise since; return whether it has it.
+
+        Nor must the maker have changed, which is what distinguishes the pattern from others.
+        """
+        if self._every_scan or self.estimate is None or due.made_by != self._made_by:
+            return False
+        poses = due.poses
+        if poses is not None and (
+            self._poses is None or poses.shape != self._poses.shape or (np.abs(poses - self._poses) > MOVED).any()
+        ):
+            return False
+        np.subtract(due.counts[0], self._counts, out=self._change)
+        np.abs(self._change, out=self._change)
+        # Noise reaches neither five of its deviations in one reading, nor 1.4 of them in the RMS of all.
+        if np.maximum.reduce(self._change, axis=None) > 5 * _CHANGE_COUNTS:
+            return False
+        if float(np.vdot(self._change, self._change)) > (1.4 * _CHANGE_COUNTS) ** 2 * self._change.size:
+            return False
+        step.estimate, step.reused_from = self.estimate, self._scan_number
+        return True
+
+    def keep(self, step: Step, due: Window, made: Estimate) -> None:
+        """Keep the estimate of a step's pattern."""
+        self.estimate, self._scan_number = made, step.scan.number
+        self._counts[...] = due.counts[0]
+        self._poses, self._made_by = due.poses, due.made_by

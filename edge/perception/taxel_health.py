@@ -1,13 +1,21 @@
-"""Health of a sensor's taxels, scan by scan: held readings, dead taxels, their reasons and what stands for them."""
+"""Health of a sensor's taxels, scan by scan: held readings, dead taxels, their reasons, and estimates of dead ones.
 
+For an estimate readings are modelled as drawn from one of several kinds of contact, each a zero-mean Gaussian of any
+scale: the edge of a figure, a face over the whole pad. The living taxels give the probability of each kind, and each
+kind an estimate.
+"""
+
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.perception.dead_taxel_fill import Filler, TaxelEstimator
+from edge.errors import EdgeError
 from edge.perception.event import Note
 from edge.perception.result import Step
+from firmware_bridge.pad_geometry import AXES
+from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import TAXEL_SILENT_SCANS
@@ -55,15 +63,20 @@ _WORDS: Final = {
     "unzeroed": "not zeroed",
 }
 _OVERLOADED: Final = ": overloaded, too near a magnet, or broken"
+WIDENING: Final = (1.0, 1.05, 1.12, 1.19, 1.29, 1.36, 1.47, 1.61, 1.79)
+"""Factors on deviations with 0 to 8 of sixteen taxels dead, so that 90 % intervals hold 90 % of pixels of validation
+presses. They may be too small on contacts unlike those of training."""
+MOST_KINDS: Final = 64
 
 
-class TaxelWatch:
-    """Tracker of the health of one sensor's taxels.
+class Health:
+    """Stage: the newest reading of each taxel over the baseline, which taxels are dead, and estimates of those.
 
     A taxel is dead while it is silent or saturated for longer than its last reading is held; stuck, when it repeats
     itself while most others do not; far, when it reads what no contact makes; or was not heard while zeroing. It is
     believed again after BACK_SCANS good scans. A taxel that is stuck only nearly, or wrong in a way that a contact
-    could be, is not found: a small sphere on one taxel looks to its neighbours like a fault.
+    could be, is not found: a small sphere on one taxel looks to its neighbours like a fault. Without an estimator there
+    is no pattern while a taxel is dead.
 
     Attributes:
         held: (3, rows, cols), the newest reading of each taxel.
@@ -74,23 +87,22 @@ class TaxelWatch:
             new.
     """
 
-    def __init__(self, grid_shape: tuple[int, int], mounting: Mounting | None = None) -> None:
+    def __init__(
+        self,
+        grid_shape: tuple[int, int],
+        mounting: Mounting | None = None,
+        estimator: "TaxelEstimator | None" = None,
+    ) -> None:
         """Start with no reading of a grid (rows, cols); without a mounting its axes are as wired."""
-        self._mounting = mounting
+        self._mounting, self._estimator = mounting, estimator
+        self._filler: Filler | None = None
         self.held: NDArray[np.int32] = np.zeros((3, *grid_shape), dtype=np.int32)
-        self.dead: NDArray[np.bool_] = np.zeros(grid_shape, dtype=bool)
+        self.dead, self._arrived, self._saturated, self._unzeroed = np.zeros((4, *grid_shape), dtype=bool)
+        # Scans since a taxel arrived, in which it repeated itself, was far, was well, and gave no new count.
+        self._age, self._still, self._far, self._well, self._old = np.zeros((5, *grid_shape), dtype=np.int64)
         self._code = np.zeros(grid_shape, dtype=np.int8)
-        self._arrived = np.zeros(grid_shape, dtype=bool)
-        self._saturated = np.zeros(grid_shape, dtype=bool)
-        self._unzeroed = np.zeros(grid_shape, dtype=bool)
-        self._age = np.zeros(grid_shape, dtype=np.int64)
         self._read_ns = np.zeros(grid_shape, dtype=np.int64)
         self._whole_ns = 0
-        self._still = np.zeros(grid_shape, dtype=np.int64)
-        self._far = np.zeros(grid_shape, dtype=np.int64)
-        self._well = np.zeros(grid_shape, dtype=np.int64)
-        self._size = np.zeros((3, *grid_shape), dtype=np.float32)
-        self._old = np.zeros(grid_shape, dtype=np.int64)
         self._repeats = 0
         self._baseline: Baseline | None = None
         self.sound = False
@@ -98,31 +110,23 @@ class TaxelWatch:
         self.reasons: dict[int, str] = {}
 
     @property
-    def waiting(self) -> bool:
-        """True while a taxel has not arrived yet and is not given up."""
-        return not self.sound and not bool((self._arrived | self.dead).all())
-
-    @property
     def silent_long(self) -> NDArray[np.bool_]:
         """Taxels (rows, cols) that have not arrived for TAXEL_SILENT_SCANS."""
         return (self._age >= TAXEL_SILENT_SCANS) & ~self._saturated
 
     @property
-    def may_be_estimated(self) -> bool:
-        """True while enough taxels live; half of them silent are not a defect but a wrong id map."""
-        silent = sum(reason == "silent" for reason in self.reasons.values())
-        return len(self.reasons) <= self.dead.size // 2 and 2 * silent < self.dead.size
+    def widening(self) -> np.float32:
+        """Factor on the deviations of a pattern that is made with estimates."""
+        return np.float32(WIDENING[min(-(-16 * len(self.reasons) // self.dead.size), len(WIDENING) - 1)])
 
     def forget(self) -> None:
         """Hold no earlier reading any longer; dead taxels stay dead until enough good scans arrive."""
         self._arrived[:] = False
         self.sound = False
 
-    def push(self, scan: Scan, baseline: Baseline | None) -> NDArray[np.float32] | None:
-        """Take one scan and return the newest readings (3, rows, cols) over the baseline; None without a baseline.
-
-        NaN stands for taxels that were not zeroed, in both.
-        """
+    def __call__(self, step: Step, baseline: Baseline | None) -> bool:
+        """Put the newest readings over the baseline, NaN of taxels not zeroed; return whether other taxels are dead."""
+        scan, dead = step.scan, self.dead
         if baseline is not self._baseline and baseline is not None:
             unzeroed = np.isnan(baseline.counts).any(axis=0)
             if self._baseline is None or (unzeroed != self._unzeroed).any():  # not where it has drifted alone
@@ -132,89 +136,74 @@ class TaxelWatch:
             zeroed = np.subtract(scan.counts, baseline.counts, dtype=np.float32)
             if self._mounting is not None:
                 zeroed = self._mounting.correct(zeroed)
-            np.abs(zeroed, out=self._size)
-            largest = float(np.maximum.reduce(self._size, axis=None))
-            # Near rest, without contact, no taxel is far or at an end that is not its rest. In contact every taxel must
-            # be inside the range, and not far as one is that has wrapped round.
-            if largest <= NEAR_END_COUNTS or (
-                RANGE_ENDS[0] < np.minimum.reduce(scan.counts, axis=None)
-                and np.maximum.reduce(scan.counts, axis=None) < RANGE_ENDS[1]
-                and not self._may_be_far(zeroed, largest)
-            ):
+            if _is_plain(scan.counts, zeroed):
                 np.copyto(self.held, scan.counts)
                 self._whole_ns = scan.not_before_ns
-                return zeroed
-        ends = self._find_saturated(scan, baseline)
-        zeroed = None
-        if not ends and self.sound and scan.whole:
-            np.copyto(self.held, scan.counts)
-            self._whole_ns = scan.not_before_ns
-            zeroed = None if baseline is None else deformation(scan.counts, baseline, self._mounting)
-            if zeroed is None:
-                return zeroed
-            np.abs(zeroed, out=self._size)
-            if not self._may_be_far(zeroed, float(self._size.max())):
-                return zeroed
+                step.zeroed = zeroed
+                return False
+        self._find_saturated(scan, baseline)
         read = scan.fresh & ~self._saturated
         self._arrived |= read
         np.copyto(self.held, scan.counts, where=read)
-        if baseline is not None:
-            zeroed = deformation(self.held, baseline, self._mounting)
-        self._judge(scan, read, zeroed)
-        return zeroed
+        step.zeroed = None if baseline is None else deformation(self.held, baseline, self._mounting)
+        self._judge(scan, read, step.zeroed)
+        step.dead = self.reasons
+        if self.dead is dead:
+            return False
+        count = np.count_nonzero(self.dead)
+        possible = self._estimator is not None and 0 < 2 * count <= dead.size
+        self._filler = self._estimator.filler(self.dead) if self._estimator is not None and possible else None
+        return True
 
-    def notes(self, filled: str | None) -> tuple[Note, ...]:
+    def fill(self, step: Step) -> None:
+        """Set the readings for a pattern; none where a taxel has not arrived yet, or too many are dead."""
+        readings = step.zeroed
+        if not self.sound:
+            silent = sum(reason == "silent" for reason in self.reasons.values())
+            # Half of them silent are not a defect but a wrong id map.
+            if readings is not None and self._filler is not None and 2 * silent < self.dead.size:
+                readings, step.filled = self._filler(readings), "neighbours"
+            step.notes = (*step.notes, *self._notes(step.filled))
+            if not (self._arrived | self.dead).all() or (step.dead and step.filled is None):
+                return
+        if readings is not None:
+            step.readings, step.force_counts = readings, float(np.add.reduce(readings[2], axis=None))
+
+    def _notes(self, filled: str | None) -> list[Note]:
         """Return notes on taxels that are not believed, of which there are estimates or, with None, no pattern."""
-        if self.sound:
-            return ()
         notes: list[Note] = []
         overloaded = np.flatnonzero(self._saturated & ~self.dead)
         if overloaded.size:
             text = f"its last reading is held, {_named(overloaded)} {_WORDS['saturated']}{_OVERLOADED}"
             notes.append(Note("held", text))
-        kinds = {reason: self._dead_by(reason) for reason in dict.fromkeys(self.reasons.values())}
+        kinds: dict[str, list[int]] = {}
+        for taxel, reason in self.reasons.items():
+            kinds.setdefault(reason, []).append(taxel)
         if filled is not None and kinds:
             dead = ", ".join(f"{_named(taxels)} {_WORDS[reason]}" for reason, taxels in kinds.items())
             owner = "its" if len(self.reasons) == 1 else "their"
-            notes.append(Note("estimated", f"{dead}: estimated from {owner} neighbours"))
-            return tuple(notes)
-        silent_long = self.silent_long
-        id_map = 2 * np.count_nonzero(silent_long) == silent_long.size
-        remedies = {"saturated": _OVERLOADED, "unzeroed": ": zero again"}
+            return [*notes, Note("estimated", f"{dead}: estimated from {owner} neighbours")]
         if self._repeats >= FROZEN_SENSOR_SCANS:
             text = f"no pattern, the sensor is frozen: its last {self._repeats} scans are alike bit for bit"
             notes.append(Note("frozen", text))
             kinds.pop("stuck", None)
+        silent_long = np.count_nonzero(self.silent_long)
         for reason, taxels in kinds.items():
-            remedy = remedies.get(reason, ": it may be broken")
-            if reason == "silent":
-                remedy = ": try another --id-map" if id_map else remedy if silent_long.any() else ""
-            if taxels:
-                notes.append(Note("dead", f"no pattern, {_named(taxels)} {_WORDS[reason]}{remedy}"))
-        return tuple(notes)
+            remedy = {"saturated": _OVERLOADED, "unzeroed": ": zero again"}.get(reason, ": it may be broken")
+            if reason == "silent" and 2 * silent_long == self.dead.size:
+                remedy = ": try another --id-map"
+            elif reason == "silent" and not silent_long:
+                remedy = ""
+            notes.append(Note("dead", f"no pattern, {_named(taxels)} {_WORDS[reason]}{remedy}"))
+        return notes
 
-    def _dead_by(self, reason: str) -> list[int]:
-        return [taxel for taxel, why in self.reasons.items() if why == reason]
-
-    def _find_saturated(self, scan: Scan, baseline: Baseline | None) -> bool:
-        """Mark taxels at an end of the chip's range on some axis and far from rest; return whether there are any."""
-        low, high = RANGE_ENDS
-        ends = (scan.counts == low) | (scan.counts == high)
-        if not self.sound:
-            self._saturated &= ~scan.fresh
+    def _find_saturated(self, scan: Scan, baseline: Baseline | None) -> None:
+        """Mark taxels at an end of the chip's range on some axis and far from rest."""
+        self._saturated &= ~scan.fresh
+        ends = (scan.counts == RANGE_ENDS[0]) | (scan.counts == RANGE_ENDS[1])
         if baseline is not None and ends.any():
             far = np.abs(deformation(scan.counts, baseline)) > NEAR_END_COUNTS
             self._saturated |= (ends & far).any(axis=0)
-            return bool(self._saturated.any())
-        return False
-
-    def _may_be_far(self, zeroed: NDArray[np.float32], largest: float) -> bool:
-        """Return quickly whether a taxel may be far, if all taxels live; only then the full check is made."""
-        if largest <= LONE_COUNTS:
-            return False
-        sizes = np.maximum.reduce(self._size).ravel()
-        sizes.partition(-2)
-        return bool(sizes[-2] < LONE_SHARE * sizes[-1] or (zeroed < _LOW).any() or (zeroed > _HIGH).any())
 
     def _judge(self, scan: Scan, read: NDArray[np.bool_], zeroed: NDArray[np.float32] | None) -> None:
         self._age += 1
@@ -271,41 +260,113 @@ class TaxelWatch:
         return size
 
 
+def _is_plain(counts: NDArray[np.int32], zeroed: NDArray[np.float32]) -> bool:
+    """Return quickly whether no taxel of a sound sensor can be far, or at an end of its range."""
+    sizes = np.abs(zeroed)
+    largest = float(np.maximum.reduce(sizes, axis=None))
+    if largest <= NEAR_END_COUNTS:  # without contact, only one that rests at an end is at it
+        return True
+    if np.minimum.reduce(counts, axis=None) <= RANGE_ENDS[0] or np.maximum.reduce(counts, axis=None) >= RANGE_ENDS[1]:
+        return False
+    if largest <= LONE_COUNTS:
+        return True
+    of_taxels = np.maximum.reduce(sizes).ravel()
+    of_taxels.partition(-2)
+    lone = of_taxels[-2] < LONE_SHARE * of_taxels[-1]
+    return not (lone or (zeroed < _LOW).any() or (zeroed > _HIGH).any())
+
+
 def _named(taxels: list[int] | NDArray[np.integer]) -> str:
     return f"taxel {', '.join(map(str, taxels))}"
 
 
-class Health:
-    """Stage: the newest reading of each taxel over the baseline, and estimates of those of dead taxels.
+class TaxelEstimator:
+    """Estimator of dead taxels of a grid (rows, cols), fitted on readings of simulated presses.
 
-    Without an estimator there is no pattern while a taxel is dead.
+    Covariances (kinds, 3 taxels, 3 taxels) are of zeroed counts about zero, of any scale, x of all taxels first,
+    row-major, then y, z.
+
+    Raises:
+        EdgeError: the covariances are of another grid, or not positive definite.
     """
 
-    def __init__(self, watch: TaxelWatch, estimator: TaxelEstimator | None) -> None:
-        self._watch, self._estimator = watch, estimator
-        self._filler: Filler | None = None
+    def __init__(self, covariances: NDArray[np.floating], grid_shape: tuple[int, int]) -> None:
+        channels = len(AXES) * grid_shape[0] * grid_shape[1]
+        shape = covariances.shape
+        if len(shape) != 3 or shape[1:] != (channels, channels) or not 0 < shape[0] <= MOST_KINDS:
+            raise EdgeError(
+                f"covariances are {shape}, expected (1 to {MOST_KINDS}, {channels}, {channels}): freeze them again"
+            )
+        exact = covariances.astype(np.float64)
+        if not np.isfinite(exact).all() or not (np.linalg.eigvalsh(exact)[:, 0] > -ridge_of(exact)).all():
+            raise EdgeError("covariances are not positive definite: freeze them again")
+        self._grid_shape = grid_shape
+        self._covariances = ridged(exact)
 
-    def __call__(self, step: Step, baseline: Baseline | None) -> bool:
-        """Take the step's readings; return whether other taxels are dead than before."""
-        watch = self._watch
-        before = watch.dead
-        step.zeroed = watch.push(step.scan, baseline)
-        step.dead = watch.reasons
-        if watch.dead is before:
-            return False
-        dead = np.count_nonzero(watch.dead)
-        possible = self._estimator is not None and 0 < 2 * dead <= watch.dead.size
-        self._filler = self._estimator.filler(watch.dead) if self._estimator is not None and possible else None
-        return True
+    def filler(self, dead: NDArray[np.bool_]) -> "Filler":
+        """Return the filler for the taxels `dead` (rows, cols), some of which must be alive."""
+        if dead.shape != self._grid_shape or dead.all():
+            raise EdgeError(
+                f"{np.count_nonzero(dead)} dead taxels of {dead.shape}, expected fewer, of {self._grid_shape}"
+            )
+        return Filler(dead, self._covariances)
 
-    def fill(self, step: Step) -> None:
-        """Set the readings for a pattern; none where a taxel has not arrived yet, or too many are dead."""
-        watch, readings = self._watch, step.zeroed
-        if readings is not None and self._filler is not None and watch.may_be_estimated:
-            readings, step.filled = self._filler(readings), "neighbours"
-        if not watch.sound:
-            step.notes = (*step.notes, *watch.notes(step.filled))
-            if watch.waiting or (step.dead and step.filled is None):
-                return
-        if readings is not None:
-            step.readings, step.force_counts = readings, float(np.add.reduce(readings[2], axis=None))
+
+class Filler:
+    """Filler for the same dead taxels scan after scan; computes once all that does not depend on readings."""
+
+    def __init__(self, dead: NDArray[np.bool_], covariances: NDArray[np.float64]) -> None:
+        off = np.tile(dead.ravel(), len(AXES))
+        self._dead, self._live = np.flatnonzero(off), np.flatnonzero(~off)
+        living = covariances[:, self._live[:, None], self._live]
+        self._kinds = Kinds(living)
+        self._maps = np.linalg.solve(living, covariances[:, self._live[:, None], self._dead]).transpose(0, 2, 1)
+
+    def __call__(self, zeroed: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return one scan (3, rows, cols) in zeroed counts with estimates in the place of dead taxels."""
+        living = zeroed.ravel()[self._live].astype(np.float64)
+        counts = zeroed.copy()
+        counts.flat[self._dead] = self._kinds.weigh(living[None])[0] @ (self._maps @ living)
+        return counts
+
+
+class Kinds:
+    """Probabilities of kinds of contact, equally frequent, by their covariances (kinds, n, n) of readings of any scale.
+
+    Source: Tyler 1987, angular central Gaussian.
+    """
+
+    def __init__(self, covariances: NDArray[np.float64]) -> None:
+        factors = np.linalg.cholesky(covariances)
+        self._whiteners = np.linalg.inv(factors)
+        self._log_sizes = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
+
+    def weigh(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the probability of each kind, (m, kinds), from readings (m, n)."""
+        square = np.square(self._whiteners @ readings.T).sum(axis=1) + np.finfo(np.float64).tiny
+        log_weight = -readings.shape[1] / 2 * np.log(square) - self._log_sizes[:, None]
+        weight = np.exp(log_weight - log_weight.max(axis=0))
+        return (weight / weight.sum(axis=0)).T
+
+
+def ridged(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return covariances (kinds, n, n) with the ridge added to the diagonal of each."""
+    return covariances + ridge_of(covariances)[:, None, None] * np.eye(covariances.shape[1])
+
+
+def ridge_of(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ridge in squared counts for each of (kinds, n, n), for gains and noise of the individual sensor."""
+    return 2e-3 * np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
+
+
+def load_estimator(path: Path, grid_shape: tuple[int, int]) -> TaxelEstimator:
+    """Load the covariances that `train.freeze` computed from simulated presses.
+
+    Raises:
+        EdgeError: the file cannot be read, or is of another grid.
+    """
+    try:
+        covariances = read_npz(path, ["covariances"], 1 << 24)["covariances"]
+    except (OSError, ValueError, KeyError) as error:
+        raise EdgeError(f"{path} cannot be read ({error}): make it with 'python -m train.freeze'") from error
+    return TaxelEstimator(covariances, grid_shape)

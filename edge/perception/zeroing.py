@@ -1,71 +1,40 @@
-"""Stage that knows a sensor's rest level: its baseline, stored, taken at the start or on demand, and its drift."""
+"""Stages that know a sensor's rest level: its baseline, taken or stored, and its drift; and whether to believe it.
 
-import time
+The shape of a reading does not tell whether it is a touch, or whether drift or an old baseline explains it as well: a
+flat grip moves all taxels together, and so does a pad that has warmed, or is another one than was zeroed. What tells is
+how it began. A touch is quick, and begins from a rest level that was seen in this run; or it is local, and leaves half
+of the pad at rest. All else over a threshold is in doubt.
+"""
+
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Note, Report
-from edge.perception.result import Step
+from edge.perception.result import Step, age_text
 from edge.perception.tap_tracker import TapTracker
-from edge.perception.taxel_health import TaxelWatch
+from edge.perception.taxel_health import Health
 from firmware_bridge.errors import BaselineRefusedError
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator, deformation
+from firmware_bridge.zeroing.baseline import FEWEST_SCANS, Baseline, BaselineEstimator, Origin, deformation
 from firmware_bridge.zeroing.drift_tracker import Drift, DriftTracker
 
 GIVE_UP_NS: Final = 15_000_000_000
 """Longest zeroing on demand, in [ns] of scan time: ten tries at 100 Hz, and four at 30 Hz."""
 
 
-class Rezeroing:
-    """Zeroing of one sensor on demand: takes one new baseline, or gives up.
+class Demand(NamedTuple):
+    """Zeroing on demand, which goes on until a time in [ns]; forced, it zeroes a load away."""
 
-    Attributes:
-        note: its progress.
-    """
-
-    def __init__(self, old: Baseline | None, *, force: bool, unix_time_s: Callable[[], float] = time.time) -> None:
-        """Start with the next scan; without an old baseline, or by force, a load is zeroed away."""
-        self.note = Note("zeroing", "zeroing: keep the pad still and free")
-        self._old = old
-        self._force = force
-        self._unix_time_s = unix_time_s
-        self._end_ns: int | None = None
-        self._why = f"fewer than {FEWEST_SCANS} whole scans"
-        self._estimator = self._new_estimator()
-
-    def push(self, scan: Scan, contact: bool, silent: NDArray[np.bool_] | None) -> Baseline | None:
-        """Take one more scan; return the new baseline once there are enough.
-
-        A tap that goes on starts the zeroing over unless it is forced; `silent` taxels (rows, cols) are left unzeroed.
-
-        Raises:
-            BaselineRefusedError: the tries have taken too long; the message gives the last reason. The old baseline
-                stays.
-        """
-        if self._end_ns is None:
-            self._end_ns = scan.time_ns + GIVE_UP_NS
-        if scan.time_ns >= self._end_ns:
-            raise BaselineRefusedError(f"{self._why}; tried for {GIVE_UP_NS / 1e9:.0f} s")
-        try:
-            if contact and not self._force:
-                if self._estimator.scans:
-                    self._estimator = self._new_estimator()
-                raise BaselineRefusedError("the pad is in contact: free it")
-            taken = self._estimator.push(scan, silent)
-        except BaselineRefusedError as refusal:
-            self._why = str(refusal)
-            self.note = Note("zeroing_restarted", f"zeroing started over: {refusal}")
-            return None
-        return None if taken is None else replace(taken, origin="demand")
-
-    def _new_estimator(self) -> BaselineEstimator:
-        return BaselineEstimator(reference=self._old, clock=self._unix_time_s)
+    force: bool
+    old: Baseline | None
+    end_ns: int | None = None
+    why: str = f"fewer than {FEWEST_SCANS} whole scans"
 
 
 class Zeroing:
@@ -83,20 +52,20 @@ class Zeroing:
     def __init__(
         self,
         taps: TapTracker,
-        watch: TaxelWatch,
+        health: Health,
         mounting: Mounting | None,
         report: Report,
         unix_time_s: Callable[[], float],
         notes: tuple[Note, ...] = (),
     ) -> None:
         self.baseline: Baseline | None = None
-        self._taps, self._watch, self._mounting = taps, watch, mounting
+        self._taps, self._health, self._mounting = taps, health, mounting
         self._report, self._unix_time_s = report, unix_time_s
         self.notes = notes
         self._drift: Drift | None = None
         self.drift_notes: tuple[Note, ...] = ()
         self._estimator = BaselineEstimator(clock=unix_time_s)
-        self._rezeroing: Rezeroing | None = None
+        self._demand: Demand | None = None
         self._taken: Baseline | None = None
         self._taken_ns: int | None = None
         self._tracker: DriftTracker | None = None
@@ -111,14 +80,12 @@ class Zeroing:
     def __call__(self, step: Step) -> Baseline | None:
         """Put the step's readings over the baseline; return a baseline that this very scan has completed."""
         new = None
-        if self.baseline is None:
-            new = self._zero(step.scan)
-        elif self._rezeroing is not None:
-            new = self._rezero(step.scan, self._rezeroing)
+        if self.baseline is None or self._demand is not None:
+            new = self._take(step.scan)
         if new is not None:
             self.use(new, 0.0, step.scan.time_ns)
             self.notes = ()
-            step.zeroed = deformation(self._watch.held, new, self._mounting)
+            step.zeroed = deformation(self._health.held, new, self._mounting)
         if self.baseline is not None:
             step.baseline, step.drift = self.baseline, self._drift
             if self._taken_ns is not None:
@@ -130,7 +97,7 @@ class Zeroing:
         tracker, taken = self._tracker, self._taken
         if tracker is None or taken is None:
             return
-        if not tracker.push(step.scan, step.doubted or bool(step.contact), self._watch.dead):
+        if not tracker.push(step.scan, step.doubted or bool(step.contact), self._health.dead):
             return
         self.baseline = taken.moved(tracker.counts)
         self._drift, note = tracker.summary, tracker.note
@@ -149,43 +116,208 @@ class Zeroing:
         elif self._taps.contact and not force:
             self._report("in_contact")
         else:
-            old = None if force or doubted else self.baseline
-            self._rezeroing = Rezeroing(old, force=force, unix_time_s=self._unix_time_s)
-            self.notes = (self._rezeroing.note,)
+            self._demand = Demand(force, None if force or doubted else self.baseline)
+            self._begin()
+            self.notes = (Note("zeroing", "zeroing: keep the pad still and free"),)
 
     def lose_touch(self) -> None:
         """Compare the rest level with the earlier one before drift is followed again; a zeroing that goes on ends."""
-        self._estimator = BaselineEstimator(clock=self._unix_time_s)
         if self._tracker is not None:
             self._tracker.forget()
-        if self._rezeroing is not None:
-            self._rezeroing, self.notes = None, ()
-            self._report("given_up", "the sensor was away; request it again")
+        if self._demand is not None:
+            self._give_up("the sensor was away; request it again")
+        self._begin()
 
-    def _zero(self, scan: Scan) -> Baseline | None:
-        """Use the scan for the first baseline; after a refusal a note reports it and zeroing starts over."""
+    def _begin(self) -> None:
+        old = None if self._demand is None else self._demand.old
+        self._estimator = BaselineEstimator(reference=old, clock=self._unix_time_s)
+
+    def _give_up(self, why: str) -> None:
+        self._demand, self.notes = None, ()
+        self._report("given_up", why)
+
+    def _take(self, scan: Scan) -> Baseline | None:
+        """Use the scan for a new baseline; after a refusal a note reports it and zeroing starts over.
+
+        On demand a tap that goes on starts it over unless it is forced, and after a time it is given up: the old
+        baseline stays.
+        """
+        demand = self._demand
+        if demand is not None and demand.end_ns is None:
+            self._demand = demand = demand._replace(end_ns=scan.time_ns + GIVE_UP_NS)
+        if demand is not None and demand.end_ns is not None and scan.time_ns >= demand.end_ns:
+            self._give_up(f"{demand.why}; tried for {GIVE_UP_NS / 1e9:.0f} s")
+            return None
+        silent = self._health.silent_long
         try:
-            return self._estimator.push(scan, self._silent())
+            if demand is not None and self._taps.contact and not demand.force:
+                self._begin()
+                raise BaselineRefusedError("the pad is in contact: free it")
+            new = self._estimator.push(scan, silent if 2 * np.count_nonzero(silent) < silent.size else None)
         except BaselineRefusedError as refusal:
             self.notes = (Note("zeroing_restarted", f"zeroing started over: {refusal}"),)
+            self._demand = None if demand is None else demand._replace(why=str(refusal))
             return None
-
-    def _rezero(self, scan: Scan, rezeroing: Rezeroing) -> Baseline | None:
-        """Push a scan to a zeroing on demand and return the new baseline once there is one."""
-        try:
-            new = rezeroing.push(scan, self._taps.contact, self._silent())
-        except BaselineRefusedError as refusal:
-            self._rezeroing, self.notes = None, ()
-            self._report("given_up", str(refusal))
-            return None
-        self.notes = (rezeroing.note,)
-        if new is None:
-            return None
-        self._rezeroing = None
+        if new is None or demand is None:
+            return new
+        self._demand = None
         self._report("zeroed", f"baseline {new.id}" + ("" if self._taken is None else f" instead of {self._taken.id}"))
         self._taps.reset()  # earlier taps were zeroed with another rest level
-        return new
+        return replace(new, origin="demand")
 
-    def _silent(self) -> NDArray[np.bool_] | None:
-        silent = self._watch.silent_long
-        return silent if 2 * np.count_nonzero(silent) < silent.size else None
+
+Doubt = Literal["unseen", "outage", "held", "below", "slow", "alike", "left"]
+"""Why readings are no contact: the pad was not seen at rest near its baseline in this run, or since an outage; the
+recording that is played may hold something all the time; it reads far below its baseline; the readings rose no faster
+than drift; all taxels changed alike, as in a field; or it is what a release has left, which warming and recovery
+explain."""
+
+NEAR_COUNTS: Final = 50.0
+"""Largest reading of a taxel at rest, on any axis: more than a pad turned over in the earth's field (36) and the first
+recovery after a grip (45), and less than the change of any public recording's rest level in four hours (64 to 715)."""
+SEEN_SHARE: Final = 0.75  # share of the taxels at rest by which the pad is seen at rest
+LOCAL_SHARE: Final = 0.5  # share of the taxels at rest beside which the others are touched
+_TEXTS: Final[dict[Doubt, str]] = {
+    "unseen": "most taxels are off it together, by {counts}, and the pad was not seen at rest near it in this run",
+    "outage": "after an outage most taxels are off it together, by {counts}: is this another pad?",
+    "held": "taken from this recording, whose readings hardly change: the pad is free, or holds something all the time",
+    "below": "far below the baseline on all taxels, by {counts}: it was taken while something pressed, or is old",
+    "slow": "all taxels rose slowly together, by {counts}, as drift does",
+    "alike": "all taxels changed alike by {counts}, as in a field or by warming, and as no touch does",
+    "left": "all taxels stay off by {counts} after a release, as a pad does that has warmed or recovers",
+}
+
+
+def doubt_text(doubt: Doubt, counts: tuple[float, float, float], age_s: float | None) -> str:
+    """Return a doubt in a user's words, with the medians of all taxels on x, y, z and the baseline's age in [s]."""
+    seen = "x {:+.0f}, y {:+.0f}, z {:+.0f} counts".format(*counts)
+    age = "of unknown age" if age_s is None else f"{age_text(age_s)} old"
+    return f"baseline in doubt: {_TEXTS[doubt].format(counts=seen)} (baseline {age}); free the pad and zero again"
+
+
+class BaselineDoubt:
+    """Stage: decides whether a step's readings may be a touch, and reports when a doubt begins, changes and ends.
+
+    Attributes:
+        doubt: why the newest readings are in doubt; None if they are not.
+        counts: medians of all taxels on x, y, z when that began.
+        reported: the doubt of the newest step that was judged; `notes` state it for the user.
+    """
+
+    def __init__(self, options: RuntimeOptions, taxels: int, report: Report) -> None:
+        self._report = report
+        self.reported: Doubt | None = None
+        self.notes: tuple[Note, ...] = ()
+        self._on, self._off = options.contact_on_counts, options.contact_off_counts
+        # Drift explains a rise of 40 counts/s a taxel: twice the fastest on record. A release leaves up to 150 a taxel:
+        # warming by 3 K gives 120.
+        self._drift_per_ns = 40.0 * taxels / 1e9
+        self._left = 150.0 * taxels
+        self.counts = (0.0, 0.0, 0.0)
+        self.begin("file")
+
+    def begin(self, origin: Origin) -> None:
+        """Begin with a baseline of an origin: of a file, or taken from these very scans."""
+        seen = origin != "file"
+        self.doubt: Doubt | None = None
+        self._held = origin == "unsure"
+        self._seen = seen
+        self._unseen: Doubt = "unseen"
+        self._touched = seen  # until it was low once, nothing is known of how a contact began
+        self._before: NDArray[np.float32] | None = None
+        self._newest: NDArray[np.float32] | None = None
+        self._level = self._peak = self._still_counts = 0.0
+        self._newest_ns = self._still_ns = 0
+
+    def lose_touch(self, *, same_pad: bool = False) -> None:
+        """Forget how a contact began, and after an outage that the pad was seen: it may not be the `same_pad`."""
+        if self._seen and not same_pad:
+            self._before, self._newest = self._newest, None
+            self._seen, self._unseen = False, "outage"
+        self._touched = self._seen
+
+    def __call__(self, step: Step) -> None:
+        """Mark the step where its readings are in doubt."""
+        if step.readings is None or step.force_counts is None:
+            return
+        doubt = self._weigh(step.readings, step.force_counts, step.scan.time_ns)
+        step.doubted = doubt is not None
+        if doubt is self.reported:
+            return
+        self.reported = doubt
+        if doubt is None:
+            self._report("baseline_cleared", "")
+        else:
+            text = doubt_text(doubt, self.counts, step.baseline_age_s)
+            self.notes = (Note("baseline_in_doubt", text),)
+            self._report("baseline_doubted", text)
+
+    def _weigh(self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int) -> Doubt | None:
+        """Return why readings (3, rows, cols) over the baseline, of a summed z, are in doubt; None if they are not."""
+        self._newest = zeroed
+        if self._held:
+            return "held"
+        if self._seen and -self._off < z_counts < self._off:
+            self._newest_ns, self._level, self._peak = time_ns, 0.0, 0.0
+            self._touched, self.doubt = False, None
+            return None
+        near = np.maximum.reduce(np.abs(zeroed)) <= NEAR_COUNTS
+        at_rest = np.count_nonzero(near) / near.size
+        if at_rest >= SEEN_SHARE:
+            self._seen, self._peak, self._level = True, 0.0, 0.0
+        elif not self._seen:
+            self._seen = self._goes_on(zeroed)
+        before, self.doubt = self.doubt, None
+        if z_counts <= -self._off and float(np.median(zeroed[2])) < -NEAR_COUNTS:
+            self.doubt, self._seen, self._touched = "below", False, False
+        elif at_rest >= LOCAL_SHARE and z_counts >= self._on:
+            self._touched = True
+        elif not self._seen:
+            self.doubt = None if self._touched else self._unseen
+        elif at_rest < LOCAL_SHARE:
+            self.doubt = self._explanation(zeroed, z_counts, time_ns, before)
+        if self.doubt is not None and before is None:
+            x, y, z = np.median(zeroed.reshape(3, -1), axis=1).tolist()
+            self.counts = (x, y, z)
+        if z_counts < self._off:
+            self._touched = False
+        self._peak = max(self._peak, z_counts)
+        self._newest_ns = time_ns
+        return self.doubt
+
+    def _goes_on(self, zeroed: NDArray[np.float32]) -> bool:
+        """Return whether the readings are those from before an outage, once."""
+        before, self._before = self._before, None
+        if before is None:
+            return False
+        far = np.abs(zeroed - before) > NEAR_COUNTS + 0.1 * np.abs(before)  # as a grip changes that has gone on
+        self._touched = np.count_nonzero(far.any(axis=0)) <= (1 - SEEN_SHARE) * far[0].size
+        return self._touched
+
+    def _explanation(
+        self, zeroed: NDArray[np.float32], z_counts: float, time_ns: int, before: Doubt | None
+    ) -> Doubt | None:
+        """Return what explains readings of most taxels over a confirmed baseline as well as a touch."""
+        if not self._touched:
+            rise = self._drift_per_ns * max(time_ns - self._newest_ns, 0)
+            self._level = min(z_counts, self._level + rise)
+            if z_counts < self._on and before is None:
+                return None
+            if z_counts < 2 * self._level:
+                return "slow"
+            if self._alike(zeroed):
+                return "alike"
+            self._touched = True
+        if abs(z_counts - self._still_counts) > 100:
+            self._still_counts, self._still_ns = z_counts, time_ns
+        slack = 1.2 if before == "left" else 1.0
+        left = z_counts < slack * min(self._left, 0.5 * self._peak)
+        still = before == "left" or time_ns - self._still_ns >= 100_000_000
+        return "left" if left and still else None
+
+    @staticmethod
+    def _alike(zeroed: NDArray[np.float32]) -> bool:
+        flat = zeroed.reshape(3, -1)
+        common = np.median(flat, axis=1, keepdims=True)
+        # In real flat grips taxels differ by 0.55 of the median and more, in simulated presses by more than all of it.
+        return bool((np.abs(flat - common) <= 10 + 0.3 * np.abs(common)).all())

@@ -12,12 +12,12 @@ from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.cadence import Cadences, PaceSetter
+from edge.pipeline.cadence import Cadences
 from edge.pipeline.commands import Commands, carry_out
 from edge.pipeline.gain_keeper import GainKeeper
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.pose_queue import PoseIntake, PoseQueue
-from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.run_statistics import COUNTED, Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
@@ -28,7 +28,9 @@ from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
 
 _UNWRITTEN: Final = attrgetter("unwritten")
+_TROUBLES: Final = attrgetter(*COUNTED)
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
+COUNTED_NS: Final = 250_000_000  # age of the counters of a record, at most, while all is well, in [ns] of scan time
 
 
 class Loop:
@@ -96,14 +98,14 @@ class Loop:
         self._commands = commands
         unused_by = None if any(sink.uses_poses for sink in self._sinks) else runtime.unposed
         self._intake = PoseIntake(runtime, self._poses, recorded=source.patient, unused_by=unused_by)
-        self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
+        recorded, rate_hz = source.kind == "replay", source.rate_hz
+        self._cadences = Cadences(runtime.expected, recorded=recorded, rate_hz=rate_hz, patience_s=patience_s)
         self._now_ns = 0
         self._waited_s = self._refused_s = -math.inf
         self._clock_s = clock_s
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
-        self._received: dict[str, int] | None = None
-        self._pace = PaceSetter(patience_s)
+        self._counted: tuple[int, tuple[int, ...], dict[str, int]] = (0, (), {})
         path = None if source.kind == "replay" else source.sensor_file.path
         self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
         source.reserve(self)
@@ -116,11 +118,8 @@ class Loop:
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        if self._received is None:
-            self._received = self._source.counters()
-        if self._sinks:
-            self.statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
-        return self._received | self.statistics.counters()
+        self.statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
+        return self._source.counters() | self.statistics.counters()
 
     def close(self) -> None:
         """End the stream, as closing its source does; its sinks, which may be closed by now, get nothing more."""
@@ -132,18 +131,12 @@ class Loop:
                 f"the stream of source {self._source.name} is closed: results that were left are old"
             )
 
-    def _next_made(self) -> Result | None:
-        """Take the next result; None after an event, which is told instead."""
-        made = self._made.popleft()
-        if isinstance(made, Event):
-            self._on_event(made)
-            return None
-        return made
-
     def _pass_over(self) -> None:
         """Tell what happened, and leave the results out that were made."""
         while self._made:
-            self._next_made()
+            made = self._made.popleft()
+            if isinstance(made, Event):
+                self._on_event(made)
 
     def _step(self, wait_s: float) -> None:
         """Make the results of all that waits, after waiting at most `wait_s` [s]; of a patient source, of every scan.
@@ -162,48 +155,65 @@ class Loop:
                     raise
 
     def _make(self, wait_s: float) -> None:
-        over = self._over()
+        """Take what waits, and make its results: the order of everything that happens in a turn."""
+        source, runtime = self._source, self._runtime
+        if self._begun_s is None:
+            self._begun_s = self._clock_s()
+        over = self._stop.is_set() or (not source.patient and self._clock_s() - self._begun_s >= self._length_s)
         try:
-            taken = self._take(0.0 if over or self._runtime.waiting else wait_s, over=over)
+            taken = source.take(0.0 if over or runtime.waiting else wait_s) if not (over and source.patient) else None
         except BridgeError:
             self._make_patterns()
             raise
-        if taken is None:
+        self.statistics.overruns = source.overruns
+        if taken is None or (source.patient and self._is_too_long(taken)):
             self._make_patterns()
-            self._finish()
-            self._newest.ended = True
+            self._end()
             return
-        if self._commands is not None:
-            self._carry_out(self._commands)
-        self._poses.begun = self._poses.begun or any(isinstance(one, TimedPose) for one in taken)
-        if self._poses.begun:
+        if (commands := self._commands) is not None:
+            carry_out(commands, runtime, self._may_come)
+            self.statistics.commands_refused = commands.refused
+            if commands.reason is not None:
+                self._tell_refusal(commands, commands.reason)
+        if self._poses.begun or source.states_poses:
             self._take_poses(taken)
         for one in taken:
             if isinstance(one, Scan):
-                for result in self._runtime.take(one, self._latency_clock):
+                for result in runtime.take(one, self._latency_clock):
                     self._follow(result)
-                if self._pace.waited(one):
+                if one.time_ns < self._cadences.waited_ns:
                     self._make_patterns()
             elif isinstance(one, Notice):
                 self._make_patterns()
                 self._take_notice(one)
         # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
-        self._left = min(self._left or len(self._runtime.waiting), len(self._runtime.waiting))
-        self._left -= self._infer()
-        if over or self._source.patient:
+        self._left = min(self._left or len(runtime.waiting), len(runtime.waiting))
+        self._left -= self._infer() if runtime.waiting else 0
+        if over or source.patient:
             self._make_patterns()
         elif self._left > 0:
             return
         if over:
-            self._finish()
-            self._newest.ended = True
+            self._end()
             return
         self._left = 0
         for event in self._cadences.look():
             self._tell(event)
-        self._source.pace = self._pace.choose(len(self._cadences), self._cadences.shortest_period_s)
+        source.pace = self._cadences.pace
         if not taken:
             self._rest(wait_s)
+
+    def _is_too_long(self, taken: Sequence[Scan | Notice | TimedPose]) -> bool:
+        """Return whether the time of a patient source, which is that of its scans, is over."""
+        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
+        if not times_ns:
+            return False
+        self._first_ns = times_ns[0] if self._first_ns is None else self._first_ns
+        return times_ns[-1] - self._first_ns >= self._length_s * 1e9
+
+    def _end(self) -> None:
+        self._finish()
+        self._newest.ended = True
 
     def _finish(self) -> None:
         """Keep what was learned; there are no more results."""
@@ -228,17 +238,14 @@ class Loop:
         most = max((scans for other, scans in heard.items() if other.startswith(prefix)), default=0)
         return f"no sensor {name!r}: sensors are {', '.join(sorted(heard))}" if most >= ALL_HEARD_SCANS else None
 
-    def _carry_out(self, commands: Commands) -> None:
-        def may_come(name: str) -> bool:
-            return name not in self.statistics.scans_of_each() and self._no_sensor(name) is None
+    def _may_come(self, name: str) -> bool:
+        return name not in self.statistics.scans_of_each() and self._no_sensor(name) is None
 
-        carry_out(commands, self._runtime, may_come)
-        self.statistics.commands_refused = commands.refused
+    def _tell_refusal(self, commands: Commands, reason: str) -> None:
         now_s = self._clock_s()
-        if commands.reason is not None and now_s - self._refused_s >= 10:
-            self._refused_s = now_s  # a stream of refused ones must not flood
-            self._tell(Event(self._clock_ns(), "refused", None, commands.reason))
-            commands.reason = None
+        if now_s - self._refused_s >= 10:  # a stream of refused ones must not flood
+            self._refused_s, commands.reason = now_s, None
+            self._tell(Event(self._clock_ns(), "refused", None, reason))
 
     def _rest(self, wait_s: float) -> None:
         """Let the sinks do what is due, four times a second while no scan comes."""
@@ -251,8 +258,7 @@ class Loop:
     def _take_poses(self, taken: Sequence[Scan | Notice | TimedPose]) -> None:
         """Pass poses on to the runtime: those from outside, and those of the source."""
         recorded = [one for one in taken if isinstance(one, TimedPose)]
-        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
-        first_ns = min(times_ns, default=None)
+        first_ns = min((one.time_ns for one in taken if isinstance(one, Scan)), default=None)
         if not self._source.patient:
             self._now_ns = self._clock_ns()
         elif first_ns is not None:
@@ -266,27 +272,6 @@ class Loop:
         for event in intake.look(self._now_ns):
             self._tell(event)
 
-    def _over(self) -> bool:
-        """Return True once `stop` is set, or the time is over; a patient source's time is that of its scans."""
-        now_s = self._clock_s()
-        if self._begun_s is None:
-            self._begun_s, now_s = now_s, self._clock_s()
-        return self._stop.is_set() or (not self._source.patient and now_s - self._begun_s >= self._length_s)
-
-    def _take(self, wait_s: float, *, over: bool) -> list[Scan | Notice | TimedPose] | None:
-        """Return what waits; None once the source has ended, or a patient one's time is over."""
-        if over and self._source.patient:
-            return None
-        taken = self._source.take(wait_s)
-        self.statistics.overruns = self._source.overruns
-        self._received = None
-        for one in taken if self._source.patient and taken is not None else ():  # one scan at most
-            if isinstance(one, Scan):
-                self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
-                if one.time_ns - self._first_ns >= self._length_s * 1e9:
-                    return None
-        return taken
-
     def _make_patterns(self) -> None:
         """Make the results of all sensors that wait for their patterns."""
         while self._runtime.waiting:
@@ -294,8 +279,6 @@ class Loop:
 
     def _infer(self) -> int:
         """Make the results of those that have waited longest, in one call; return their number."""
-        if not self._runtime.waiting:
-            return 0
         results = self._runtime.infer(self._latency_clock)
         if self._keeper is not None:
             for name, pad in self._runtime.take_learned().items():
@@ -306,22 +289,28 @@ class Loop:
 
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""
-        scan, statistics = result.scan, self.statistics
-        back = self._cadences.follow(scan)
-        if result.latency_us is not None:
-            late = self._cadences.late(scan.sensor, result.latency_us)
-            statistics.late += late and not self._pace.waited(scan)
-        self._pace.follow(result)
+        cadences, statistics = self._cadences, self.statistics
+        back = cadences.follow(result)
         statistics.add(result)
-        statistics.missed = self._cadences.missed
+        statistics.late, statistics.missed = cadences.late, cadences.missed
         if back is not None:
             self._tell(back)
         if self._sinks:
-            counters = self.counters
+            # Counters are read where they are due, and where something was lost: merging them took a tenth of a scan.
+            statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
+            counted_ns, troubles, counters = self._counted
+            time_ns = result.scan.time_ns
+            if not (0 <= time_ns - counted_ns < COUNTED_NS and result.scan.whole and troubles == _TROUBLES(statistics)):
+                counters = self._count(time_ns)
             for sink in self._sinks:
                 sink.write(result, counters)
         self._newest.add(result)
         self._made.append(result)
+
+    def _count(self, time_ns: int) -> dict[str, int]:
+        counters = self.counters
+        self._counted = (time_ns, _TROUBLES(self.statistics), counters)
+        return counters
 
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""

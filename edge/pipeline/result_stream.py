@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from edge.errors import NoResultError, UsageError
+from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.latest import Latest
@@ -180,13 +181,21 @@ class Stream(Loop):
         self._pass_over()
         return latest
 
+    def run(self) -> None:
+        """Make all results for the sinks alone; raises as `__iter__`."""
+        while self._error is not None or not self._newest.ended:
+            self._step(POLL_S)
+            self._pass_over()
+
     def _returned(self) -> Iterator[Result]:
         """Yield the results that were made, each as one that an iteration returns."""
         while self._made:
-            result = self._next_made()
-            if result is not None:
-                self._newest.see(result)
-                yield result
+            made = self._made.popleft()
+            if isinstance(made, Event):
+                self._on_event(made)
+            else:
+                self._newest.see(made)
+                yield made
 
     def _round(self, wait_s: float) -> None:
         """Make the results of the scans that wait, after waiting at most `wait_s` for them."""
@@ -306,8 +315,7 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
     stream = Stream(source, runtime, sinks=sinks, statistics=statistics, **settings)
     with uncollected():
         try:
-            for _ in stream:
-                pass
+            stream.run()
         finally:
             # What the last ones left out belongs to the run, too.
             statistics.unwritten = sum(sink.unwritten for sink in sinks)

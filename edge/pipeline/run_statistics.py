@@ -17,11 +17,12 @@ BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
 OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
-_COUNTERS: Final = (
+COUNTED: Final = (
     *("dropped", "overruns", "late", "missed"),
     *("poses", "poses_refused", "poses_dropped", "unwritten"),
 )
-_COUNTS: Final = attrgetter(*_COUNTERS)
+"""Counts of which records have counters."""
+_COUNTS: Final = attrgetter(*COUNTED)
 
 
 class Histogram:
@@ -84,14 +85,13 @@ class Statistics:
     poses_dropped: int = 0
     sink_trouble: str | None = None  # trouble of the sinks at the end; None while all is well
     events: dict[EventKind, int] = field(default_factory=dict)
-    model_patterns: dict[str, int] = field(default_factory=dict)
     run_time_us: Histogram = field(default_factory=Histogram)
     latency_us: Histogram = field(default_factory=Histogram)
     _sensors: dict[str, _Course] = field(default_factory=dict)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of which records have counters."""
-        return dict(zip(_COUNTERS, _COUNTS(self), strict=True))
+        return dict(zip(COUNTED, _COUNTS(self), strict=True))
 
     def add(self, result: Result) -> None:
         """Count one result."""
@@ -107,7 +107,6 @@ class Statistics:
         self.reused += result.reused_from is not None
         if result.run_time_us is not None:
             self.run_time_us.add(result.run_time_us)
-            self.model_patterns[result.model] = self.model_patterns.get(result.model, 0) + 1
         if result.latency_us is not None:
             self.latency_us.add(result.latency_us)
         course = self._sensors.get(scan.sensor)

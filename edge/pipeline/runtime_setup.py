@@ -13,10 +13,10 @@ from edge.errors import UsageError
 from edge.inference.bundled import TAXELS, find_model, taps_of
 from edge.inference.contract import Model
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.gain_learning import load_contact_model
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import load_estimator
 from edge.pipeline.result_stream import Stream
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import of_single_csv, sensor_settings, stored_baselines, unmapped

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from edge.errors import MessageError, UsageError
 from edge.perception.event import Event
-from edge.perception.field import Columns, Out
 from edge.perception.result import Result
-from edge.perception.result_fields import FIELDS, MAPS
+from edge.perception.result_fields import FIELDS, MAPS, Columns, Out
 
 ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "note", "pattern_unit")
 """Fields of every record: which scan it is of, and whether a robot may act on it; `note` names old readings."""

@@ -9,7 +9,7 @@ from typing import Final, TextIO
 
 from edge.perception.event import Event
 from edge.perception.result import NextTap, Result
-from edge.pipeline.cadence import Rate
+from edge.pipeline.cadence import Cadence
 from edge.pipeline.sink import Sink
 from edge.terminal.text_wrap import drawn, rewritable
 from firmware_bridge.errors import harmless
@@ -38,7 +38,7 @@ class StatusSink(Sink):
         self._columns = columns
         self._terminal = rewritable(self._stream)
         self._latest: dict[str, Result] = {}
-        self._rates: defaultdict[str, Rate] = defaultdict(Rate)
+        self._cadences: defaultdict[str, Cadence] = defaultdict(Cadence)
         self._counters: Mapping[str, int] = {}
         self._last_scan_s = clock_s()
         self._received_s: dict[str, float] = {}
@@ -48,7 +48,7 @@ class StatusSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Show one result, unless the line is fresh."""
         self._latest[result.scan.sensor] = result
-        self._rates[result.scan.sensor].add(result.scan.time_ns)
+        self._cadences[result.scan.sensor].follow(result.scan)
         self._counters = counters
         self._last_scan_s = self._received_s[result.scan.sensor] = self._clock_s()
         self._refresh()
@@ -149,7 +149,7 @@ class StatusSink(Sink):
             words.append("unchanged")
         elif result.run_time_us is not None:
             words.append(f"{result.run_time_us:.0f} us")
-        rate_hz = self._rates[name].rate_hz
+        rate_hz = self._cadences[name].rate_hz
         if rate_hz is not None:
             words.append(f"{rate_hz:.0f} Hz")
         return " ".join(words)

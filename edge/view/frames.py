@@ -13,7 +13,7 @@ from edge.inference.contract import Contract
 from edge.mapping.sink import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.cadence import Rate
+from edge.pipeline.cadence import Cadence
 from edge.pipeline.sink import Sink
 from edge.sinks.json_encoding import event_record, pack, record
 from firmware_bridge.errors import harmless
@@ -96,7 +96,7 @@ class RunSnapshot(Sink):
         for event in result.events:
             self._add_event(event, counters)
         received_ns = self._clock_ns()
-        newest = Newest(trace.number, result, counters, received_ns, trace.rate.rate_hz)
+        newest = Newest(trace.number, result, counters, received_ns, trace.cadence.rate_hz)
         if scan.sensor in self.newest:
             self.newest[scan.sensor] = newest
         else:
@@ -139,14 +139,14 @@ class _Trace:
 
     def __init__(self) -> None:
         self.number = 0
-        self.rate = Rate()
+        self.cadence = Cadence()
         self._recent: deque[Point] = deque(maxlen=RECENT_SCANS)
         self._past: deque[Point] = deque(maxlen=TRACE_POINTS - 1)
 
     def add(self, result: Result) -> None:
         self.number += 1
         time_ns = result.scan.time_ns
-        self.rate.add(time_ns)
+        self.cadence.follow(result.scan)
         shear = None if result.wrench is None else result.wrench.shear_ratio
         point = Point(self.number, time_ns, result.force_counts, result.area_mm2, result.force_n, shear)
         self._recent.append(point)

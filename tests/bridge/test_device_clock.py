@@ -8,7 +8,7 @@ from edge_samples import make_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.pipeline.cadence import Cadences
+from edge.pipeline.cadence import Cadence
 from firmware_bridge.scans.device_clock import BACK_NS, DeviceClock
 
 US, MS, S = 1_000, 1_000_000, 1_000_000_000
@@ -120,12 +120,12 @@ def test_a_device_that_begins_anew_is_still_a_clock() -> None:
 @pytest.mark.parametrize("back_ms", [-50, 0, 3, 12, 15, 20, 50, 80, 99, 3000])
 def test_a_wall_clock_that_is_set_back_costs_no_scan(back_ms: int) -> None:
     """Stamps of socketcan and of a server are of one. No scan is lost, so none may be reported missing."""
-    clock, cadences, noise = DeviceClock(US, None), Cadences(rate_hz=100.0), random.Random(back_ms)
+    clock, cadence, noise = DeviceClock(US, None), Cadence(100.0), random.Random(back_ms)
     for number in range(2_000):
         bus_us = 10_000 * number
         arrival_ns = HOST_NS + bus_us * US + noise.randint(0, 2 * MS)
         stamp_us = 1_800_000_000_000_000 + bus_us - 1_000 * back_ms * (number >= 1_000)
         device_ns = clock.host_ns(stamp_us, arrival_ns)
-        cadences.follow(replace(make_scan(number), time_ns=arrival_ns, device_ns=device_ns))
+        cadence.follow(replace(make_scan(number), time_ns=arrival_ns, device_ns=device_ns))
     assert clock.restarts == (back_ms * MS > BACK_NS + 10 * MS)
-    assert cadences.missed == 0
+    assert cadence.missed == 0

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from edge.perception.field import Field, Out
-from edge.perception.result_fields import FIELDS
+from edge.perception.result_fields import FIELDS, Field, Out
 from edge.sinks.shm import IN_MEMORY, MAPS_IN_MEMORY, MEMBERS, offsets_of
 
 DOCS = Path(__file__).parents[2] / "docs"

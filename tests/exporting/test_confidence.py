@@ -6,7 +6,7 @@ from edge_samples import make_contract
 
 from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models
-from edge.inference.intervals import Expected, doubt, expect, is_confidence
+from edge.inference.intervals import WORTH_A_TAP, doubt, expect, is_confidence
 from edge.inference.onnx_session import ModelSession
 from export.to_onnx import BINS, doubts_and_errors, fit_confidence
 from train.data.frozen_presses import load_frozen_presses
@@ -26,24 +26,30 @@ def maps(about, size=0.5):
 
 
 @pytest.mark.parametrize(
-    ("about", "share", "gain"), [(0.05, 0.2, 0.0), (0.1, 0.2, 0.0), (0.2, 0.3, 0.05), (0.3, 0.4, 0.1), (0.6, 0.8, 0.1)]
+    ("about", "share", "another"),
+    [
+        (0.05, 0.2, False),
+        (0.1, 0.2, False),
+        (0.139, 0.239, False),
+        (0.2, 0.3, True),
+        (0.3, 0.4, True),
+        (0.6, 0.8, True),
+    ],
 )
-def test_between_doubts_it_is_interpolated_and_beyond_them_the_error_grows(about, share, gain):
-    expected = expect(TABLE, 1, *maps(about))
-    assert expected.rmse == pytest.approx(0.5 * share, rel=1e-4) and expected.gain == pytest.approx(gain, abs=1e-6)
+def test_between_doubts_it_is_interpolated_and_beyond_them_the_error_grows(about, share, another):
+    rmse, worth_it = expect(TABLE, 1, *doubt(*maps(about)))
+    assert rmse == pytest.approx(0.5 * share, rel=1e-4) and worth_it is another and WORTH_A_TAP == 0.02
 
 
 def test_what_is_not_known_is_not_told():
-    assert expect(TABLE, 3, *maps(0.2)) is None and expect({}, 1, *maps(0.2)) is None
-    last = expect(TABLE, 2, *maps(0.2))
-    assert last.gain is None and last.another_tap is None
-    assert Expected(0.1, 0.02).another_tap is True and Expected(0.1, 0.019).another_tap is False
+    assert expect(TABLE, 3, 0.2, 0.5) is None and expect({}, 1, 0.2, 0.5) is None
+    assert expect(TABLE, 2, 0.2, 0.5) == (pytest.approx(0.1), None)
 
 
 def test_of_a_pattern_of_nothing_nothing_is_known():
     nothing = np.zeros((40, 40), dtype=np.float32)
     assert doubt(nothing, nothing + 1) == (np.inf, 0.0)
-    assert expect(TABLE, 1, nothing, nothing + 1) is None
+    assert expect(TABLE, 1, np.inf, 0.0) is None
 
 
 @pytest.mark.parametrize(

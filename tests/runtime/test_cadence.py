@@ -1,4 +1,4 @@
-"""Period and deadline of a sensor, sensors that fall silent, and scans that left no trace."""
+"""Period and deadline of a sensor, sensors that fall silent, scans that left no trace, and the pace of reading."""
 
 import itertools
 import random
@@ -7,7 +7,16 @@ from dataclasses import replace
 import pytest
 from edge_samples import make_scan
 
-from edge.pipeline.cadence import FEWEST_INTERVALS, LONGEST_BURST, SENSOR_SILENT_NS, SETTLING_SCANS, Cadence, Cadences
+from edge.perception.result import Result
+from edge.pipeline.cadence import (
+    FEWEST_INTERVALS,
+    LONGEST_BURST,
+    SENSOR_SILENT_NS,
+    SETTLING_SCANS,
+    Cadence,
+    Cadences,
+    Pace,
+)
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -18,6 +27,10 @@ SILENT_MS = SENSOR_SILENT_NS // MS
 def scan(number, time_ms, sensor="4", device_ms=None):
     device_ns = None if device_ms is None else device_ms * MS
     return replace(make_scan(number, sensor=sensor), time_ns=round(time_ms * MS), device_ns=device_ns)
+
+
+def follow(cadences, one, state="idle", **more):
+    return cadences.follow(Result(one, "device", "m", state, **more))
 
 
 def followed(intervals_ms, rate_hz=None):
@@ -46,10 +59,11 @@ def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
 
 
 def test_a_pattern_is_late_after_one_period_and_not_before():
-    cadences = Cadences()
-    for number in range(9):
-        cadences.follow(scan(number, 10 * number))
-        assert cadences.late("4", 10_000.001) == (number >= FEWEST_INTERVALS) and not cadences.late("4", 10_000)
+    for latency_us, late in ((10_000, 0), (10_000.001, 9 - FEWEST_INTERVALS)):
+        cadences = Cadences()
+        for number in range(9):
+            follow(cadences, scan(number, 10 * number), latency_us=latency_us)
+        assert cadences.late == late
 
 
 @pytest.mark.parametrize(
@@ -74,11 +88,11 @@ def test_a_pattern_is_late_after_one_period_and_not_before():
 def test_missed_scans_are_counted_by_gaps(scans, missed):
     cadences, last = Cadences(rate_hz=RATE_HZ), scan(*scans[-1])
     for one in scans:
-        cadences.follow(scan(*one))
+        follow(cadences, scan(*one))
     for n in range(1, SETTLING_SCANS + 2):  # only scans after a gap show what was lost
         device_ns = None if last.device_ns is None else last.device_ns + n * PERIOD_NS
         after = replace(last, number=last.number + n, time_ns=last.time_ns + n * PERIOD_NS, device_ns=device_ns)
-        cadences.follow(after)
+        follow(cadences, after)
     assert cadences.missed == missed
 
 
@@ -86,7 +100,7 @@ def missed_of(arrivals):
     """Return what is missed of scans that arrive so, each given as a scan, at the pace that they show."""
     cadences = Cadences()
     for one in arrivals:
-        cadences.follow(one)
+        follow(cadences, one)
     return cadences.missed
 
 
@@ -139,7 +153,7 @@ def test_a_silent_finger_is_told_once_and_told_back(wanted, gone, told):
     for n in range(200):
         for sensor in ("4", "6"):
             if sensor == "4" or n not in gone:
-                back = cadences.follow(scan(n, 10 * n, sensor))
+                back = follow(cadences, scan(n, 10 * n, sensor))
                 events += [] if back is None else [back]
         events += cadences.look()
     assert [(event.kind, event.time_ns // MS) for event in events] == told
@@ -152,13 +166,44 @@ def test_a_silent_finger_is_told_once_and_told_back(wanted, gone, told):
 def test_after_an_outage_its_own_sensors_are_excused():
     cadences = Cadences(rate_hz=RATE_HZ)
     for sensor in ("left/4", "left/5", "right/4", "right/6"):
-        cadences.follow(scan(0, 0, sensor))
+        follow(cadences, scan(0, 0, sensor))
     assert cadences.look() == [], "when all are silent it is not a finger"
     cadences.begin_anew(5_000 * MS, "left/")
-    cadences.follow(scan(1, 5_000, "right/4"))
+    follow(cadences, scan(1, 5_000, "right/4"))
     assert [event.sensor for event in cadences.look()] == ["right/6"]
     cadences.begin_anew(6_000 * MS)
-    cadences.follow(scan(2, 6_000, "left/4"))
+    follow(cadences, scan(2, 6_000, "left/4"))
     assert cadences.look() == []
-    cadences.follow(scan(3, 6_000 + SILENT_MS + 1, "left/4"))
+    follow(cadences, scan(3, 6_000 + SILENT_MS + 1, "left/4"))
     assert "left/5" in [event.sensor for event in cadences.look()]
+
+
+def rest(cadences, scans, state="idle", *, begin=0, period_ms=10, stamped=True):
+    for number in range(begin, begin + scans):
+        time_ms = round(number * period_ms)
+        follow(cadences, scan(number, time_ms, device_ms=time_ms if stamped else None), state)
+    cadences.look()
+    return cadences.pace
+
+
+def test_rest_is_a_second_without_contact_of_stamped_sensors():
+    cadences = Cadences(patience_s=0.1)
+    assert rest(cadences, 0) == rest(cadences, 50, "contact") == rest(cadences, 100, begin=50) == Pace()
+    assert cadences.waited_ns <= 1490 * MS
+    resting = rest(cadences, 2, begin=150)
+    assert resting == Pace(0.01, 10) and cadences.waited_ns > 1600 * MS
+    assert rest(cadences, 1, "contact", begin=152) == Pace()
+    assert 1520 * MS < cadences.waited_ns <= 1540 * MS, "what was on its way, and nothing after it"
+
+
+def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
+    for sensors, period_ms, pace in ((3, 10, Pace()), (4, 10, Pace(0.0025)), (4, 100, Pace())):
+        cadences = Cadences()
+        for number in range(9):
+            for name in range(sensors):
+                follow(cadences, scan(number, number * period_ms, f"{name}"), "contact")
+        cadences.look()
+        assert cadences.pace == pace
+    assert rest(Cadences(patience_s=0.1), 200, stamped=False) == Pace()
+    assert rest(Cadences(patience_s=0.1), 1000, period_ms=2) == Pace()
+    assert rest(Cadences(patience_s=0.1), 0) == Pace()

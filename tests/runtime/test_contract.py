@@ -3,6 +3,7 @@
 import json
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 from edge_samples import make_contract, make_pad_contract
 from pose_samples import make_posed_contract
@@ -73,6 +74,13 @@ def test_a_constant_without_an_interval_is_exact():
     contract = make_pad_contract(pad_inputs=(("poisson", 0.45, 0.02),), takes_gains=False)
     assert contract.pad_row(None).tolist() == [0, 0]
     assert contract.pad_row(Pad(poisson=0.46)).tolist() == pytest.approx([0.5, 1])
+
+
+def test_counts_become_units_of_the_network_over_the_gains():
+    contract = make_contract(counts_per_unit=(100.0, 200.0, 400.0))
+    window, gains = np.full((2, 3, 4, 4), 400, dtype=np.float32), np.full((3, 4, 4), 2, dtype=np.float32)
+    for scaled, expected in ((contract.scale_window(window), 4), (contract.scale_window(window, gains), 2)):
+        assert scaled.dtype == np.float32 and (scaled == np.array([1, 0.5, 0.25])[:, None, None] * expected).all()
 
 
 @pytest.mark.parametrize("key", [one.name for one in fields(Contract)])

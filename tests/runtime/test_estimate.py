@@ -15,8 +15,7 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, TAXELS, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.dead_taxel_fill import WIDENING, TaxelEstimator, load_estimator
-from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS
+from edge.perception.taxel_health import BACK_SCANS, FROZEN_SCANS, HOLD_SCANS, WIDENING, TaxelEstimator, load_estimator
 from firmware_bridge.scans.scan import ScanSeries
 
 GRID = (4, 4)

@@ -13,9 +13,16 @@ from edge.api import USPA44, EdgeError, SensorFileError, Source, Stream
 from edge.cli import main as cli
 from edge.inference.bundled import CONTACTS
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.gain_following import CONTRADICTED_CONTACTS, HELD_SCANS, Learn, SensorPad
-from edge.perception.gain_learning import BOUND, ContactModel, GainLearner, load_contact_model
-from edge.perception.pattern_check import PatternCheck
+from edge.perception.gain_learning import (
+    BOUND,
+    CONTRADICTED_CONTACTS,
+    HELD_SCANS,
+    ContactModel,
+    GainLearner,
+    Learn,
+    load_contact_model,
+)
+from edge.perception.pattern_check import PatternCheck, SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ScanSeries
@@ -145,7 +152,7 @@ class TestLearner:
 def learning_of(measured, used=None, check=None):
     """Return the stage of a sensor that learns, the pad in use, and the events that it reports."""
     pad, events = SensorPad(make_pad_contract(), used or measured, None, check), []
-    return Learn(MODEL, measured, used, pad, check, lambda kind, detail="": events.append((kind, detail))), pad, events
+    return Learn(MODEL, measured, pad, lambda kind, detail="": events.append((kind, detail))), pad, events
 
 
 def held(learn, contact, trusted=None):

@@ -22,7 +22,7 @@ UNUSED_IN_A_REPLAY = {
     *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
     *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),
 }
-MOST_MODULES = 130
+MOST_MODULES = 104
 """Modules of ours that a run loads: each is work for a reader, and for a start."""
 
 

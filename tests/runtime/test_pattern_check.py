@@ -37,8 +37,7 @@ def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> Verdict:
     window = np.zeros((4, *tap.shape), dtype=np.float32)
     window[0] = tap
     pattern = np.float32(factor) * model.run(window, PAD_ROW)
-    deviation = np.full_like(pattern, doubt * np.sqrt(np.mean(pattern**2)))
-    return check.judge(number, tap, pattern, deviation, model.traction, repeats)
+    return check.judge(number, tap, pattern, doubt, model.traction, repeats)
 
 
 LEAST = LEAST_COUNTS / CONTRACT.counts_per_unit[2]
@@ -103,12 +102,12 @@ class TestReasons:
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_what_is_not_finite_is_never_believed(self, bad):
         tap, pattern, traction = make_tap(), np.ones((40, 40), dtype=np.float32), np.zeros((3, 8, 8), dtype=np.float32)
-        deviation = 0.1 * pattern
-        for place in (tap, pattern, deviation, traction):
+        about = np.array([0.1])
+        for place in (tap, pattern, about, traction):
             kept = place.flat[-1]
             place.flat[-1] = bad
             with np.errstate(all="ignore"):
-                verdict = make_check().judge(0, tap, pattern, deviation, traction, 0)
+                verdict = make_check().judge(0, tap, pattern, float(about[0]), traction, 0)
             assert verdict.trusted is not True and (place is not tap or verdict.reason == "unfamiliar")
             place.flat[-1] = kept
 

@@ -39,19 +39,12 @@ def test_runs_what_the_graph_says_newest_tap_first(tmp_path, taps):
     np.testing.assert_array_equal(session.run(np.asfortranarray(window)), kept)
 
 
-def test_outputs_are_read_only_arrays_bound_once(tmp_path):
+def test_outputs_are_those_of_their_own_run(tmp_path):
     session = ModelSession(write_model(tmp_path / "sure.onnx", SURE))
-    first = session.run(random_window(1))
-    kept, deviation = first.copy(), session.deviation
-    for seed in (1, 2):
-        second, expected = session.run(random_window(seed)), tiny_pattern(random_window(seed))
-        np.testing.assert_allclose(second, expected, atol=1e-6)
-        np.testing.assert_allclose(session.deviation, tiny_deviation(expected), atol=1e-6)
-    assert np.shares_memory(deviation, session.deviation)
-    assert np.shares_memory(first, second) and not np.array_equal(kept, second)
-    for array in (first, deviation):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0, 0] = 1
+    made = [(seed, session.run(random_window(seed)), session.deviation) for seed in (1, 2)]
+    for seed, pattern, deviation in made:
+        np.testing.assert_allclose(pattern, tiny_pattern(random_window(seed)), atol=1e-6)
+        np.testing.assert_allclose(deviation, tiny_deviation(pattern), atol=1e-6)
 
 
 @pytest.mark.parametrize("batch", [1, ANY_BATCH])

@@ -5,7 +5,6 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from edge_samples import REST, FakeLink, ListSink, make_scan
 from runtime_samples import presses, pumped
 
 from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
-from edge.pipeline.cadence import Pace, PaceSetter
+from edge.pipeline.cadence import Pace
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.reconnecting import LastingLink
@@ -166,39 +165,6 @@ class TestScripts:
         with Source(away, LastingLink(FakeLink([], endless=True), None, name="right")) as source:
             take_all(source, lambda taken: any(isinstance(one, Notice) for one in taken))
         assert not set(threading.enumerate()) - before
-
-
-def followed(setter, scans, state="idle", *, stamped=True, begin=0):
-    for number in range(begin, begin + scans):
-        scan = make_scan(number)
-        setter.follow(SimpleNamespace(state=state, scan=replace(scan, device_ns=scan.time_ns if stamped else None)))
-
-
-def test_rest_is_a_second_without_contact_of_stamped_sensors():
-    setter = PaceSetter(0.1)
-    assert setter.choose(1, 0.01) == Pace()
-    followed(setter, 50, "contact")
-    assert setter.choose(1, 0.01) == Pace()
-    followed(setter, 100, begin=50)
-    assert setter.choose(1, 0.01) == Pace() and not setter.waited(make_scan(149))
-    followed(setter, 2, begin=150)
-    rest = setter.choose(1, 0.01)
-    assert rest == Pace(0.01, 10) and setter.waited(make_scan(160))
-    assert setter.choose(1, 0.0105) is rest, "a measured period jitters"
-    followed(setter, 1, "contact", begin=152)
-    assert setter.choose(1, 0.01) == Pace()
-    assert setter.waited(make_scan(152)), "it was still on its way"
-    assert not setter.waited(make_scan(154))
-
-
-def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
-    setter = PaceSetter(0.0)
-    paces = [setter.choose(*of) for of in ((3, 0.01), (4, 0.01), (4, 0.1))]
-    assert paces == [Pace(), Pace(0.0025), Pace()]
-    for period_s, stamped in ((0.01, False), (0.002, True), (float("inf"), True)):
-        setter = PaceSetter(0.1)
-        followed(setter, 200, stamped=stamped)
-        assert setter.choose(1, period_s) == Pace()
 
 
 def recording(scans, pressed):

@@ -20,9 +20,15 @@ def frame(z_counts: float, mark: float = 0.0) -> np.ndarray:
     return deformation
 
 
+def push(tracker, *scan, **how):
+    """Return the tracker after a scan."""
+    tracker.push(*scan, **how)
+    return tracker
+
+
 def play(tracker, z_counts, start_ns=0, step_ns=S // 100):
-    """Return contact, taps used and the number of the tap after each scan; the state's window is the tracker's own."""
-    states = [tracker.push(frame(z), start_ns + i * step_ns) for i, z in enumerate(z_counts)]
+    """Return contact, taps used and the number of the tap after each scan."""
+    states = (push(tracker, frame(z), start_ns + i * step_ns) for i, z in enumerate(z_counts))
     return [(state.contact, state.taps_used, state.tap) for state in states]
 
 
@@ -49,10 +55,10 @@ def test_the_window_is_the_current_frame_then_peaks():
     for mark, peak in enumerate([3000, 4000, 5000], start=1):
         for z, m in ((2000, 0), (peak, mark), (peak, 7), (2500, 0)):  # an equal frame later is no new peak
             tracker.push(frame(z, m), mark)
-        released = tracker.push(frame(0), mark)
+        released = push(tracker, frame(0), mark)
         assert not released.window[0].any() and released.taps_used == 0
     mine = frame(2222, 9)
-    state = tracker.push(mine, 10)
+    state = push(tracker, mine, 10)
     mine[...] = 0  # it was copied
     assert state.contact and state.taps_used == 3
     assert state.window.shape == (3, 3, 4, 4) and state.window.dtype == np.float32
@@ -65,7 +71,7 @@ def test_the_window_is_the_current_frame_then_peaks():
 def test_a_peak_starts_anew_and_absent_taps_are_zeros():
     tracker = TapTracker(4)
     play(tracker, [9000, 9000, 0, 2000, 2100, 0])
-    state = tracker.push(frame(100, 5), S)
+    state = push(tracker, frame(100, 5), S)
     assert state.window[:, 2].sum(axis=(1, 2)) == pytest.approx([0, 2100, 9000, 0])
     assert not state.window[0].any() and not state.window[3].any()
     assert [(peak.tap, peak.time_ns) for peak in state.peaks] == [(1, 4 * S // 100), (0, 0)]
@@ -84,9 +90,9 @@ def test_a_peak_starts_anew_and_absent_taps_are_zeros():
 def test_earlier_taps_are_forgotten_after_an_idle_time(first, then_ns, used):
     tracker = TapTracker(4, RuntimeOptions(idle_reset_s=5.0))
     play(tracker, first)
-    assert tracker.push(frame(2000), int(then_ns)).taps_used == used
+    assert push(tracker, frame(2000), int(then_ns)).taps_used == used
     play(tracker, [2000, 0], 200 * S)
-    assert not tracker.push(frame(0), 206 * S).window.any(), "in the window, too"
+    assert not push(tracker, frame(0), 206 * S).window.any(), "in the window, too"
 
 
 def test_time_running_backwards_counts_as_no_time():
@@ -94,17 +100,17 @@ def test_time_running_backwards_counts_as_no_time():
         tracker = TapTracker(2, RuntimeOptions(idle_reset_s=5.0))
         play(tracker, [2000, 2000, 0], start_ns=100 * S)
         tracker.push(frame(0), 1 * S)
-        assert tracker.push(frame(2000), then_s * S).taps_used == used
+        assert push(tracker, frame(2000), then_s * S).taps_used == used
 
 
 def test_after_a_reset_a_tap_in_progress_is_the_first():
     tracker = TapTracker(4)
     play(tracker, [2000, 2000, 0, 9000, 9000])
     tracker.reset()
-    state = tracker.push(frame(1000), S)  # between the thresholds: the tap goes on
+    state = push(tracker, frame(1000), S)  # between the thresholds: the tap goes on
     assert state.contact and (state.taps_used, state.tap) == (1, 2)
     tracker.push(frame(1100), S)
-    state = tracker.push(frame(0), S)
+    state = push(tracker, frame(0), S)
     assert state.window[1, 2].sum() == pytest.approx(1100)  # not the peak from before the reset
     assert not state.window[2:].any() and state.tap == 2
     tracker.reset()
@@ -115,14 +121,14 @@ def test_reset_just_before_the_release_leaves_no_tap():
     tracker = TapTracker(2)
     play(tracker, [9000, 9000])
     tracker.reset()
-    assert not tracker.push(frame(0), S).window.any()
+    assert not push(tracker, frame(0), S).window.any()
 
 
 def test_a_scan_in_doubt_is_no_contact_and_ends_one():
     tracker = TapTracker(2)
-    assert not tracker.push(frame(9000), 0, doubted=True).contact
+    assert not push(tracker, frame(9000), 0, doubted=True).contact
     assert [contact for contact, *_ in play(tracker, [2000, 2000])] == [True, True]
-    state = tracker.push(frame(9000), S, doubted=True)
+    state = push(tracker, frame(9000), S, doubted=True)
     assert not state.contact and state.window[1, 2].sum() == 2000
 
 
@@ -130,7 +136,7 @@ def test_taps_that_are_dropped_leave_the_others_in_their_order():
     tracker = TapTracker(4)
     play(tracker, [2000, 2000, 0, 3000, 3000, 0, 4000, 4000, 0])
     tracker.forget({2})
-    state = tracker.push(frame(2500), S)
+    state = push(tracker, frame(2500), S)
     assert state.taps_used == 3 and state.window[:, 2].sum(axis=(1, 2)).tolist() == [2500, 4000, 2000, 0]
     assert [peak.tap for peak in state.peaks] == [2, 0]
 
@@ -172,7 +178,7 @@ def test_any_sequence_keeps_the_invariants(taps, sequence):
             continue
         z, time_ns = event
         deformation = frame(z)
-        state = tracker.push(deformation, time_ns)
+        state = push(tracker, deformation, time_ns)
         z = float(deformation[2].sum())
         contact = z >= (750 if contact else 1500)
         assert state.contact == contact

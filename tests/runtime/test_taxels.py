@@ -10,9 +10,19 @@ from edge_samples import BASELINE, PERIOD_NS, REST, make_scan
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import USPA44, Baseline, demo_recording
+from edge.inference.bundled import TAXELS
 from edge.perception import taxel_health as health
 from edge.perception.event import joined
-from edge.perception.taxel_health import BACK_SCANS, FAR_SCANS, HOLD_SCANS, STUCK_SCANS, TAXEL_SILENT_SCANS, TaxelWatch
+from edge.perception.result import Origin, Step
+from edge.perception.taxel_health import (
+    BACK_SCANS,
+    FAR_SCANS,
+    HOLD_SCANS,
+    STUCK_SCANS,
+    TAXEL_SILENT_SCANS,
+    Health,
+    load_estimator,
+)
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT, ScanSeries
 from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS
@@ -21,11 +31,19 @@ SPHERE_SHARE = 0.030
 """Reading of the largest neighbour as a share of the taxel under a sphere of 1.5 mm, simulated."""
 
 
+def followed(watch, scan, baseline):
+    """Return the step of a scan after the stage."""
+    step = Step(scan, Origin("device", "m", "mm"))
+    watch(step, baseline)
+    watch.fill(step)
+    return step
+
+
 class Pad:
     """A watched pad with noise; `faults` change a scan's counts (3, 16) in place."""
 
     def __init__(self, baseline=BASELINE, seed=0, noise_counts=2.0):
-        self.watch = TaxelWatch((4, 4))
+        self.watch = Health((4, 4), estimator=load_estimator(TAXELS, (4, 4)))
         self._baseline = baseline
         self._series = ScanSeries("4", USPA44)
         self._rng = np.random.default_rng(seed)
@@ -40,12 +58,13 @@ class Pad:
             for fault in faults:
                 fault(counts.reshape(3, 16))
             self._number += 1
-            self.watch.push(self._series.close(counts, self._number * PERIOD_NS), self._baseline)
+            self.step = followed(self.watch, self._series.close(counts, self._number * PERIOD_NS), self._baseline)
             told.append(dict(self.watch.reasons))
         return told
 
-    def note(self, filled=None):
-        return joined(self.watch.notes(filled)) or ""
+    @property
+    def note(self):
+        return joined(self.step.notes) or ""
 
 
 def at(taxel, *readings):
@@ -107,8 +126,8 @@ class TestWatch:
         pad = Pad(noise_counts=0)
         assert not any(pad.read(health.FROZEN_SENSOR_SCANS))
         assert pad.read(1) == [dict.fromkeys(range(16), "stuck")]
-        assert not pad.watch.may_be_estimated
-        assert pad.note() == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
+        assert pad.step.readings is None
+        assert pad.note == "no pattern, the sensor is frozen: its last 10 scans are alike bit for bit"
 
     @pytest.mark.parametrize(
         ("stuck", "after"), [(1, STUCK_SCANS), (8, STUCK_SCANS), (12, STUCK_SCANS), (13, health.FROZEN_SCANS)]
@@ -119,7 +138,7 @@ class TestWatch:
         told = pad.read(after + 5, *(at(taxel, *STUCK) for taxel in range(stuck)))
         # A living taxel repeats itself now and then, and with few of them a scan then shows nothing.
         assert not any(told[:after]) and told[-1] == dict.fromkeys(range(stuck), "stuck")
-        assert pad.watch.may_be_estimated == (stuck <= 8)
+        assert (pad.step.filled == "neighbours") == (stuck <= 8)
 
     def test_the_dead_do_not_count_among_those_that_should_be_new(self):
         pad = Pad()
@@ -144,8 +163,8 @@ class TestWatch:
     def test_a_taxel_without_reading_or_rest_is_never_believed(self):
         pad = Pad()
         pad.read(1, silent(2))
-        assert pad.watch.waiting
-        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and not pad.watch.waiting
+        assert pad.step.readings is None and not pad.step.dead
+        assert pad.read(HOLD_SCANS, silent(2))[-1] == {2: "silent"} and pad.step.filled == "neighbours"
         counts = BASELINE.counts.copy()
         counts[:, 1, 2] = np.nan
         assert Pad(Baseline.of("4", counts, 0.0, 100, "start-up")).read(50)[-1] == {6: "unzeroed"}
@@ -166,22 +185,22 @@ class TestWatch:
     @pytest.mark.parametrize("torn_before", [False, True])
     def test_a_reading_from_before_a_pause_is_not_held(self, pause_ns, held, torn_before):
         """Five scans are 50 ms at 100 Hz, but whole ones may have vanished: before was another press."""
-        watch, series = TaxelWatch((4, 4)), ScanSeries("4", USPA44)
+        watch, series = Health((4, 4)), ScanSeries("4", USPA44)
         for number, (time_ns, taxel) in enumerate(
             [(0, None), (PERIOD_NS, 0 if torn_before else None), (2 * PERIOD_NS, None), (2 * PERIOD_NS + pause_ns, 7)]
         ):
             counts = REST + number
             if taxel is not None:
                 counts.reshape(3, 16)[:, taxel] = ABSENT
-            watch.push(series.close(counts, time_ns), BASELINE)
+            followed(watch, series.close(counts, time_ns), BASELINE)
         assert watch.reasons == ({} if held else {7: "silent"})
 
 
 def raised(counts, baseline):
     """Reasons over the scans of one recording."""
-    watch, series, found = TaxelWatch((4, 4)), ScanSeries("4", USPA44), []
+    watch, series, found = Health((4, 4)), ScanSeries("4", USPA44), []
     for number, row in enumerate(counts):
-        watch.push(series.close(row.astype(np.int32), number * PERIOD_NS), baseline)
+        followed(watch, series.close(row.astype(np.int32), number * PERIOD_NS), baseline)
         found.append(dict(watch.reasons))
     return [reasons for reasons in found if reasons]
 

@@ -12,8 +12,8 @@ from scipy.ndimage import binary_fill_holes
 from edge.inference.bundled import TAXELS
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.dead_taxel_fill import load_estimator
 from edge.perception.runtime import Runtime
+from edge.perception.taxel_health import load_estimator
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.formats import load_recording

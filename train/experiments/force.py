@@ -170,9 +170,11 @@ def contact(scans: Scans, course: Course) -> NDArray[np.bool_]:
     """Return the scans (n,) in which the runtime detects a contact."""
     tracker = TapTracker(taps=1)
     times_ns = np.rint(course.time_s * 1e9).astype(np.int64)
-    return np.array(
-        [tracker.push(scan, int(now_ns)).contact for scan, now_ns in zip(scans.windows[:, 0], times_ns, strict=True)]
-    )
+    touched: list[bool] = []
+    for scan, now_ns in zip(scans.windows[:, 0], times_ns, strict=True):
+        tracker.push(scan, int(now_ns))
+        touched.append(tracker.contact)
+    return np.array(touched)
 
 
 def course_errors(

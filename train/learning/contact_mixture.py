@@ -192,7 +192,7 @@ def learned(counts: NDArray[np.floating], model: ContactModel, passes: int = 3) 
     learner = GainLearner(model)
     for number in range(passes):
         if number:
-            learner = learner.again()
+            learner = GainLearner(model, look_from=learner)
         for contact in counts:
             learner.learn(contact)
         learner.solve()
