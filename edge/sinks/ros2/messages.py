@@ -47,6 +47,10 @@ _TYPE_FIELDS: Final = {
     "geometry_msgs/TransformStamped": "std_msgs/Header header, string child_frame_id, "
     "geometry_msgs/Transform transform",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "diagnostic_msgs/KeyValue": "string key, string value",
+    "diagnostic_msgs/DiagnosticStatus": "byte level, string name, string message, string hardware_id, "
+    "diagnostic_msgs/KeyValue[] values",
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header, diagnostic_msgs/DiagnosticStatus[] status",
 }
 """Fields of each type, each after the types in it."""
 
@@ -74,6 +78,7 @@ POSE_STAMPED: Final = TYPES["geometry_msgs/PoseStamped"]
 POSE_WITH_COVARIANCE_STAMPED: Final = TYPES["geometry_msgs/PoseWithCovarianceStamped"]
 TRANSFORM_STAMPED: Final = TYPES["geometry_msgs/TransformStamped"]
 TF_MESSAGE: Final = TYPES["tf2_msgs/TFMessage"]
+DIAGNOSTIC_ARRAY: Final = TYPES["diagnostic_msgs/DiagnosticArray"]
 
 
 def header(frame: str, unix_ns: int) -> dict[str, Any]:
