@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
+import trimesh
 from numpy.typing import NDArray
 
 from firmware_bridge.recording.csv_reader import CSV_HEADER, CSV_POSES
@@ -25,18 +27,38 @@ from train.physics.gripped import FINE_SCALE, SAMPLES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import INPUTS, RANGES, constants, draw_pad
 from train.physics.resample import resample, resample_touching
 from train.surfaces.depth_image import Pose, Relief, depth_image
-from train.surfaces.named_surfaces import LETTERS, SHAPES, grid_places_mm, plate_mesh
+from train.surfaces.named_surfaces import FIGURE_HEIGHT_MM, LETTERS, SHAPES, figure
 from train.surfaces.poses import random_poses
 
 PLACES_MM = (-2.5, 0.0, 2.5)
 TURNS_DEG = (0.0, 30.0, 60.0, 90.0)
 FREE, RISE, HOLD, FALL = 20, 24, 4, 8  # scans of each tap
 FORCE_N = 8.0
-MISPLACED = np.array([0.2, -0.15, 0.3])  # of the plate in the robot's frame: x, y in [mm], turn in [deg]
+MISPLACED = np.array([0.3, -0.2, 0.3])  # of the plate in the frame of the poses: x, y in [mm], turn in [deg]
 JITTER = np.array([0.05, 0.05, 0.2])  # of each pose
 SIGNATURE = (0.04, 0.04, 0.085)  # of each channel over the mean z, as on two real sensors
 KNOWN_TO = 0.1  # share of its range within which each constant of the pad is known
 PLATES = {"letters": LETTERS, "shapes": SHAPES}
+GRID_MM = 30.0  # distance of a printed plate's figures: a turned pad on one of them does not reach the next
+PRINTED_MM = 4.0  # thickness of a printed plate, which must not bend
+
+
+def grid_places_mm() -> list[tuple[float, float]]:
+    """Return the middles of a plate's nine figures in [mm], row by row from the top left; y goes up."""
+    return [(column * GRID_MM, -row * GRID_MM) for row in (-1, 0, 1) for column in (-1, 0, 1)]
+
+
+def plate_mesh(names: Sequence[str]) -> trimesh.Trimesh:
+    """Return a plate to print with nine figures; those of the paper lie in examples/plates."""
+    plate = trimesh.creation.box([3 * GRID_MM, 3 * GRID_MM, PRINTED_MM])
+    plate.apply_translation([0, 0, -FIGURE_HEIGHT_MM - PRINTED_MM / 2])
+    bodies, height_mm = [plate], FIGURE_HEIGHT_MM + PRINTED_MM / 2
+    for name, place_mm in zip(names, grid_places_mm(), strict=False):
+        # Sunk into the plate, so that a slicer makes one body of all.
+        down = trimesh.transformations.translation_matrix([*place_mm, -height_mm])
+        islands = shapely.get_parts(figure(name))
+        bodies += [trimesh.creation.extrude_polygon(island, height_mm, transform=down) for island in islands]
+    return trimesh.util.concatenate(bodies)
 
 
 @dataclass

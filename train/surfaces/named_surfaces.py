@@ -9,7 +9,6 @@ slits and slivers finer than half a millimetre, is left out.
 Source: Wu and Liu 2024, Fig. 1c (two plates of nine surfaces).
 """
 
-from collections.abc import Sequence
 from functools import lru_cache
 from math import cos, pi, radians, sin
 from typing import Final, Literal, cast
@@ -27,8 +26,6 @@ from train.surfaces.meshes import MESH, load_mesh, mesh_file
 PLATE_MM: Final = 20.0
 FIGURE_HEIGHT_MM: Final = 2.0
 _PLATE_THICKNESS_MM: Final = 1.0
-GRID_MM: Final = 30.0  # distance of a printed plate's figures: a turned pad on one of them does not reach the next
-_PRINTED_MM: Final = 4.0  # thickness of a printed plate, which must not bend
 _W, _H = 4.0, 6.0  # half the width and height of a letter, between stroke centres
 GLYPH_REACH_MM: Final = 8.0  # largest distance of a glyph's points from the plate's centre along x and y
 POLYGON_REACH_MM: Final = 9.5
@@ -77,28 +74,6 @@ def surface_mesh(name: str) -> trimesh.Trimesh:
     plate = trimesh.creation.box([PLATE_MM, PLATE_MM, _PLATE_THICKNESS_MM])
     plate.apply_translation([0, 0, -FIGURE_HEIGHT_MM - _PLATE_THICKNESS_MM / 2])
     return cast(trimesh.Trimesh, trimesh.util.concatenate([*raised, plate]))
-
-
-def plate_mesh(names: Sequence[str]) -> trimesh.Trimesh:
-    """Return one printable plate with up to nine figures in three rows, GRID_MM apart, its middle at x = y = 0."""
-    half_mm = 1.5 * GRID_MM
-    plate = trimesh.creation.box([2 * half_mm, 2 * half_mm, _PRINTED_MM])
-    plate.apply_translation([0, 0, -FIGURE_HEIGHT_MM - _PRINTED_MM / 2])
-    bodies = [plate]
-    for name, (x_mm, y_mm) in zip(names, grid_places_mm(), strict=False):
-        # Sunk into the plate, so that a slicer makes one body of all.
-        down = trimesh.transformations.translation_matrix([x_mm, y_mm, -FIGURE_HEIGHT_MM - _PRINTED_MM / 2])
-        height_mm = FIGURE_HEIGHT_MM + _PRINTED_MM / 2
-        bodies += [
-            trimesh.creation.extrude_polygon(island, height_mm, transform=down)
-            for island in shapely.get_parts(figure(name))
-        ]
-    return cast(trimesh.Trimesh, trimesh.util.concatenate(bodies))
-
-
-def grid_places_mm() -> Points:
-    """Return the middles of a plate's nine figures in [mm], row by row from the top left; y goes up."""
-    return [(column * GRID_MM, -row * GRID_MM) for row in (-1, 0, 1) for column in (-1, 0, 1)]
 
 
 @lru_cache(maxsize=64)
