@@ -43,15 +43,15 @@ from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.press_batches import OneSensor
-from train.data.presses import SEED, PressSet, load_presses
+from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, recorded_grips
+from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.experiments.sensor.real import has_hole, play
 from train.families.catalogue import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.physics.gripped import SCALE
 from train.physics.pad_draws import INPUTS, KNOWN, RANGES
 from train.report import bootstrap_interval
 from train.surfaces.meshes import mesh_name
@@ -179,24 +179,6 @@ class Comparison(NamedTuple):
     objection: str | None  # why it is not handed over
 
 
-def own_taps(path: Path, knowledge: Knowledge) -> dict[str, PressSet]:
-    """Return the sensor's taps by part (training, validation, test), divided by its gains as in the runtime.
-
-    DatasetError if it is no file of train.taps, or one of another sensor or scale.
-    """
-    taps = load_presses(path)
-    if "split" not in taps.config:
-        raise DatasetError(f"{path} has no poses that are held out: make it with python -m train.taps")
-    if taps.config["sensor"] != knowledge.name:
-        raise DatasetError(f"{path} has taps of sensor {taps.config['sensor']}, expected {knowledge.name}")
-    if taps.scale != SCALE:
-        raise DatasetError(f"{path} has patterns at x{taps.scale}, expected x{SCALE}: make it with --scale {SCALE}")
-    if knowledge.pad.gains is not None:
-        gains = np.reshape(knowledge.pad.gains, taps.counts.shape[2:])
-        taps = replace(taps, counts=(taps.counts / gains).astype(np.float32))
-    return {part: taps.pick(np.isin(taps.pad, numbers)) for part, numbers in taps.config["split"].items()}
-
-
 def compared(
     own: ModelSession,
     knowledge: Knowledge,
@@ -301,7 +283,7 @@ def _train(options: argparse.Namespace) -> int:
     grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
     if not grips and options.recordings is not None:
         raise DatasetError(f"{options.recordings} has no recording xela_{knowledge.name}.csv of this sensor")
-    taps = {} if options.taps is None else own_taps(options.taps, knowledge)
+    taps = {} if options.taps is None else load_tap_parts(options.taps, knowledge.name, knowledge.pad)
     beside = [ModelSession(path) for path in options.beside]
     if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
         raise DatasetError(

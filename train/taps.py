@@ -19,7 +19,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -54,7 +54,8 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
     The number of a frame's pad is that of its tap, and the split into training, validation and test is by place.
     """
     # What is not known of the sensor lies in the middle of its range.
-    gripped = GrippedPad(Pad(**{name: sum(ends) / 2 for name, ends in knowledge.ranges.items()}))
+    middle: dict[str, Any] = {name: sum(ends) / 2 for name, ends in knowledge.ranges.items()}
+    gripped = GrippedPad(Pad(**middle))
     gains = np.reshape(knowledge.pad.gains or np.ones(USPA44.scan_shape), USPA44.scan_shape)
     parts: list[PressSet] = []
     places: list[tuple[object, ...]] = []
@@ -82,9 +83,7 @@ def tapped(paths: Sequence[Path], surfaces: Sequence[Surface], knowledge: Knowle
     made = join_presses(parts)
     numbers = {place: number for number, place in enumerate(dict.fromkeys(places))}
     if len(numbers) < FEWEST:
-        raise DatasetError(
-            f"taps at {len(numbers)} places, expected at least {FEWEST}; the page on own models says how"
-        )
+        raise DatasetError(f"taps at {len(numbers)} places, expected at least {FEWEST}; see the page on own models")
     ninth = (np.random.default_rng(SEED).permutation(len(numbers)) % 9)[[numbers[place] for place in places]]
     split = {"training": ninth > 1, "validation": ninth == 1, "test": ninth == 0}
     numbered = {name: np.flatnonzero(part).tolist() for name, part in split.items()}

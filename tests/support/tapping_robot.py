@@ -63,7 +63,7 @@ def plate_mesh(names: Sequence[str]) -> trimesh.Trimesh:
 
 @dataclass
 class Tapped:
-    """What only an emulation knows of the taps of a recording, in their order."""
+    """Truth of the taps of a recording, in their order, which only an emulation has."""
 
     indentation_mm: NDArray[np.float32]  # (n,) at full force
     unit_patterns: NDArray[np.float32]  # (n, H, W) at FINE_SCALE, deformation per indentation

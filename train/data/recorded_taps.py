@@ -12,7 +12,7 @@ import io
 import pickle
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,11 +25,13 @@ from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import GAP_NS, PoseTrack
 from firmware_bridge.recording.csv_reader import CSV_POSES
 from firmware_bridge.recording.formats import load_recording
+from firmware_bridge.scans.pad_constants import Pad as SensorPad
 from firmware_bridge.sensor_file.model import SensorEntry
 from firmware_bridge.zeroing.baseline import deformation
 from firmware_bridge.zeroing.free_stretch import free_stretch
+from train.data.presses import PressSet, load_presses
 from train.errors import DatasetError
-from train.physics.gripped import FRAMES
+from train.physics.gripped import FRAMES, SCALE
 from train.surfaces.depth_image import Pose
 from train.surfaces.poses import over_surface
 
@@ -61,7 +63,7 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
         raise DatasetError(f"{path} has the sensors {', '.join(tracks)}, none of them {sensor}")
     if not recording.poses:
         raise DatasetError(
-            f"{path} has no poses: record with edge-sr --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
+            f"{path} has no poses: record with --poses, or add columns {', '.join(CSV_POSES)} to the CSV"
         )
     raw = entry.mounting.place_counts(track.counts) if path.suffix.lower() == ".csv" else track.counts
     rest = free_stretch(raw).baseline(track.sensor, np.nan)
@@ -83,6 +85,23 @@ def recorded_taps(path: Path, entry: SensorEntry, sensor: str) -> list[RecordedT
     return taps
 
 
+def load_tap_parts(path: Path, sensor: str, pad: SensorPad) -> dict[str, PressSet]:
+    """Return a sensor's taps by part (training, validation, test), divided by its gains as in the runtime.
+
+    DatasetError if it is no file of train.taps, or one of another sensor or scale.
+    """
+    taps = load_presses(path)
+    if "split" not in taps.config:
+        raise DatasetError(f"{path} has no poses that are held out: make it with python -m train.taps")
+    if taps.config["sensor"] != sensor:
+        raise DatasetError(f"{path} has taps of sensor {taps.config['sensor']}, expected {sensor}")
+    if taps.scale != SCALE:
+        raise DatasetError(f"{path} has patterns at x{taps.scale}, expected x{SCALE}: make it with --scale {SCALE}")
+    if pad.gains is not None:
+        taps = replace(taps, counts=(taps.counts / np.reshape(pad.gains, taps.counts.shape[2:])).astype(np.float32))
+    return {part: taps.pick(np.isin(taps.pad, numbers)) for part, numbers in taps.config["split"].items()}
+
+
 def _cut(counts: NDArray[np.float32]) -> Iterator[tuple[NDArray[np.float32], int]]:
     """Yield each tap of zeroed scans (n, 3, rows, cols): its frames up to full force, and the number of that scan."""
     z, begin = counts[:, 2].sum(axis=(1, 2)), 0
@@ -101,14 +120,14 @@ def _cut(counts: NDArray[np.float32]) -> Iterator[tuple[NDArray[np.float32], int
         begin = end
 
 
-def _rise(counts: NDArray[np.float32]) -> NDArray[np.float32]:
+def _rise(counts: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return up to FRAMES of the scans of a rising press, at even steps of their summed z."""
     z = np.maximum.accumulate(counts[:, 2].sum(axis=(1, 2)))
     return counts[np.unique(np.searchsorted(z, z[-1] * np.linspace(1 / FRAMES, 1, FRAMES)))].astype(np.float32)
 
 
 class _Number:
-    """What a pickle says of the numbers of an array; numpy's own dtype would believe any state, and memory with it."""
+    """Kind of an array's numbers by a pickle, in place of numpy's dtype, whose forged state would corrupt memory."""
 
     def __init__(self, kind: str, *_: object) -> None:
         self._kind, self._order = kind, "="
@@ -126,7 +145,7 @@ class _Number:
 
 
 class _Array:
-    """An array as a pickle restores it; `plain` is it, or a list where it is one of objects."""
+    """Array by a pickle; `plain` is it, or a list where it is one of objects."""
 
     def __init__(self, *_: object) -> None:
         self.plain: Any = []

@@ -19,6 +19,7 @@ from train import own, taps
 from train.data import recorded_taps, tapped_surface
 from train.data.press_batches import OneSensor, PressBatches, with_own_taps
 from train.data.presses import load_presses
+from train.data.recorded_taps import load_tap_parts
 from train.data.tapped_surface import image_surface, surface_of
 from train.errors import DatasetError
 from train.networks.compact import HeteroscedasticError
@@ -105,7 +106,7 @@ def elsewhere(folder):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (without_poses, "has no poses: record with edge-sr --poses, or add columns pose_x_mm"),
+        (without_poses, "has no poses: record with --poses, or add columns pose_x_mm"),
         (of_another_frame, "the readings do not fit what lies under the poses: likeness 0."),
         (elsewhere, "the pad never touches the surface at a pose"),
         (
@@ -260,7 +261,7 @@ def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
     folder, _ = tapped
     assert taps.main(arguments(folder)) == 0
     found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
-    parts = own.own_taps(folder / "taps.npz", found)
+    parts = load_tap_parts(folder / "taps.npz", "4", found.pad)
     assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     bundled = ModelSession(find_model("stsr-int8"))
@@ -275,8 +276,27 @@ def test_taps_of_another_sensor_or_of_none_are_refused(tapped, tmp_path):
     found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
     make_press_set().save(tmp_path / "presses.npz")
     with pytest.raises(DatasetError, match="has no poses that are held out"):
-        own.own_taps(tmp_path / "presses.npz", found)
+        load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
     for config, complaint in (({"sensor": "6"}, "has taps of sensor 6, expected 4"), ({"sensor": "4"}, "at x2")):
         replace(make_press_set().at_scale(2), config=config | {"split": {}}).save(tmp_path / "presses.npz")
         with pytest.raises(DatasetError, match=complaint):
-            own.own_taps(tmp_path / "presses.npz", found)
+            load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
+
+
+@pytest.mark.night
+def test_from_a_robots_taps_to_a_model(tmp_path, capsys, limits):
+    """Two plates of nine figures, 648 taps; what it learns in miniature is by chance, but not what follows of it."""
+    limits(own, TRIED=48, COMPARED=24)
+    tapping_robot.make(tmp_path)
+    files = [str(tmp_path / f"{plate}.{end}") for end in ("csv", "stl") for plate in tapping_robot.PLATES]
+    ends = ["--sensor-file", str(tmp_path / "sensor.toml"), "--out", str(tmp_path / "taps.npz")]
+    assert taps.main([*files[:2], "--surface", *files[2:], *ends]) == 0
+    split = load_presses(tmp_path / "taps.npz").config["split"]
+    assert sum(map(len, split.values())) > 600 and len(split["test"]) > 60
+    command = [str(tmp_path / "sensor.toml"), "--taps", str(tmp_path / "taps.npz"), "--minutes", "0.01"]
+    failed = own.main([*command, "--out", str(tmp_path / "mine"), "--beside", str(find_model("stsr"))])
+    said = capsys.readouterr().out
+    assert f"{TAPPED} [dB]" in said and ("not handed over: " in said) == bool(failed)
+    assert (tmp_path / "mine/mine.onnx").exists() != bool(failed)
+    contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract
+    assert contract.made_for is not None and contract.is_outside(None), "it bears its sensor"
