@@ -6,10 +6,11 @@ writes two recordings and the sensor file of `train.taps` and `train.own`, and p
 know: the true patterns of figures that are on neither plate.
 """
 
-import sys
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import shapely
@@ -58,7 +59,7 @@ def plate_mesh(names: Sequence[str]) -> trimesh.Trimesh:
         down = trimesh.transformations.translation_matrix([*place_mm, -height_mm])
         islands = shapely.get_parts(figure(name))
         bodies += [trimesh.creation.extrude_polygon(island, height_mm, transform=down) for island in islands]
-    return trimesh.util.concatenate(bodies)
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(bodies))
 
 
 @dataclass
@@ -182,5 +183,12 @@ def make(folder: Path, seed: int = 7) -> dict[str, Tapped]:
     return known
 
 
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    make(parser.parse_args(arguments).folder)
+
+
 if __name__ == "__main__":
-    make(Path(sys.argv[1]))
+    main()
