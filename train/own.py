@@ -318,8 +318,8 @@ def _train(options: argparse.Namespace) -> int:
     objection = verdict.objection
     if not grips and not taps and not options.without_recordings:
         objection = objection or (
-            "it was compared on no recording, and a model for the wrong pad draws what looks right: pass --recordings, "
-            "or --without-recordings to rely on the sensor file alone"
+            "it was compared on no recording, and a model for the wrong pad draws what looks right: pass --recordings "
+            "or --taps, or --without-recordings to rely on the sensor file alone"
         )
     if objection is not None:
         say(f"not handed over: {objection}")
