@@ -2,6 +2,7 @@
 
     python -m train.own sensor.toml --recordings trials --out mine
     python -m train.own sensor.toml --recordings trials --mesh part.stl --minutes 60 --out mine
+    python -m train.own sensor.toml --taps taps.npz --beside mine/mine.onnx --out tapped
 
 The bundled models are for any pad. One for a single pad is better by decibels, and worse than none on another pad: so
 its pads are drawn within what is known of the sensor, the less is known the wider, and the model says in its contract
@@ -10,6 +11,8 @@ whose it is. Constants that the sensor file lacks are found by train.identify, w
 At the end it is compared with the bundled model, which is told the same, and with bilinear interpolation, on presses of
 pads like the sensor, of pads a little unlike it, and on --recordings, a folder of TRIAL/xela_SENSOR.csv. What loses is
 not handed over, nor what was compared on no recording. The same command continues an interrupted run.
+
+Taps of train.taps are a third of what it then learns from; those held out decide, also against models --beside it.
 """
 
 import argparse
@@ -19,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -37,11 +40,12 @@ from firmware_bridge.errors import BridgeError
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
-from train.data.frozen_presses import freeze_presses
+from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.press_batches import OneSensor
 from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, has_hole, play, recorded_grips
+from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError
 from train.families.catalogue import FIGURES, SHARES
@@ -175,25 +179,31 @@ class Comparison(NamedTuple):
 
 
 def compared(
-    own: ModelSession, knowledge: Knowledge, sets: Mapping[str, PressSet], grips: Sequence[Grip]
+    own: ModelSession,
+    knowledge: Knowledge,
+    sets: Mapping[str, PressSet],
+    grips: Sequence[Grip],
+    beside: Sequence[ModelSession] = (),
 ) -> Comparison:
     """Compare a model with the bundled one, told the same, and with bilinear interpolation.
 
     Args:
         own: the model.
         knowledge: of its sensor.
-        sets: presses that it was not trained on, by what they are; the last are of pads a little unlike the sensor.
+        sets: presses that it was not trained on, by what they are; TAPPED are the sensor's own, read as they are.
         grips: recordings of the sensor that holds flat faces, which cover its pad.
+        beside: further models of the sensor, which TAPPED decide between.
     """
     bundled = ModelSession(find_model(DEFAULT_MODEL))
-    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled}
+    sensor, models = knowledge.sensor(), {OWN: own, bundled.name: bundled} | {one.name: one for one in beside}
     bilinear = fitted_methods(BUNDLE_DIR / "classical.npz", own.contract.scale)["bilinear"]
     cells: dict[str, list[str]] = {name: [] for name in (*models, "bilinear")}
     times_us: dict[str, list[float]] = {name: [] for name in models}
     gains: list[str] = []
     objections: list[str] = []
     for what, presses in sets.items():
-        frozen = freeze_presses(presses, SEED + 1, sensor.nuisances)
+        as_read = FrozenPresses(presses, np.ones(0, dtype=np.float32))
+        frozen = as_read if what == TAPPED else freeze_presses(presses, SEED + 1, sensor.nuisances)
         windows, truth = frozen.windows(1), frozen.patterns()
         patterns = {name: np.empty_like(truth) for name in models} | {"bilinear": bilinear(windows[:, 0])}
         for number, window in enumerate(windows):
@@ -210,7 +220,8 @@ def compared(
             gain = f"{gained.mean():+.2f} ({low:+.2f} to {high:+.2f})"
             if name == bundled.name:
                 gains.append(gain)
-            if name != OWN and (high < 0 if what == UNLIKE else low <= 0):
+            decides = name in (bundled.name, "bilinear") or what == TAPPED
+            if name != OWN and decides and (high < 0 if what == UNLIKE else low <= 0):
                 objections.append(f"on {what} it is {gain} dB to {name}")
     holes = {name: np.array([_holes(grip, model, knowledge.pad) for grip in grips]) for name, model in models.items()}
     for name, shares in holes.items() if grips else ():
@@ -238,21 +249,26 @@ def _holes(grip: Grip, model: ModelSession, pad: Pad) -> float:
 
 OWN: Final = "this model"
 UNLIKE: Final = "pads a fifth unlike it"
+TAPPED: Final = "own taps at other poses"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; 0 when a model was handed over, 1 where not, 130 when interrupted."""
-    options = _parser().parse_args(arguments)
+    return reported("train.own", _train, _parser().parse_args(arguments))
+
+
+def reported(program: str, run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
+    """Run a program with its options; an error is a line, and interrupted it is 130."""
     try:
-        return _train(options)
+        return run(options)
     except (TrainError, BridgeError, EdgeError) as error:
-        sys.stderr.write(f"train.own: {error}\n")
+        sys.stderr.write(f"{program}: {error}\n")
         return 1
     except OSError as error:
-        sys.stderr.write(f"train.own: {error.filename}: {error.strerror}\n")
+        sys.stderr.write(f"{program}: {error.filename}: {error.strerror}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("train.own: interrupted; the same command continues\n")
+        sys.stderr.write(f"{program}: interrupted; the same command continues\n")
         return 130
 
 
@@ -261,11 +277,13 @@ def _train(options: argparse.Namespace) -> int:
     work = out / "work"
     work.mkdir(parents=True, exist_ok=True)
     knowledge = knowledge_of(load_sensor_file(options.sensor_file), options.sensor)
-    _say(knowledge.told())
+    say(knowledge.told())
     grips = [] if options.recordings is None else recorded_grips(options.recordings)
     grips = [one for one in grips if one.free.sensor.removeprefix("xela_") == knowledge.name]
     if not grips and options.recordings is not None:
         raise DatasetError(f"{options.recordings} has no recording xela_{knowledge.name}.csv of this sensor")
+    taps = {} if options.taps is None else load_tap_parts(options.taps, knowledge.name, knowledge.pad)
+    beside = [ModelSession(path) for path in options.beside]
     if not knowledge.pad.constants and knowledge.pad.gains_certainty < _FIFTH:
         raise DatasetError(
             "nothing is known of this sensor, and a model for any sensor is there: lay a weight on it with "
@@ -290,23 +308,24 @@ def _train(options: argparse.Namespace) -> int:
             made[what] = make_presses(replace(of, seed=options.seed + 1000 * number), path)
     name, sensor = out.resolve().name, knowledge.sensor()
     frozen = freeze_presses(made["validation"], SEED, sensor.nuisances).as_frozen_set()
-    report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work)
-    _say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
+    report = fit_network(_training(name, sensor, plan.steps), presses, frozen, work, taps.get("training"))
+    say(f"{report['steps']} steps in {report['elapsed_s'] / 60:.1f} minutes")
     path = _exported(work, name)
-    verdict = compared(ModelSession(path), knowledge, {what: made[what] for what in list(sets)[2:]}, grips)
-    _say(verdict.table)
+    judges = {what: made[what] for what in list(sets)[2:]} | ({TAPPED: taps["test"]} if taps else {})
+    verdict = compared(ModelSession(path), knowledge, judges, grips, beside)
+    say(verdict.table)
     objection = verdict.objection
-    if not grips and not options.without_recordings:
+    if not grips and not taps and not options.without_recordings:
         objection = objection or (
-            "it was compared on no recording, and a model for the wrong pad draws what looks right: pass --recordings, "
-            "or --without-recordings to rely on the sensor file alone"
+            "it was compared on no recording, and a model for the wrong pad draws what looks right: pass --recordings "
+            "or --taps, or --without-recordings to rely on the sensor file alone"
         )
     if objection is not None:
-        _say(f"not handed over: {objection}")
+        say(f"not handed over: {objection}")
         return 1
     handed = out / f"{name}.onnx"
     write_in_place(handed, lambda draft: draft.write_bytes(path.read_bytes()), load_session)
-    _say(f"from now on: edge-sr --sensor {options.sensor_file} --model {handed}")
+    say(f"from now on: edge-sr --sensor {options.sensor_file} --model {handed}")
     return 0
 
 
@@ -334,13 +353,14 @@ def plan_of(minutes: float, world: World, folder: Path) -> Plan:
         return Plan(kept["presses"], kept["steps"])
     press_s, step_s = tried(world, folder)
     plan = planned(minutes, press_s, step_s)
-    _say(plan.line(press_s, step_s))
+    say(plan.line(press_s, step_s))
     text = json.dumps({"minutes": minutes, "presses": plan.presses, "steps": plan.steps}) + "\n"
     write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False)
     return plan
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Write a line of a program at once."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -353,6 +373,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--sensor", metavar="NAME", help="which sensor of the file (default: its only one)")
     add("--recordings", type=Path, metavar="FOLDER", help="TRIAL/xela_SENSOR.csv of grips of flat faces, to compare by")
     add("--without-recordings", action="store_true", help="hand it over by simulated presses alone")
+    add("--taps", type=Path, metavar="FILE", help="the sensor's own taps, as train.taps makes them, to learn from, too")
+    add("--beside", type=Path, action="append", default=[], metavar="MODEL", help="another model to compare with")
     add("--mesh", type=Path, action="append", default=[], metavar="FILE", help="STL, OBJ or PLY file to add")
     add("--unit-mm", type=float, default=1.0, help="unit of the meshes in mm (1)")
     add("--minutes", type=positive, default=20.0, help="about how long all takes (20)")

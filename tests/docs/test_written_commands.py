@@ -48,6 +48,7 @@ PARSED = {
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",
     r"python tests/system/chaos\.py .*": "takes minutes; test_chaos runs it, shortened",
+    r"python tests/support/tapping_robot\.py .*": "taps for a minute; test_own_taps runs it by night",
     r"python tests/system/chaos_wire\.py .*": "plays until ended; test_chaos runs it",
     r"python tests/system/mutation_survey\.py.*": "takes an hour; test_mutants runs it on a part",
     r"python tests/system/program_cost\.py.*": "takes a minute; test_bench_timing runs it, shortened",

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from firmware_bridge.pad_geometry import USPA44
-from train.experiments.fig5 import PsfNet, degrade, fit_psf_net, tpsf
+from train.networks.tactile_psf import PsfNet, degrade, fit_psf_net, tpsf
 
 PIXEL_MM = 0.47
 

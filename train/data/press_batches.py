@@ -3,7 +3,7 @@
 Batches for a network that takes poses have one number of taps each, and poses with errors of a stated size.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ class Batch:
     window: Tensor  # (n, 3K, rows, cols) in network units
     pattern: Tensor  # (n, H, W) in [mm]
     pad: Tensor | None = None  # (n, known), inputs of the pads
-    traction: Tensor | None = None  # (n, 3, h, w) in [kPa]; None if it is not trained on
+    traction: Tensor | None = None  # (n, 3, h, w) in [kPa], NaN where unknown; None if it is not trained on
     poses: Tensor | None = None  # (n, K, 5) of the taps in the newest one's axes, with their errors; None: a schedule
 
     def mirrored(self, which: Tensor) -> "Batch":
@@ -157,6 +157,27 @@ class PressBatches:
         if taps > 1:  # a mirrored pad would turn the other way from tap to tap
             return batch
         return batch.mirrored(torch.from_numpy(rng.random(len(index)) < 0.5))
+
+
+def with_own_taps(
+    batches: Callable[[int], Batch], taps: PressSet, sensor: OneSensor, seed: int
+) -> Callable[..., Batch]:
+    """Return batches in which a third of the windows are a sensor's own taps, which no mirror image belongs to.
+
+    Their gains and lags are the sensor's; drift, the earth's field and noise differ from tap to tap. They have no
+    traction.
+    """
+    left = sensor.nuisances.without("hysteresis", "cross_talk", "gain_spread", "saturation_counts")
+
+    def mixed(number: int) -> Batch:
+        world, rng = batches(number), np.random.default_rng([seed, 3, number])
+        picked = taps.pick(_rows_of_batch(number, np.arange(len(taps)), len(world.window) // 2, [seed, 4]))
+        readings = read_presses(picked, left, int(rng.integers(2**62)))
+        own = _batch(rng, picked, readings, np.empty(0, dtype=np.float32), sensor)
+        parts = {one: (getattr(world, one), getattr(own, one)) for one in ("window", "pattern", "pad", "traction")}
+        return Batch(**{name: torch.cat(both) for name, both in parts.items()})
+
+    return mixed
 
 
 def _lacking(taps: int) -> DatasetError:

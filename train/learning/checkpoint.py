@@ -22,7 +22,7 @@ from edge.evaluation.metrics import contact_iou, psnr_db, ssim
 from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.in_place import write_in_place
-from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatches, network_input
+from train.data.press_batches import Batch, OneSensor, PosedBatches, PressBatches, network_input, with_own_taps
 from train.data.presses import PressSet
 from train.errors import CheckpointError, DatasetError
 from train.learning.interval_fit import calibrate, interval_coverage
@@ -74,13 +74,18 @@ class Training:
         return hashlib.sha256(json.dumps([asdict(self), data_sha256], sort_keys=True).encode()).hexdigest()
 
 
-def fit_network(training: Training, data: PressSet, validation: FrozenSet, folder: Path) -> dict[str, Any]:
+def fit_network(
+    training: Training, data: PressSet, validation: FrozenSet, folder: Path, taps: PressSet | None = None
+) -> dict[str, Any]:
     """Train, calibrate, evaluate and write one network, and return the content of its NAME.json.
 
+    `taps` of the one sensor that it is for are mixed in.
     A checkpoint of the same training that already exists is left as it is.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data_sha256, path = data.sha256(), folder / f"{training.name}.pt"
+    if taps is not None:
+        data_sha256 += taps.sha256()
     training_sha256 = training.sha256(data_sha256)
     start_path = None if training.start is None else _path_of(training.start, folder)
     start_sha256 = None if start_path is None else _file_sha256(start_path)
@@ -102,6 +107,8 @@ def fit_network(training: Training, data: PressSet, validation: FrozenSet, folde
     seed = int(hashlib.sha256(f"{training.seed} {training.name}".encode()).hexdigest()[:8], 16)
     recipe = training.recipe
     batches = batches_of(data, training.scale, recipe, seed, posed=net.takes_poses, sensor=training.sensor)
+    if taps is not None and training.sensor is not None:
+        batches = with_own_taps(batches, taps, training.sensor, seed)
     elapsed_s = train(
         net,
         _objective(net, device, seed),

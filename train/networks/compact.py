@@ -332,8 +332,10 @@ class HeteroscedasticError(Objective):
         pattern, deviation, traction = net(batch.window, batch.pad, *posed)
         loss = heteroscedastic_loss(pattern, deviation, batch.pattern)
         if batch.traction is not None:
-            size = batch.traction.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(0.05)
-            loss = loss + 0.2 * ((traction - batch.traction).abs() / size).mean()
+            known = batch.traction.isfinite().all(dim=(1, 2, 3))  # of a real sensor's taps it is not
+            traction, truth = traction[known], batch.traction[known]
+            size = truth.square().mean(dim=(1, 2, 3), keepdim=True).sqrt().clamp_min(0.05)
+            loss = loss + 0.2 * ((traction - truth).abs() / size).mean()
         return loss
 
 

@@ -1,0 +1,302 @@
+"""Own taps on a known surface: from recordings with poses to a set to learn from, and a model that it judges."""
+
+import io
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import tapping_robot
+from edge_samples import make_contract, write_model
+from press_samples import make_press_set
+from tapping_robot import Robot, plate_mesh
+from train.physics.resample import resample
+
+from edge.inference.bundled import find_model
+from edge.inference.onnx_session import ModelSession
+from firmware_bridge.sensor_file.model import load_sensor_file
+from train import own, taps
+from train.data import recorded_taps, tapped_surface
+from train.data.press_batches import OneSensor, PressBatches, with_own_taps
+from train.data.presses import load_presses
+from train.data.recorded_taps import load_tap_parts
+from train.data.tapped_surface import image_surface, surface_of
+from train.errors import DatasetError
+from train.networks.compact import HeteroscedasticError
+from train.own import OWN, TAPPED, compared, knowledge_of
+from train.physics.gripped import FINE_SCALE, GrippedPad
+from train.physics.pad_draws import KNOWN, NOMINAL
+from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import figure
+
+FIGURES = ("T", "L", "hollow square")
+
+
+@pytest.fixture(scope="module")
+def tapped(tmp_path_factory):
+    """A folder with a recording of three figures at nine places each, its surface, the sensor file, and the truth."""
+    folder = tmp_path_factory.mktemp("robot")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tapping_robot, "TURNS_DEG", (30.0,))
+        robot = Robot()
+        robot.save_sensor_file(folder / "sensor.toml", known_to=0.02)
+        plate_mesh(FIGURES).export(folder / "plate.stl")
+        return folder, robot.record_plate(folder / "plate.csv", FIGURES)
+
+
+@pytest.fixture(autouse=True)
+def few(limits):
+    """Fewer taps to fit the poses by, and a network of the PSF that is hardly trained."""
+    limits(tapped_surface, FIT_FROM=6)
+    limits(taps, EPOCHS=1)
+
+
+def arguments(folder, *more, recording="plate.csv", surface="plate.stl"):
+    """Return the command line of this folder."""
+    given = [folder / recording, "--surface", folder / surface, "--sensor-file", folder / "sensor.toml"]
+    return [str(one) for one in (*given, "--out", folder / "taps.npz", *more)]
+
+
+def test_taps_become_a_set_with_truth(tapped, capsys):
+    folder, truth = tapped
+    assert taps.main(arguments(folder)) == 0
+    told = capsys.readouterr().out
+    assert "27 taps; they fit best with the surface moved by" in told and "LR-HR pairs" in told
+    made = load_presses(folder / "taps.npz")
+    split = {name: len(numbers) for name, numbers in made.config["split"].items()}
+    assert split == {"training": 21, "validation": 3, "test": 3}, "a ninth of the places, twice"
+    last = np.append(np.flatnonzero(np.diff(made.pad)), len(made) - 1)
+    assert len(last) == 27 and np.diff(last).max() == 16, "from first touch to full force"
+    expected = resample(truth.unit_patterns, FINE_SCALE, 10) * truth.indentation_mm[:, None, None]
+    error_mm = np.sqrt(np.square(made.patterns[last] - expected).mean(axis=(1, 2)))
+    assert np.median(error_mm) < 0.035, "of presses half a millimetre deep, at poses that were off by 0.4 mm"
+    assert (made.touching[last] == (expected > 0.9 * truth.indentation_mm[:, None, None])).mean() > 0.97
+
+
+@pytest.mark.parametrize("truth", ["fitted", "psf", "depth"])
+def test_other_truths_are_there_to_compare(tapped, capsys, truth):
+    folder, _ = tapped
+    assert taps.main(arguments(folder, "--truth", truth, "--scale", "4")) == 0
+    made = load_presses(folder / "taps.npz")
+    assert made.config["truth"] == truth and made.patterns.shape[1:] == (16, 16)
+    inside = made.touching
+    if truth != "psf":  # a plateau
+        assert all(np.ptp(one[area].astype(float)) < 1e-3 for one, area in zip(made.patterns, inside, strict=True))
+    assert (truth == "depth") == (not made.patterns[~inside].any()), "alone it has no reach"
+
+
+def without_poses(folder):
+    lines = (folder / "plate.csv").read_text().splitlines()
+    return "\n".join(",".join(line.split(",")[:-3]) for line in lines)
+
+
+def of_another_frame(folder):
+    lines = [line.split(",") for line in (folder / "plate.csv").read_text().splitlines()]
+    mirrored = [lines[0], *([*one[:-3], f"{-float(one[-3])}", *one[-2:]] for one in lines[1:])]
+    return "\n".join(map(",".join, mirrored))
+
+
+def elsewhere(folder):
+    lines = [line.split(",") for line in (folder / "plate.csv").read_text().splitlines()]
+    far = [lines[0], *([*one[:-3], "500", *one[-2:]] for one in lines[1:])]
+    return "\n".join(map(",".join, far))
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (without_poses, "has no poses: record with --poses, or add columns pose_x_mm"),
+        (of_another_frame, "the readings do not fit what lies under the poses: likeness 0."),
+        (elsewhere, "the pad never touches the surface at a pose"),
+        (
+            lambda folder: "\n".join((folder / "plate.csv").read_text().splitlines()[:900]),
+            "places, expected at least 27",
+        ),
+        (lambda folder: "\n".join((folder / "plate.csv").read_text().splitlines()[:99]), "has no tap with a pose"),
+    ],
+)
+def test_a_bad_recording_is_one_line(tapped, tmp_path, capsys, change, complaint):
+    folder, _ = tapped
+    (tmp_path / "bad.csv").write_text(change(folder) + "\n")
+    assert taps.main(arguments(folder, recording=tmp_path / "bad.csv")) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("train.taps: ") and complaint in said
+
+
+def test_a_bad_surface_is_one_line(tapped, tmp_path, capsys):
+    folder, _ = tapped
+    plate_mesh(FIGURES).apply_scale(0.001).export(tmp_path / "metres.stl")
+    dome = plate_mesh(FIGURES)
+    dome.vertices[:, 2] -= np.square(dome.vertices[:, :2]).sum(axis=1) / 2000
+    dome.export(tmp_path / "dome.stl")
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    for surface, complaint in (
+        ("metres.stl", "pass --unit-mm 1000 if it is in metres"),
+        ("none.stl", "cannot be read"),
+        ("broken.png", "is no PNG file"),
+        ("none.png", "No such file"),
+    ):
+        assert taps.main(arguments(folder, surface=tmp_path / surface)) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("train.taps: ") and complaint in said and said.count("\n") == 1
+
+
+def test_a_curved_surface_is_refused():
+    pad = GrippedPad(NOMINAL)
+    bowl = lambda pose, pad: -(np.hypot(*pad.places_mm) ** 2 / 40).astype(np.float32)  # noqa: E731
+    with pytest.raises(DatasetError, match="is curved under the pad"):
+        tapped_surface.pressed([Pose(0, 0, 0)], bowl, pad)
+
+
+def test_a_depth_image_lies_as_the_mesh(tapped):
+    folder, _ = tapped
+    mesh, pad, pose = surface_of(folder / "plate.stl"), GrippedPad(NOMINAL), Pose(-28.0, 31.0, 30.0)
+    steps = (np.arange(900) + 0.5) / 10 - 45
+    x_mm, y_mm = np.meshgrid(steps, -steps)
+    image = np.zeros((900, 900))
+    for name, (right, up) in zip(FIGURES, tapping_robot.grid_places_mm(), strict=False):
+        image[shapely.contains_xy(figure(name), x_mm - right, y_mm - up)] = 1
+    drawn, expected = image_surface(image, 0.1)(pose, pad) > -1, mesh(pose, pad) > -1
+    assert expected.mean() > 0.05 and (drawn == expected).mean() > 0.99
+
+
+def published(path, held):
+    """Write an object array as the authors do."""
+    np.save(path, np.array([[one] for one in held], dtype=object), allow_pickle=True)
+    return path
+
+
+def test_published_taps_are_read(tapped, tmp_path, capsys):
+    folder, _ = tapped
+    image = np.zeros((100, 100))
+    image[20:60, 30:70] = 0.8
+    z = np.linspace(0, 400, 40)[:, None, None] * np.ones((40, 16, 3)) * (0.1, 0.1, 1)
+    held = [{"sample_idx": number, "depth": image, "LRs": z.reshape(40, 48).tolist()} for number in range(27)]
+    path = published(tmp_path / "C.npy", held)
+    entry = load_sensor_file(folder / "sensor.toml").sensors["4"]
+    found = recorded_taps.recorded_taps(path, entry, "4")
+    assert len(found) == 27 and found[0].counts.shape == (16, 3, 4, 4) and found[0].counts[-1, 2].mean() == 400
+    command = [str(path), "--sensor-file", str(folder / "sensor.toml"), "--out", str(tmp_path / "taps.npz")]
+    assert taps.main(command) == 0
+    made = load_presses(tmp_path / "taps.npz")
+    assert made.family[0] == "C" and made.touching.mean() == pytest.approx(0.16, abs=0.02)
+
+
+class Evil:
+    """An object whose pickle would run a command."""
+
+    def __init__(self, *call):
+        self._call = call
+
+    def __reduce__(self):
+        return self._call[0], self._call[1:]
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        [Evil(print, "run")],
+        [{"depth": Evil(eval, "1 + 1"), "LRs": []}],
+        [{"depth": np.ones((2, 2)), "LRs": Evil(np.fromfile, "/etc/hostname")}],
+        [{"depth": np.eye(2), "LRs": [[np.nan] * 48]}],
+        [{"depth": np.ones((2, 2)), "LRs": [[1.0] * 48]}],
+        [{"depth": np.eye(2), "LRs": [[1.0] * 47]}],
+        [{"depth": np.eye(2)}],
+        [3],
+        [Evil(bytearray, 1 << 40)],
+    ],
+)
+def test_a_hostile_or_wrong_file_is_one_line_and_runs_nothing(tapped, tmp_path, capsys, held):
+    path = published(tmp_path / "C.npy", held)
+    assert (
+        taps.main([str(path), "--sensor-file", str(tapped[0] / "sensor.toml"), "--out", str(tmp_path / "t.npz")]) == 1
+    )
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1 and "is not a file of published taps" in err
+
+
+def test_broken_bytes_are_one_line(tapped, tmp_path, capsys):
+    whole = published(tmp_path / "C.npy", [{"depth": np.eye(4), "LRs": [[1.0] * 48]}]).read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [whole[:end] for end in range(0, len(whole), 37)]
+    for _ in range(200):
+        at, spoilt = int(rng.integers(len(whole))), bytearray(whole)
+        spoilt[at] = int(rng.integers(256))
+        damaged.append(bytes(spoilt))
+    entry = load_sensor_file(tapped[0] / "sensor.toml").sensors["4"]
+    for content in damaged:
+        (tmp_path / "broken.npy").write_bytes(content)
+        try:
+            recorded_taps.recorded_taps(tmp_path / "broken.npy", entry, "4")
+        except DatasetError as error:
+            assert "\n" not in str(error)
+
+
+def test_nothing_but_arrays_is_unpickled():
+    for thing in (io.BytesIO, np.load, pickle.Unpickler, np.memmap, np.ndarray.tofile):
+        with pytest.raises((pickle.UnpicklingError, AttributeError)):
+            recorded_taps._Arrays(io.BytesIO(pickle.dumps(thing))).load()
+
+
+def test_a_third_of_a_batch_are_own_taps_as_they_are():
+    sensor = OneSensor((0.5,) * KNOWN, 0.0)
+    world, mine = make_press_set(count=64, taps=1), make_press_set(count=12, taps=1, seed=1)
+    mine.traction_kpa[:] = np.nan
+    mine.counts[:] = np.arange(48, dtype=np.float32).reshape(3, 4, 4) * 50
+    batch = with_own_taps(PressBatches(world, (1.0,), 24, seed=1, sensor=sensor), mine, sensor, seed=2)(0)
+    own_rows = batch.traction.isnan().flatten(1).all(dim=1).numpy()
+    assert own_rows.sum() == 12 and len(own_rows) == 36 and not batch.traction[~own_rows].isnan().any()
+    read = batch.window[own_rows].numpy() * np.array([500, 500, 1000])[:, None, None]
+    assert np.abs(read - mine.counts[0, 0]).mean() < 60, "drift and the earth's field alone, and no mirror image"
+
+    def net(window, pad):
+        pattern = batch.pattern.clone().requires_grad_()
+        return pattern, batch.pattern + 1, batch.traction.nan_to_num(0)
+
+    assert np.isfinite(HeteroscedasticError().loss(net, batch).item())
+
+
+def test_what_loses_on_own_taps_is_not_handed_over(tapped, tmp_path):
+    folder, _ = tapped
+    assert taps.main(arguments(folder)) == 0
+    found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
+    parts = load_tap_parts(folder / "taps.npz", "4", found.pad)
+    assert set(parts) == {"training", "validation", "test"} and len(np.unique(parts["test"].pad)) == 3
+    tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
+    bundled = ModelSession(find_model("stsr-int8"))
+    table, objection = compared(tiny, found, {TAPPED: parts["test"]}, [], [bundled])
+    assert OWN in table and objection is not None and f"on {TAPPED} it is -" in objection
+    _, objection = compared(bundled, found, {TAPPED: parts["test"]}, [], [tiny])
+    assert objection is not None and "to tiny" not in objection, "better than tiny, and no better than itself"
+
+
+def test_taps_of_another_sensor_or_of_none_are_refused(tapped, tmp_path):
+    folder, _ = tapped
+    found = knowledge_of(load_sensor_file(folder / "sensor.toml"), None)
+    make_press_set().save(tmp_path / "presses.npz")
+    with pytest.raises(DatasetError, match="has no poses that are held out"):
+        load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
+    for config, complaint in (({"sensor": "6"}, "has taps of sensor 6, expected 4"), ({"sensor": "4"}, "at x2")):
+        replace(make_press_set().at_scale(2), config=config | {"split": {}}).save(tmp_path / "presses.npz")
+        with pytest.raises(DatasetError, match=complaint):
+            load_tap_parts(tmp_path / "presses.npz", "4", found.pad)
+
+
+@pytest.mark.night
+def test_from_a_robots_taps_to_a_model(tmp_path, capsys, limits):
+    """Two plates of nine figures, 648 taps; what it learns in miniature is by chance, but not what follows of it."""
+    limits(own, TRIED=48, COMPARED=24)
+    tapping_robot.make(tmp_path)
+    files = [str(tmp_path / f"{plate}.{end}") for end in ("csv", "stl") for plate in tapping_robot.PLATES]
+    ends = ["--sensor-file", str(tmp_path / "sensor.toml"), "--out", str(tmp_path / "taps.npz")]
+    assert taps.main([*files[:2], "--surface", *files[2:], *ends]) == 0
+    split = load_presses(tmp_path / "taps.npz").config["split"]
+    assert sum(map(len, split.values())) > 600 and len(split["test"]) > 60
+    command = [str(tmp_path / "sensor.toml"), "--taps", str(tmp_path / "taps.npz"), "--minutes", "0.01"]
+    failed = own.main([*command, "--out", str(tmp_path / "mine"), "--beside", str(find_model("stsr"))])
+    said = capsys.readouterr().out
+    assert f"{TAPPED} [dB]" in said and ("not handed over: " in said) == bool(failed)
+    assert (tmp_path / "mine/mine.onnx").exists() != bool(failed)
+    contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract
+    assert contract.made_for is not None and contract.is_outside(None), "it bears its sensor"
