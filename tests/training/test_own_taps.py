@@ -11,7 +11,6 @@ import tapping_robot
 from edge_samples import make_contract, write_model
 from press_samples import make_press_set
 from tapping_robot import Robot, plate_mesh
-from train.physics.resample import resample
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
@@ -27,6 +26,7 @@ from train.networks.compact import HeteroscedasticError
 from train.own import OWN, TAPPED, compared, knowledge_of
 from train.physics.gripped import FINE_SCALE, GrippedPad
 from train.physics.pad_draws import KNOWN, NOMINAL
+from train.physics.tpsf import resample
 from train.surfaces.depth_image import Pose
 from train.surfaces.named_surfaces import figure
 

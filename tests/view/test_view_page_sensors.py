@@ -228,9 +228,7 @@ def test_a_held_pad_is_shown_and_measured(held, open_page, tmp_path):
     assert taken.startswith(b"\x89PNG") and struct.unpack(">II", taken[16:24]) == pictures.PHONE
 
 
-NODES_SHOWN = (
-    "let count = 0; for (const all = document.createNodeIterator(document); all.nextNode(); ) count += 1; count"
-)
+NODES_SHOWN = "let all = document.createNodeIterator(document), count = 0; while (all.nextNode()) count += 1; count"
 
 
 def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
