@@ -180,7 +180,7 @@ class SlcanSerialLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return frozenset(self._scans.can_ids)
+        return self._scans.can_ids
 
     def serial_line(self) -> SerialLine:
         """Return the port and its speed."""
