@@ -59,7 +59,8 @@ class Link(Protocol):
             not available, or equals `kind`.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
         states_poses: True where poses of the sensors come with the scans.
-        prefix: beginning of the names of all its sensors.
+        prefix: beginning of the names of all its sensors: what the user calls it, and a slash.
+        lasts: True where it is opened again after a loss; a recording, or a demo, is over then.
         fetches: True if the system keeps for a while what is not read, and `fetch` takes it.
     """
 
@@ -74,6 +75,7 @@ class Link(Protocol):
     mountings: Mapping[str, Mounting] = MappingProxyType({})
     states_poses: bool = False
     prefix: str = ""
+    lasts: bool = True
     fetches: bool = False
 
     def __enter__(self) -> "Link": ...

@@ -157,7 +157,7 @@ class ScanAssembler:
         since the beginning or end of their cycle was uncertain; scans; torn_wire: taxels missing; torn_source:
         complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
-        totals = dict.fromkeys(_COUNTED, 0)
+        totals: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         for sensor in self._sensors.values():
             for name, count in sensor.counts.items():
                 totals[name] += count
