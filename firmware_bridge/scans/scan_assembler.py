@@ -15,9 +15,10 @@ open scan at once. So a scan costs little, also where the frames of several sens
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import pairwise
 from operator import itemgetter
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,6 @@ from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 READING_BYTES: Final = 8
 """Bytes of the data of a reading: one unused, X, Y, Z as unsigned big-endian 16 bit, one unused. The unused ones are
 not zero."""
-Reading = tuple[int, ...]
-"""`key` of the frame's id, and counts x, y, z of a taxel; whatever follows them is no part of it."""
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",
@@ -55,6 +54,19 @@ def key(can_id: int) -> int:
     return can_id << 4 | READING_BYTES
 
 
+class Readings(NamedTuple):
+    """Readings that came together, one place of each column for each: the `key` of its id, and its counts."""
+
+    keys: tuple[int, ...]
+    x: tuple[int, ...]
+    y: tuple[int, ...]
+    z: tuple[int, ...]
+
+    def taken(self, places: Sequence[int]) -> "Readings":
+        """Return those at some places."""
+        return Readings(*(tuple(column[place] for place in places) for column in self))
+
+
 class ScanAssembler:
     """Assembler of readings into the scans of their sensors.
 
@@ -72,6 +84,7 @@ class ScanAssembler:
         self._model = model
         self._places = {key(can_id): place for can_id, place in model.taxels.items()}
         self._keys = set[int]()  # bounded: there are at most 2048 of standard ids
+        self._runs = lru_cache(maxsize=32)(self._find_runs)  # those of whole cycles come again and again
         self._readings = 0
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
@@ -88,13 +101,13 @@ class ScanAssembler:
             if not frame.extended:
                 self._keys.add(key(frame.can_id))
             return []
-        reading = key(frame.can_id), *_unpack_counts(frame.data)
+        readings = Readings((key(frame.can_id),), *zip(_unpack_counts(frame.data)))
         if device is None:
-            return self.feed([reading], time_ns)
-        return self.feed([reading], time_ns, [device.own_ns], device.host_ns - device.own_ns)
+            return self.feed(readings, time_ns)
+        return self.feed(readings, time_ns, [device.own_ns], device.host_ns - device.own_ns)
 
     def feed(
-        self, readings: Sequence[Reading], time_ns: int, own_ns: Sequence[int] | None = None, offset_ns: int = 0
+        self, readings: Readings, time_ns: int, own_ns: Sequence[int] | None = None, offset_ns: int = 0
     ) -> list[Scan]:
         """Return the scans that readings close, which arrived together at `time_ns` in [ns], in their order on the bus.
 
@@ -102,27 +115,34 @@ class ScanAssembler:
         is that from it to the host's, in [ns].
         """
         self._newest_ns = time_ns
-        self._keys.update([reading[0] for reading in readings])
-        runs: dict[str, tuple[list[int], list[int]]] = {}
-        for number, reading in enumerate(readings):
-            place = self._places.get(reading[0])
-            if place is None:
-                self.foreign += 1
-            elif (run := runs.get(place[0])) is not None:
-                run[0].append(number)
-                run[1].append(place[1])
-            else:
-                runs[place[0]] = [number], [place[1]]
+        runs, keys = self._runs(readings.keys), len(readings.keys)
         closed: list[tuple[int, Scan]] = []
+        sorted_out = 0
         for name, (numbers, taxels) in runs.items():
-            self._readings += len(numbers)
-            mine = [readings[number] for number in numbers]
-            times_ns = None if own_ns is None else [own_ns[number] for number in numbers]
+            sorted_out += len(numbers)
+            mine, times_ns = readings, own_ns
+            if len(numbers) < keys:
+                mine = readings.taken(numbers)
+                times_ns = None if own_ns is None else [own_ns[number] for number in numbers]
             found = self._sensor(name).feed(mine, taxels, time_ns, times_ns, offset_ns)
             closed += [(numbers[at], scan) for at, scan in found]
+        self._readings += sorted_out
+        self.foreign += keys - sorted_out
         if len(runs) > 1:
             closed.sort(key=itemgetter(0))
         return [scan for _, scan in closed]
+
+    def _find_runs(self, keys: tuple[int, ...]) -> dict[str, tuple[list[int], list[int]]]:
+        """Return the numbers and the taxels of each sensor's readings among those with these keys."""
+        self._keys.update(keys)
+        runs: dict[str, tuple[list[int], list[int]]] = {}
+        for number, one in enumerate(keys):
+            name, taxel = self._places.get(one, ("", 0))
+            if name:
+                numbers, taxels = runs.setdefault(name, ([], []))
+                numbers.append(number)
+                taxels.append(taxel)
+        return runs
 
     def _sensor(self, name: str) -> "_Sensor":
         sensor = self._sensors.get(name)
@@ -174,20 +194,21 @@ class _Sensor:
         self._taxel_count, self._scan_shape = geometry.taxel_count, geometry.scan_shape
         self._last_place = geometry.taxel_count - 1
         self._series = ScanSeries(name, geometry)
+        self._pack = struct.Struct(f"={3 * geometry.taxel_count}i").pack
         self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
         self._begins_known = self._half_before = False
         self._opened_ns = self._newest_ns = self._offset_ns = 0
-        self._last: Reading | None = None
+        self._last: tuple[int, ...] | None = None
         self._own_ns: int | None = None
         self._taxels: list[int] = []
-        self._values: list[int] = []
+        self._columns: tuple[list[int], list[int], list[int]] = [], [], []
         self._place = -1
 
     def begin_anew(self) -> None:
         held = sum(self._taxel_count - missing for *_, missing in self._held)
         self.counts["abandoned"] += len(self._taxels) + held
         self._held.clear()
-        self._taxels, self._values, self._place, self._begins_known = [], [], -1, False
+        self._taxels, self._columns, self._place, self._begins_known = [], ([], [], []), -1, False
         self._last = self._own_ns = None
         self.wire.begin_anew()
 
@@ -201,17 +222,17 @@ class _Sensor:
         return self._last_place - self._place if self.wire.order else 1
 
     def feed(
-        self, readings: list[Reading], taxels: list[int], time_ns: int, own_ns: list[int] | None, offset_ns: int
+        self, readings: Readings, taxels: list[int], time_ns: int, own_ns: Sequence[int] | None, offset_ns: int
     ) -> list[tuple[int, Scan]]:
         """Return the scans that these readings of its taxels close, each with the place of the one that closed it."""
         if own_ns is None and self._own_ns is not None:
             self.begin_anew()  # time stamps were dropped, and arrivals are on another clock
         closed: list[tuple[int, Scan]] = []
         at = 0
-        while at < len(readings):
+        while at < len(taxels):
             # The link causes the same frame twice in a row. Closing on it would tear a scan, and skipping it loses
             # nothing.
-            if readings[at][:4] == self._last:
+            if self._last == (taxels[at], readings.x[at], readings.y[at], readings.z[at]):
                 self.counts["duplicates"] += 1
                 at += 1
                 continue
@@ -225,9 +246,9 @@ class _Sensor:
             if not self._taxels:
                 self._opened_ns = time_ns
             self._taxels += taxels[at:end]
-            for reading in readings[at:end]:
-                self._values += reading[1:4]
-            self._last = readings[end - 1][:4]
+            for axis, column in zip(self._columns, readings[1:], strict=True):
+                axis += column[at:end]
+            self._last = taxels[end - 1], *(axis[-1] for axis in self._columns)
             place = self.wire.places[taxels[end - 1]]
             self._place = max(self._place, place)
             self._own_ns = None if own_ns is None else own_ns[end - 1]
@@ -237,13 +258,13 @@ class _Sensor:
                 closed += [(end - 1, scan) for scan in self._close(by_pause=False)]
         return closed
 
-    def _gap_ns(self, time_ns: int, own_ns: list[int] | None, at: int) -> int:
+    def _gap_ns(self, time_ns: int, own_ns: Sequence[int] | None, at: int) -> int:
         """Return the time since the newest reading; by the device's times, if any, a late read splits no scan."""
         if own_ns is None or self._own_ns is None:
             return time_ns - self._newest_ns
         return own_ns[at] - self._own_ns
 
-    def _end_of_run(self, taxels: list[int], at: int, time_ns: int, own_ns: list[int] | None) -> int:
+    def _end_of_run(self, taxels: list[int], at: int, time_ns: int, own_ns: Sequence[int] | None) -> int:
         """Return the end of the readings that surely go on in the open scan, or are a new one's beginning."""
         wire = self.wire
         if wire.gaps_ns is not None:
@@ -279,7 +300,8 @@ class _Sensor:
         return closed
 
     def _close(self, *, by_pause: bool) -> list[Scan]:
-        taxels, values, self._taxels, self._values, self._place = self._taxels, self._values, [], [], -1
+        taxels, columns = self._taxels, self._columns
+        self._taxels, self._columns, self._place = [], ([], [], []), -1
         known, self._begins_known = self._begins_known, True
         count, come = self._taxel_count, len(taxels)
         half = 2 * come >= count
@@ -303,9 +325,11 @@ class _Sensor:
         if half:
             now_ns = self._newest_ns if self._own_ns is None else self._own_ns
             on_pace = self.wire.count(now_ns, ended=come == count or taxels[-1] == self.wire.order[-1])
-        axes_last = np.full((count, 3), ABSENT, dtype=np.int32)
-        axes_last[taxels] = np.array(values, dtype=np.int32).reshape(-1, 3)
-        counts = np.ascontiguousarray(axes_last.T).reshape(self._scan_shape)
+        # Plain integers up to the last step: for so few, numpy takes three times as long to put them in place.
+        placed = [ABSENT] * (3 * count)
+        for taxel, x, y, z in zip(taxels, *columns, strict=True):
+            placed[taxel], placed[count + taxel], placed[2 * count + taxel] = x, y, z
+        counts = np.frombuffer(self._pack(*placed), dtype=np.int32).reshape(self._scan_shape)
         device_ns = None if self._own_ns is None else self._own_ns + self._offset_ns
         self._held.append((counts, self._newest_ns, device_ns, count - come))
         shows_pauses = self._own_ns is not None and not self.wire.in_pieces

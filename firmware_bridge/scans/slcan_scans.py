@@ -1,19 +1,20 @@
 """Stages from slcan text to scans: decoder, clock and assembler in a row. No I/O, no clock of its own."""
 
 import struct
+from collections.abc import Sequence
 from typing import Final
 
 from firmware_bridge.can.slcan import LAST_TIMESTAMP_MS, PACKED_BYTES, STAMPED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.scans.scan_assembler import Reading, ScanAssembler
+from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler
 from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 _MS_NS: Final = 1_000_000
 _WRAP_MS: Final = LAST_TIMESTAMP_MS + 1
-_UNPACK: Final = {PACKED_BYTES: struct.Struct(">HxHHHx"), STAMPED_BYTES: struct.Struct(">HxHHHxH")}
-"""Layouts of packed frames by their length: key and counts of a reading, time stamp in [ms]."""
+_LAYOUTS: Final = {PACKED_BYTES: ("HxHHHx", 4), STAMPED_BYTES: ("HxHHHxH", 5)}
+"""Layouts of packed frames and the numbers in them, by their length: key and counts of a reading, stamp in [ms]."""
 
 
 class SlcanScans:
@@ -46,11 +47,13 @@ class SlcanScans:
                 device = None if piece.timestamp_ms is None else self._device_time(piece.timestamp_ms, time_ns)
                 scans += self._assembler.feed_frame(piece, time_ns, device)
             else:
-                readings = list(_UNPACK[piece.frame_bytes].iter_unpack(piece.data))
-                if head_ns < time_ns and self._is_joined(readings[0], head_ns):
+                layout, numbers = _LAYOUTS[piece.frame_bytes]
+                flat = struct.unpack(">" + layout * (len(piece.data) // piece.frame_bytes), piece.data)
+                stamps_ms = flat[4::5] if numbers == 5 else ()
+                if head_ns < time_ns and stamps_ms and self._is_joined(stamps_ms[0], head_ns):
                     self._assembler.foreign += 1
-                    del readings[0]
-                scans += self._feed(readings, time_ns)
+                    flat, stamps_ms = flat[numbers:], stamps_ms[1:]
+                scans += self._feed(Readings(*(flat[at::numbers] for at in range(4))), stamps_ms, time_ns)
             head_ns = time_ns
         return scans
 
@@ -73,28 +76,31 @@ class SlcanScans:
         self.clock = DeviceClock(tick_ns=_MS_NS, wrap_ticks=_WRAP_MS)
         self._newest: tuple[int, DeviceTime] | None = None
 
-    def _feed(self, readings: list[Reading], time_ns: int) -> list[Scan]:
+    def _feed(self, readings: Readings, stamps_ms: Sequence[int], time_ns: int) -> list[Scan]:
         """Return the scans that a run of readings closes; the newest stamp, which was read soonest, gives the times."""
-        stamps_ms = [reading[4] for reading in readings if len(reading) > 4]
-        if not stamps_ms or self.clock.dropped:
-            return self._assembler.feed(readings, time_ns)
-        last_ms = stamps_ms[-1]
-        if len(readings) > 1 and (
-            stamps_ms != sorted(stamps_ms) or (last_ms - stamps_ms[0]) * _MS_NS > SCAN_GIVEN_UP_NS
-        ):  # they wrap round, or are of no good clock: that shows in each of them
-            return [scan for reading in readings for scan in self._feed([reading], time_ns)]
-        device = self._device_time(last_ms, time_ns)
+        device = None
+        if stamps_ms and not self.clock.dropped:
+            first_ms, last_ms = stamps_ms[0], stamps_ms[-1]
+            rising = (last_ms - first_ms) * _MS_NS <= SCAN_GIVEN_UP_NS and list(stamps_ms) == sorted(stamps_ms)
+            if not rising:  # they wrap round, or are of no good clock: that shows in each of them
+                return [
+                    scan
+                    for at, stamp_ms in enumerate(stamps_ms)
+                    for scan in self._feed(readings.taken([at]), [stamp_ms], time_ns)
+                ]
+            device = self._device_time(last_ms, time_ns)
         if device is None:
             return self._assembler.feed(readings, time_ns)
-        own_ns = [device.own_ns - (last_ms - stamp_ms) * _MS_NS for stamp_ms in stamps_ms]
+        zero_ns = device.own_ns - stamps_ms[-1] * _MS_NS
+        own_ns = [zero_ns + stamp_ms * _MS_NS for stamp_ms in stamps_ms]
         return self._assembler.feed(readings, time_ns, own_ns, device.host_ns - device.own_ns)
 
-    def _is_joined(self, reading: Reading, head_ns: int) -> bool:
-        """Return True if the head of its line came at `head_ns`, before its stamp: it has the tail of another."""
-        if len(reading) < 5 or self._newest is None:
+    def _is_joined(self, stamp_ms: int, head_ns: int) -> bool:
+        """Return True if the head of a line came at `head_ns`, before its stamp: it has the tail of another."""
+        if self._newest is None:
             return False
         newest_ms, device = self._newest
-        since_ns = (reading[4] - newest_ms) % _WRAP_MS * _MS_NS
+        since_ns = (stamp_ms - newest_ms) % _WRAP_MS * _MS_NS
         # No frame can arrive 5 ms before its stamp, which is the error of stamps and of their offset.
         return head_ns + 5 * _MS_NS < device.host_ns + since_ns < head_ns + _MS_NS * LAST_TIMESTAMP_MS // 2
 

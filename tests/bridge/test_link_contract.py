@@ -230,6 +230,7 @@ def test_what_lay_there_because_nobody_read_is_marked_old(rig):
         rig.give(link, 1)
         rig.hear(*frames_of(2))
         time.sleep(0.1)
+        link.fetch()
         assert all(scan.unread_ns > 80_000_000 for scan in read_scans(link, 2))
         end_s = time.monotonic() + 60
         while all(scan.unread_ns for scan in [*link.read(0.0), *rig.give(link, 1)]):

@@ -10,9 +10,11 @@ from hypothesis import strategies as st
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
-from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, Reading, ScanAssembler, key
+from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, Readings, ScanAssembler, key
 from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS
 
+Reading = tuple[int, int, int, int]
+"""Key of its id, and counts x, y, z."""
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
 
 
@@ -22,14 +24,19 @@ def cycle(number: int, sensor: str = "4") -> list[Reading]:
     return [(key(can_id), 1000 * taxel + number, 2000 + number, 3000 + number) for can_id, taxel in order]
 
 
+def feed_all(assembler: ScanAssembler, readings: list[Reading], time_ns: int, *stamps) -> list[Scan]:
+    """Feed readings of one moment together."""
+    return assembler.feed(Readings(*zip(*readings, strict=True)), time_ns, *stamps)
+
+
 def feed(assembler: ScanAssembler, readings: list[Reading], start_ns: int = 0) -> list[Scan]:
-    return [scan for i, reading in enumerate(readings) for scan in assembler.feed([reading], start_ns + i)]
+    return [scan for i, reading in enumerate(readings) for scan in feed_all(assembler, [reading], start_ns + i)]
 
 
 def feed_one(assembler: ScanAssembler, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
     if device is None:
-        return assembler.feed([reading], time_ns)
-    return assembler.feed([reading], time_ns, [device.own_ns], device.host_ns - device.own_ns)
+        return feed_all(assembler, [reading], time_ns)
+    return feed_all(assembler, [reading], time_ns, [device.own_ns], device.host_ns - device.own_ns)
 
 
 def counters(assembler: ScanAssembler) -> dict[str, int]:
@@ -39,7 +46,7 @@ def counters(assembler: ScanAssembler) -> dict[str, int]:
 def test_a_scan_closes_with_its_last_taxel():
     assembler = ScanAssembler(USPA44_MAP)
     assert feed(assembler, cycle(0)[:-1]) == []
-    (scan,) = assembler.feed(cycle(0)[-1:], 99)
+    (scan,) = feed_all(assembler, cycle(0)[-1:], 99)
     assert (scan.sensor, scan.number, scan.time_ns) == ("4", 0, 99)
     assert scan.complete and not scan.torn and not scan.repeated
     assert scan.counts.dtype == np.int32 and scan.counts.shape == (3, 4, 4)
@@ -133,7 +140,7 @@ def test_a_flipped_id_invents_no_sensor(apart_ns):
     assembler, phantom = ScanAssembler(USPA44_MAP), cycle(0, "5")
     scans = feed(assembler, cycle(0))
     for number, reading in enumerate([*phantom[:7], (phantom[0][0], 1, *phantom[0][2:]), *phantom[7:]]):
-        scans += assembler.feed([reading], 100 + number * apart_ns) if apart_ns > 1 or number < 8 else []
+        scans += feed_all(assembler, [reading], 100 + number * apart_ns) if apart_ns > 1 or number < 8 else []
     assert {scan.sensor for scan in scans} == {"4"}
     assert counters(assembler)["unconfirmed"] == (7 if apart_ns == 1 else 16)
 
@@ -144,7 +151,7 @@ def test_a_bit_that_flips_in_one_id_of_fifty_invents_no_sensor():
     for number in range(6_000):
         for place, reading in enumerate(cycle(number % 1000)):
             flipped = (reading[0] | key(1), *reading[1:]) if noise.random() < 0.02 else reading
-            found |= {scan.sensor for scan in assembler.feed([flipped], number * 10 * ms + place * 130_000)}
+            found |= {scan.sensor for scan in feed_all(assembler, [flipped], number * 10 * ms + place * 130_000)}
     assert found == {"4"}
 
 
@@ -194,13 +201,13 @@ def test_a_scan_is_waited_for_as_long_as_the_slowest_takes():
     assert SCAN_GIVEN_UP_NS == 1_000_000_000
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, cycle(0) + cycle(1))
-    assembler.feed(cycle(0, "5")[:1], 50)
+    feed_all(assembler, cycle(0, "5")[:1], 50)
     assert assembler.fewest_missing() == 16
     feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)  # open since 76
     assert assembler.fewest_missing() == 7
-    assembler.feed(cycle(2)[:1], 76 + SCAN_GIVEN_UP_NS)
+    feed_all(assembler, cycle(2)[:1], 76 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 7
-    assembler.feed(cycle(2)[1:2], 77 + SCAN_GIVEN_UP_NS)
+    feed_all(assembler, cycle(2)[1:2], 77 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 14
     feed(assembler, cycle(2)[2:], 78 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 16
@@ -231,8 +238,8 @@ def feed_at(assembler: ScanAssembler, parts: list[Reading], time_ns: int = 0, *,
 def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
     """Feed a whole cycle at once."""
     if not stamped:
-        return assembler.feed(cycle(number), time_ns)
-    return assembler.feed(cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
+        return feed_all(assembler, cycle(number), time_ns)
+    return feed_all(assembler, cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
 
 
 @pytest.mark.parametrize("stamped", [False, True])
@@ -262,7 +269,7 @@ def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
         feed_cycle(assembler, number, 100 * number * MS, stamped=True)
     own_ns = [100 * MS + place // 8 * pause_ns for place in range(16)]
     parts = [slice(0, 16)] if together else [slice(0, 8), slice(8, 16)]
-    scans = [scan for part in parts for scan in assembler.feed(cycle(50)[part], 2000 * MS, own_ns[part], 0)]
+    scans = [scan for part in parts for scan in feed_all(assembler, cycle(50)[part], 2000 * MS, own_ns[part], 0)]
     assert [int(scan.fresh.sum()) for scan in scans] == ([16] if whole else [8, 8])
 
 
