@@ -248,9 +248,11 @@ class _Sensor:
             if not self._taxels:
                 self._opened_ns = time_ns
             self._taxels += taxels[at:end]
-            for axis, column in zip(self._columns, readings[1:], strict=True):
-                axis += column[at:end]
-            self._last = taxels[end - 1], *(axis[-1] for axis in self._columns)
+            x, y, z = self._columns
+            x += readings.x[at:end]
+            y += readings.y[at:end]
+            z += readings.z[at:end]
+            self._last = taxels[end - 1], x[-1], y[-1], z[-1]
             place = self.wire.places[taxels[end - 1]]
             self._place = max(self._place, place)
             self._own_ns = None if own_ns is None else own_ns[end - 1]

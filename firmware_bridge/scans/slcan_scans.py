@@ -53,7 +53,8 @@ class SlcanScans:
                 if head_ns < time_ns and stamps_ms and self._is_joined(stamps_ms[0], head_ns):
                     self._assembler.foreign += 1
                     flat, stamps_ms = flat[numbers:], stamps_ms[1:]
-                scans += self._feed(Readings(*(flat[at::numbers] for at in range(4))), stamps_ms, time_ns)
+                columns = flat[::numbers], flat[1::numbers], flat[2::numbers], flat[3::numbers]
+                scans += self._feed(Readings(*columns), stamps_ms, time_ns)
             head_ns = time_ns
         return scans
 
