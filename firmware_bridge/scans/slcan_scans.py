@@ -9,10 +9,11 @@ from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import Readings, ScanAssembler
-from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
 
 _MS_NS: Final = 1_000_000
 _WRAP_MS: Final = LAST_TIMESTAMP_MS + 1
+LONGEST_RUN_MS: Final = 50
+"""Longest time between stamps by the newest of which all are mapped to this machine's clock, in [ms]."""
 _LAYOUTS: Final = {PACKED_BYTES: ("HxHHHx", 4), STAMPED_BYTES: ("HxHHHxH", 5)}
 """Layouts of packed frames and the numbers in them, by their length: key and counts of a reading, stamp in [ms]."""
 
@@ -81,13 +82,16 @@ class SlcanScans:
         """Return the scans that a run of readings closes; the newest stamp, which was read soonest, gives the times."""
         device = None
         if stamps_ms and not self.clock.dropped:
-            first_ms, last_ms = stamps_ms[0], stamps_ms[-1]
-            rising = (last_ms - first_ms) * _MS_NS <= SCAN_GIVEN_UP_NS and list(stamps_ms) == sorted(stamps_ms)
-            if not rising:  # they wrap round, or are of no good clock: that shows in each of them
+            last_ms = stamps_ms[-1]
+            rising = list(stamps_ms) == sorted(stamps_ms)
+            if not rising or last_ms - stamps_ms[0] > LONGEST_RUN_MS:
+                # They wrap round, or are of no good clock, or may be of none: that shows in each, or in their parts.
+                size = (len(stamps_ms) + 1) // 2 if rising else 1
+                parts = [range(len(stamps_ms))[at : at + size] for at in range(0, len(stamps_ms), size)]
                 return [
                     scan
-                    for at, stamp_ms in enumerate(stamps_ms)
-                    for scan in self._feed(readings.taken([at]), [stamp_ms], time_ns)
+                    for part in parts
+                    for scan in self._feed(readings.taken(part), [stamps_ms[at] for at in part], time_ns)
                 ]
             device = self._device_time(last_ms, time_ns)
         if device is None:
