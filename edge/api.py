@@ -216,5 +216,6 @@ def open_source(
     if not give_up_s >= 0:
         raise UsageError(f"give_up_s is {give_up_s}, expected 0 or more")
     known = sensor_settings(sensor, id_map)
-    links = links_to(texts, known, rate_hz=rate_hz, give_up_s=give_up_s)
-    return Source(*links, sensor_file=with_recorded(known, links), rate_hz=rate_hz, force=force)
+    links = links_to(texts, known, rate_hz=rate_hz)
+    settings = with_recorded(known, links)
+    return Source(*links, sensor_file=settings, rate_hz=rate_hz, force=force, give_up_s=give_up_s)

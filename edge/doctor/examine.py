@@ -174,7 +174,7 @@ def prepare(
     if rate_hz is not None:
         check_positive("rate_hz", rate_hz)
     check_baselines(before, known.model_map.geometry)
-    (link,) = links_to(texts, known, rate_hz=rate_hz, give_up_s=0)
+    (link,) = links_to(texts, known, rate_hz=rate_hz)
     known = with_recorded(known, [link])
     return link, known, Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
 

@@ -80,7 +80,8 @@ def open_recording(
         for entry in [known.sensors.get(name, SensorEntry())]
     }
     known = replace(known, sensors=entries)
-    return Source(place_recordings(replay, paths, file.mountings), sensor_file=known, rate_hz=rate_hz)
+    place_recordings(replay, file.mountings)
+    return Source(replay, sensor_file=known, rate_hz=rate_hz)
 
 
 def recorded_baselines(text: str, known: SensorFile, rate_hz: float | None) -> tuple[dict[str, Baseline], list[str]]:

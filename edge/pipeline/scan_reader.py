@@ -16,6 +16,7 @@ from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
@@ -65,10 +66,12 @@ class Source:
         sensor_file: SensorFile | None = None,
         rate_hz: float | None = None,
         force: bool = False,
+        give_up_s: float = 0.0,
     ) -> None:
         """Prepare to read one or more links that are not open yet; this source opens and closes them.
 
-        With `force` a device also gets properties that the sensor file has from an emulated sensor.
+        With `force` a device also gets properties that the sensor file has from an emulated sensor. A lost link is
+        opened again; `give_up_s` is the longest time that one may be away, in [s], and at 0 its first loss is raised.
 
         Raises:
             SourceError: some are emulated and some are not: results of both kinds must not be mixed.
@@ -84,7 +87,8 @@ class Source:
         self._force = force
         self.overruns = 0
         self.pace = Pace()
-        self._links = links
+        self._stop = threading.Event()
+        self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
         self._last_ns = 0
         self._opened = self._closed = False
         self._opening: Future[None] | None = None
@@ -95,7 +99,6 @@ class Source:
         self._bell: SimpleQueue[None] = SimpleQueue()
         self._capacity_scans = capacity_scans
         self._through = False
-        self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self._reading = len(links)
         self._failed: Future[None] | None = None
@@ -173,29 +176,29 @@ class Source:
         """
         if not self._opened:
             raise self._not_open()
-        return self._links[0].kind
+        return self._readers[0].link.kind
 
     def steer(self) -> Callable[[PadPose | None], None] | None:
         """Return the function by which the emulated robot of the demo is asked where to tap next; None without."""
-        return next((asked for link in self._links if (asked := link.steer()) is not None), None)
+        return next((asked for one in self._readers if (asked := one.link.steer()) is not None), None)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of received, skipped and missed items so far, by name; sums over all links."""
-        counters = self._links[0].counters()
-        for link in self._links[1:]:
-            for name, count in link.counters().items():
+        counters = self._readers[0].counters()
+        for reader in self._readers[1:]:
+            for name, count in reader.counters().items():
                 counters[name] = counters.get(name, 0) + count
         return counters
 
     @property
     def unix_offset_ns(self) -> int | None:
         """Offset from scan time to [ns] since 1970, 0 if unknown; None for a live source."""
-        return (self._links[0].unix_offset_ns or 0) if self.patient else None
+        return (self._readers[0].link.unix_offset_ns or 0) if self.patient else None
 
     @property
     def origin(self) -> SourceKind | None:
         """Kind of source that the scans of a recording come from; None if unknown, or equal to `kind`."""
-        return one_origin(link.origin for link in self._links)
+        return one_origin(reader.link.origin for reader in self._readers)
 
     def unix_time_s(self) -> float:
         """Return the time in [s] since 1970: now, or for a patient source that of the last scan taken."""
@@ -237,9 +240,10 @@ class Source:
 
     def _open_links(self) -> None:
         with ExitStack() as opening:
-            for link in self._links:
-                opening.enter_context(link)
-            refuse_emulated(self.sensor_file, _one_kind(self._links), self._force)  # some know their kind only now
+            for reader in self._readers:
+                opening.enter_context(reader)
+            kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
+            refuse_emulated(self.sensor_file, kind, self._force)
             if not self.patient:
                 self._begin_reading()
                 opening.callback(self._end_reading)
@@ -249,10 +253,10 @@ class Source:
     def _begin_reading(self) -> None:
         # Until another pace is asked for, a model loads, and nobody needs the scans at once: reading several links by
         # frames would slow that down until the kernel had no room for more.
-        if len(self._links) > 1:
+        if len(self._readers) > 1:
             self.pace = Pace(0.01)
-        for link in self._links:
-            reading, thread = _started("scan-reader", partial(self._follow, link))
+        for reader in self._readers:
+            reading, thread = _started("scan-reader", partial(self._follow, reader))
             self._threads.append(thread)
             reading.add_done_callback(self._end)
 
@@ -261,39 +265,40 @@ class Source:
         for thread in self._threads:
             thread.join()
 
-    def _follow(self, link: Link) -> None:
+    def _follow(self, reader: LinkReader) -> None:
         """Read a link until it has ended, is lost for good, or all reading ends."""
+        link = reader.link
         while not (self._stop.is_set() or link.ended):
             scans: Sequence[Scan] = ()
             try:
-                scans = self._read(link)
+                self._await_pace(link)
+                scans = reader.read(POLL_S)
             finally:  # its notices come also before its end
-                notices: list[Notice | TimedPose] = [*link.notices()]
+                notices: list[Notice | TimedPose] = [*reader.notices()]
                 if link.kind != "device":  # recordings hold poses, and the demo's robot states some
                     notices += link.poses()
                 if notices or scans:
                     self._put(notices, scans)
 
-    def _read(self, link: Link) -> list[Scan]:
-        """Return the next scans of a link, which are read at this source's pace where the link can wait."""
+    def _await_pace(self, link: Link) -> None:
+        """Take what a link receives, at this source's pace where the link can wait, until it is made into scans."""
         pace = self.pace
         for _ in range(pace.reads if pace.every_s and link.fetches else 0):
             time.sleep(pace.every_s - time.monotonic() % pace.every_s)  # at the same times for all links
             link.fetch()
             if self.pace is not pace:
                 break
-        return link.read(POLL_S)
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
 
     def _take_next(self, timeout_s: float) -> list[Scan | Notice | TimedPose] | None:
-        (link,) = self._links
-        if link.ended:
+        (reader,) = self._readers
+        if reader.link.ended:
             return None
-        scans = link.read(timeout_s)
+        scans = reader.read(timeout_s)
         self._last_ns = scans[-1].time_ns if scans else self._last_ns
-        return [*link.notices(), *link.poses(), *scans]
+        return [*reader.notices(), *reader.link.poses(), *scans]
 
     def _put(self, notices: Sequence[Notice | TimedPose], scans: Sequence[Scan]) -> None:
         with self._lock:

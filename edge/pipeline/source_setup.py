@@ -1,6 +1,5 @@
 """Settings of the sensors, from a sensor file and the options next to it."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +47,6 @@ def links_to(
     known: SensorFile,
     *,
     rate_hz: float | None = None,
-    give_up_s: float = math.inf,
 ) -> list[Link]:
     """Return the links to the requested sources, else to the sensor file's adapter or the only one; not yet entered.
 
@@ -63,7 +61,7 @@ def links_to(
         texts = [f"slcan:serial={known.adapter}"]
     demo = any(text.rpartition("=")[2] in ("demo", DEMO_LOOP) for text in texts)
     recording = demo_recording() if demo else None
-    return open_sources(texts, rate_hz, recording, known.model_map, give_up_s, mountings=known.mountings)
+    return open_sources(texts, rate_hz, recording, known.model_map, mountings=known.mountings)
 
 
 def with_recorded(known: SensorFile, links: Iterable[Link]) -> SensorFile:

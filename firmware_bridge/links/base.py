@@ -60,7 +60,8 @@ class Link(Protocol):
         length_s: length of a recording, in [s]; None of anything else.
         mountings: mountings of the sensors whose scans come with their taxels in place, as in a recording.
         states_poses: True where poses of the sensors come with the scans.
-        prefix: beginning of the names of all its sensors.
+        prefix: beginning of the names of all its sensors: what the user calls it, and a slash.
+        lasts: True where it is opened again after a loss; a recording, or a demo, is over then.
         fetches: True if the system keeps for a while what is not read, and `fetch` takes it.
     """
 
@@ -76,6 +77,7 @@ class Link(Protocol):
     mountings: Mapping[str, Mounting] = MappingProxyType({})
     states_poses: bool = False
     prefix: str = ""
+    lasts: bool = True
     fetches: bool = False
 
     def __enter__(self) -> "Link": ...
@@ -207,7 +209,7 @@ class FrameLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return frozenset(self._stages.can_ids)
+        return self._stages.can_ids
 
     def _fetch(self, timeout_s: float) -> Any:
         """Return the next piece, None if none came in time."""

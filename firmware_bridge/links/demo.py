@@ -15,6 +15,7 @@ from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan
 
 _Stated = tuple[PadPose, bool]  # a pose, and whether the pad rests there until the next
@@ -105,14 +106,18 @@ class DemoLink(Link):
         emulator: the emulator, once the link was open.
     """
 
-    def __init__(self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False) -> None:
+    def __init__(
+        self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False, model: ModelMap = USPA44_MAP
+    ) -> None:
         self.name = "demo"
+        self.lasts = False
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
         self.emulator: Emulator | None = None
         self._recording = Path(recording)
         self._rate_hz = rate_hz
         self._loop = loop
+        self._model = model
         self._robot: Robot | None = None
         self._link: SlcanSerialLink | None = None
         self._counts: dict[str, int] = {}
@@ -126,7 +131,8 @@ class DemoLink(Link):
         except (BridgeError, ValueError) as error:
             raise DeviceError(f"the emulator did not start: {error}") from error
         emulator.__enter__()
-        self._robot, self.emulator, self._link = robot, emulator, SlcanSerialLink(emulator.port)
+        self._robot, self.emulator = robot, emulator
+        self._link = SlcanSerialLink(emulator.port, model=self._model)
         try:
             self._link.__enter__()
         except BaseException:

@@ -1,25 +1,21 @@
-"""Wrapper that gives a link its user's name, puts its taxels in place, and opens it again when it is lost or silent.
+"""Reader of a link for its source: opens it again when it is lost or silent, and tells what happened to it.
 
 It is also the border where the errors of drivers and of network libraries stop: each is the loss of one link.
 """
 
-import math
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import Final, Self, TypeVar
 
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, Notice, NoticeKind, SerialLine
-from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.links.base import Link, Notice, NoticeKind
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import LINK_SILENT_S
 
+FIRST_RETRY_S: Final = 0.1
 SOON_RETRY_S: Final = 0.5
 """Longest pause between tries in the first minute, in [s]: with the opening, a link that is back is used within 1 s."""
 LATE_RETRY_S: Final = 2.0
@@ -29,210 +25,162 @@ SOON_S: Final = 60.0
 _Answer = TypeVar("_Answer")
 
 
-class LastingLink(Link):
-    """Link that opens the wrapped link again whenever it is lost, and now and then while it is silent."""
+class LinkReader:
+    """Reader that opens its link again whenever it is lost, and now and then while it is silent.
+
+    Attributes:
+        link: the link.
+        outages: number of losses and silences so far.
+        reopenings: number of times that it was opened again.
+    """
 
     def __init__(
         self,
         link: Link,
-        give_up_s: float | None = math.inf,
+        give_up_s: float = 0.0,
         *,
-        name: str = "",
-        places: Mapping[str, Mounting] = MappingProxyType({}),
         clock_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        """Wrap a link that is not open yet, and whose first opening must succeed.
+        """Prepare to read a link that is not open yet, and whose first opening must succeed.
 
-        `give_up_s` is the longest outage or silence, in [s]; 0 allows no outage, but any silence, and None is for a
-        source that is not opened again, and counts no outages. With a `name` sensor "4" is "NAME/4". `places` are
-        mountings of sensors whose taxels come in the order of an id map, by the link's name of each; links that sort
-        readings by their id take a `placed_map` instead, which costs no time.
+        `give_up_s` is the longest outage or silence, in [s]; 0 allows no outage, but any silence, as for a link that
+        does not last. `sleep` waits for a time in [s], and returns True where reading is to end.
         """
-        self.name = link.name
-        self.kind = link.kind
-        self.ended = link.ended
-        self.patient = link.patient
-        self.unix_offset_ns = link.unix_offset_ns
-        self.origin = link.origin
-        self.length_s = link.length_s
-        self.states_poses = link.states_poses
-        self.fetches = link.fetches
-        self.prefix = f"{name}/" if name else ""
-        self.mountings = {f"{self.prefix}{sensor}": one for sensor, one in link.mountings.items()}
-        self._told_as = f"{name}: " if name else ""
-        self._places = dict(places)
-        self._link = link
-        self._give_up_s = give_up_s
-        self._clock_ns = clock_ns
-        self._sleep = sleep
-        self._entered = self._open = False
-        self._away = False
-        self._lost_ns: int | None = None
-        self._retry_ns = 0
-        self._delay_s = 0.1
-        self._received_ns = 0
-        self._silent_s = LINK_SILENT_S
-        self._silent = False
-        self._outages = 0
-        self._reopenings = 0
+        self.link = link
+        self.outages = self.reopenings = 0
+        self._give_up_s = give_up_s if link.lasts else 0.0
+        self._clock_ns, self._sleep = clock_ns, sleep
+        self._entered = False
+        self._kind = link.kind
+        self._trouble: str | None = None
+        self._stamps_dropped = False
         self._notices: list[Notice] = []
+        self._lost_ns: int | None = None  # beginning of an outage that has not ended
+        self._silent = self._away = False
+        self._begin_outage_times()
 
-    def __enter__(self) -> "LastingLink":
-        self._guarded(self._link.__enter__)
-        self.kind = self._link.kind
-        self._entered = self._open = True
+    def __enter__(self) -> Self:
+        self._guarded(self.link.__enter__)
+        self._entered = True
+        self._kind = self.link.kind
         self._received_ns = self._clock_ns()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        self._open = False
         if self._entered:
             self._entered = False
             with suppress(LinkLostError):  # it was lost anyway, or the run is over
-                self._guarded(self._link.__exit__, *exc_info)
+                self._guarded(self.link.__exit__, None, None, None)
 
     def read(self, timeout_s: float) -> list[Scan]:
-        """Return the scans that closed since the last call; an empty list while the link is away.
+        """Return the scans that closed since the last call; none while the link is away.
 
-        The next call closes and opens a link that is lost or silent, which may take long. It raises
+        A link that is lost or silent is closed and opened again by the next call, which may take long. It raises
         LinkLostError where it was away for longer than allowed.
         """
-        if not self._open:
-            self._come_back(timeout_s)
+        if self._away or not self._entered:
+            self._reopen()
             return []
         try:
-            scans = self._guarded(self._link.read, timeout_s)
+            scans = self._guarded(self.link.read, timeout_s)
         except LinkLostError as error:
-            self._close(f"{error}")
+            self._lose(f"{error}")
             return []
-        self.ended = self._link.ended
-        if self._link.trouble != self.trouble:
-            self.trouble = self._link.trouble
-            self._tell("well" if self.trouble is None else "trouble", self.trouble or f"{self.name} reports no trouble")
-        if self._link.stamps_dropped and not self.stamps_dropped:
-            self.stamps_dropped = True
-            text = "its time stamps do not run as this machine's clock does, and are left out"
-            self._tell("note", f"{self.name}: {text}")
+        self._report()
         if scans:
-            now_ns = self._clock_ns()
-            if self._lost_ns is not None or self._silent:
-                self._end_outage(now_ns)
-            self._received_ns = now_ns
-            if self._places:
-                scans = [self._places[one.sensor].place(one) if one.sensor in self._places else one for one in scans]
-            if self.prefix:
-                scans = [replace(scan, sensor=f"{self.prefix}{scan.sensor}") for scan in scans]
-        else:
+            if self._lost_ns is not None:
+                self._tell("back", f"{self.link.name} is back after {self._away_s():.1f} s")
+                self._lost_ns, self._silent = None, False
+                self._begin_outage_times()
+            self._received_ns = self._clock_ns()
+        elif self._give_up_s and not self.link.ended:
             self._suspect()
         return scans
 
-    def fetch(self) -> None:
-        """Take what the system has received of a link that is open."""
-        if self._open:
-            self._link.fetch()
-
     def notices(self) -> list[Notice]:
         """Return the events of the link since the last call, with the user's name for it."""
-        notices, self._notices = self._notices + self._link.notices(), []
+        notices, self._notices = self._notices + self.link.notices(), []
+        prefix = self.link.prefix
+        if not prefix:
+            return notices
         return [
-            notice._replace(sensors=f"{self.prefix}{notice.sensors}", text=notice.text and self._told_as + notice.text)
-            for notice in notices
+            one._replace(sensors=f"{prefix}{one.sensors}", text=one.text and f"{prefix[:-1]}: {one.text}")
+            for one in notices
         ]
 
-    def poses(self) -> list[TimedPose]:
-        """Return the poses since the last call; those of all its sensors stay those of all."""
-        poses = self._link.poses()
-        if not self.prefix:
-            return poses
-        return [one if one.sensor is None else replace(one, sensor=f"{self.prefix}{one.sensor}") for one in poses]
-
-    def steer(self) -> Callable[[PadPose | None], None] | None:
-        """Return the wrapped link's function that takes where to tap next."""
-        return self._link.steer()
-
     def counters(self) -> dict[str, int]:
-        """Return the wrapped link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
-        counters = self._link.counters()
-        if self._give_up_s is None:
-            return counters
-        return counters | {"outages": self._outages, "reopenings": self._reopenings}
+        """Return the link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
+        told = {"outages": self.outages, "reopenings": self.reopenings} if self.link.lasts else {}
+        return self.link.counters() | told
 
-    def can_ids(self) -> frozenset[int]:
-        """Return the CAN ids of the wrapped link."""
-        return self._link.can_ids()
+    def _begin_outage_times(self) -> None:
+        self._delay_s, self._silent_s = FIRST_RETRY_S, LINK_SILENT_S
 
-    def serial_line(self) -> SerialLine | None:
-        """Return the serial line of the wrapped link."""
-        return self._link.serial_line()
+    def _away_s(self) -> float:
+        return (self._clock_ns() - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9
 
-    def _away_s(self, now_ns: int) -> float:
-        return (now_ns - (self._received_ns if self._lost_ns is None else self._lost_ns)) / 1e9
-
-    def _end_outage(self, now_ns: int) -> None:
-        self._tell("back", f"{self.name} is back after {self._away_s(now_ns):.1f} s")
-        self._lost_ns, self._silent = None, False
-        self._delay_s, self._silent_s = 0.1, LINK_SILENT_S
+    def _report(self) -> None:
+        """Tell of a trouble that begins or ends, and of time stamps that are no clock."""
+        link = self.link
+        if link.trouble != self._trouble:
+            self._trouble = link.trouble
+            self._tell("well" if link.trouble is None else "trouble", link.trouble or f"{link.name} reports no trouble")
+        if link.stamps_dropped and not self._stamps_dropped:
+            self._stamps_dropped = True
+            self._tell(
+                "note", f"{link.name}: its time stamps do not run as this machine's clock does, and are left out"
+            )
 
     def _suspect(self) -> None:
-        """Schedule another opening of a silent link, less often each time."""
-        now_ns = self._clock_ns()
-        if self.ended or not self._give_up_s or now_ns - self._received_ns < self._silent_s * 1e9:
+        """Close a link that has been silent for long, less often each time, so that it is opened again."""
+        if (self._clock_ns() - self._received_ns) / 1e9 < self._silent_s:
             return
-        if not self._silent and self._lost_ns is None:
-            self._silent = True
-            self._outages += 1
-            self._tell("silent", f"no scan from {self.name} for {self._silent_s:.1f} s: opening it again")
-        away_s = self._away_s(now_ns)
-        if away_s >= self._give_up_s:
-            raise LinkLostError(f"{self.name} gave no scan for {away_s:.0f} s: check the sensor's power and its cable")
+        name = self.link.name
+        if self._lost_ns is None:
+            self._lost_ns, self._silent = self._received_ns, True
+            self.outages += 1
+            self._tell("silent", f"no scan from {name} for {self._silent_s:.1f} s: opening it again")
+        if self._away_s() >= self._give_up_s:
+            raise LinkLostError(
+                f"{name} gave no scan for {self._away_s():.0f} s: check the sensor's power and its cable"
+            )
         self._silent_s += min(self._silent_s, LATE_RETRY_S)
-        self._open = False
+        self.__exit__()
 
-    def _reopen(self, now_ns: int) -> None:
-        try:
-            self._guarded(self._link.__enter__)
-        except DeviceError as error:
-            self._close(f"{error}", now_ns)
-        else:
-            self._reopenings += 1
-            self._entered = self._open = True
-            if self._link.kind != self.kind:  # every result would go on to state the first kind
-                raise LinkLostError(f"{self.name} was {self.kind} and came back as {self._link.kind}: start again")
-
-    def _close(self, why: str, now_ns: int | None = None) -> None:
-        now_ns = self._clock_ns() if now_ns is None else now_ns
-        self._open = False
+    def _lose(self, why: str) -> None:
+        """Begin, or go on with, an outage; raises LinkLostError if it lasts for too long."""
         self._away = True
         if not self._give_up_s:
             raise LinkLostError(why)
-        if self._lost_ns is None:
-            self._outages += not self._silent
-            self._lost_ns = now_ns if not self._silent else self._received_ns
+        if self._lost_ns is None or self._silent:
+            self.outages += not self._silent
+            self._lost_ns = self._clock_ns() if self._lost_ns is None else self._lost_ns
+            self._silent = False
             self._tell("lost", f"{why}; trying again until it is back")
-        elif now_ns - self._lost_ns >= self._give_up_s * 1e9:
-            raise LinkLostError(f"{self.name} was away for {self._give_up_s:g} s: {why}")
-        longest_s = SOON_RETRY_S if now_ns - self._lost_ns < SOON_S * 1e9 else LATE_RETRY_S
-        self._retry_ns = now_ns + int(min(self._delay_s, longest_s) * 1e9)
-        self._delay_s = min(2 * self._delay_s, LATE_RETRY_S)
+        elif self._away_s() >= self._give_up_s:
+            raise LinkLostError(f"{self.link.name} was away for {self._give_up_s:g} s: {why}")
 
-    def _come_back(self, timeout_s: float) -> None:
-        """Close the link if it is still open, and open it again: at once if it was silent, else when a try is due."""
-        self.__exit__(None, None, None)
-        if not self._away:
-            self._reopen(self._clock_ns())
+    def _reopen(self) -> None:
+        """Open the link again: at once if it was silent, after a pause if it was lost."""
+        self.__exit__()
+        if self._away:
+            if self._sleep(min(self._delay_s, SOON_RETRY_S if self._away_s() < SOON_S else LATE_RETRY_S)):
+                return
+            self._delay_s = min(2 * self._delay_s, LATE_RETRY_S)
+            self._received_ns, self._silent_s = self._clock_ns(), LINK_SILENT_S  # its silence begins with the opening
+        try:
+            self._guarded(self.link.__enter__)
+        except DeviceError as error:
+            self._lose(f"{error}")
             return
-        wait_s = (self._retry_ns - self._clock_ns()) / 1e9
-        if wait_s > 0:
-            self._sleep(min(wait_s, timeout_s))
-        now_ns = self._clock_ns()
-        if now_ns >= self._retry_ns:
-            self._received_ns, self._silent_s = now_ns, LINK_SILENT_S  # its silence begins with the opening
-            self._away = False
-            self._reopen(now_ns)
+        self._entered, self._away = True, False
+        self.reopenings += 1
+        if self.link.kind != self._kind:  # every result would go on to state the first kind
+            raise LinkLostError(f"{self.link.name} was {self._kind} and came back as {self.link.kind}: start again")
 
     def _guarded(self, call: Callable[..., _Answer], *arguments: object) -> _Answer:
-        """Return what the wrapped link returns; any error that no link is expected to raise is a LinkLostError."""
+        """Return what the link returns; any error that no link is expected to raise is a LinkLostError."""
         try:
             return call(*arguments)
         except BridgeError:
@@ -241,7 +189,7 @@ class LastingLink(Link):
             place = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{'/'.join(Path(place.filename).parts[-2:])}, line {place.lineno}"
             text = " ".join(f"{type(error).__name__} {error}".split())
-            raise LinkLostError(f"{self.name}: link lost by an unforeseen {text} ({where})") from error
+            raise LinkLostError(f"{self.link.name}: link lost by an unforeseen {text} ({where})") from error
 
     def _tell(self, kind: NoticeKind, text: str) -> None:
         self._notices.append(Notice(self._clock_ns(), kind, text))

@@ -1,21 +1,21 @@
 """Parser of the sources that a user names, into links."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
-from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
 from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
     from firmware_bridge.links.replay import ReplayLink
+    from firmware_bridge.recording.tracks import Recording
 
 FORMS: Final = {
     "slcan:/dev/ttyUSB0[@baud]": "serial CAN adapter, such as VScom or CANable",
@@ -40,15 +40,13 @@ def open_sources(
     rate_hz: float | None = None,
     demo_recording: str | Path | None = None,
     model: ModelMap = USPA44_MAP,
-    give_up_s: float = math.inf,
     *,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
 ) -> list[Link]:
-    """Create the links that `texts` name, not yet entered, as `open_source` does; a lost one is opened again.
+    """Create the links that `texts` name, not yet entered, as `open_source` does.
 
     Each text is one of FORMS, or NAME=FORM: sensor "4" of NAME is then "NAME/4", also in `mountings`. Among several
-    sources, those without a name are called by their place, source1 and so on. `give_up_s` is the longest outage of a
-    source, in [s]; at 0 its first loss is raised.
+    sources, those without a name are called by their place, source1 and so on.
 
     Raises:
         SourceError: no such form, or one name twice; and the other errors of `open_source`.
@@ -57,16 +55,16 @@ def open_sources(
     for number, text in enumerate(texts or [None], 1):
         match = None if text is None else re.fullmatch(r"([A-Za-z0-9_-]+)=(.+)", text, re.DOTALL)
         name, form = (match[1], match[2]) if match else (f"source{number}" if len(texts) > 1 else "", text)
+        prefix = f"{name}/" if name else ""
         own = {
-            sensor.removeprefix(f"{name}/"): one
+            sensor: one
             for sensor, one in mountings.items()
-            if (sensor.startswith(f"{name}/") if name else "/" not in sensor)
+            if (sensor.startswith(prefix) if prefix else "/" not in sensor)
         }
-        link = open_source(form, rate_hz, demo_recording, model, own)
+        link = open_source(form, rate_hz, demo_recording, model, own, prefix=prefix)
         if name in named:
             raise SourceError(f"two sources are named {name!r}: give each a name of its own, --source NAME=SRC")
-        finite = (form or "").startswith(("demo", "replay:"))  # which are not opened again after their end
-        named[name] = LastingLink(link, None if finite else give_up_s, name=name) if name or not finite else link
+        named[name] = link
     return list(named.values())
 
 
@@ -76,18 +74,32 @@ def open_source(
     demo_recording: str | Path | None = None,
     model: ModelMap = USPA44_MAP,
     mountings: Mapping[str, Mounting] = MappingProxyType({}),
+    *,
+    prefix: str = "",
 ) -> Link:
     """Create the link that `text`, one of FORMS, names, not yet entered; for None that of the only known adapter.
 
-    `rate_hz` is that at which recordings are played, among them the demo's; a device has its own. `mountings` are of
-    its sensors, by name; recordings of edge-sr are in place already.
+    `rate_hz` is that at which recordings are played, among them the demo's; a device has its own. `prefix` begins the
+    names of its sensors, and `mountings` are theirs by these names; recordings of edge-sr are in place already.
 
     Raises:
         SourceError: no such form.
         NoDeviceError: no adapter, or several without a choice.
         RecordingError: a recording that cannot be used.
     """
-    model = placed_map(model, mountings)
+    link = _link_of(text, rate_hz, demo_recording, placed_map(model, mountings, prefix), mountings, prefix)
+    link.prefix = prefix
+    return link
+
+
+def _link_of(
+    text: str | None,
+    rate_hz: float | None,
+    demo_recording: str | Path | None,
+    model: ModelMap,
+    mountings: Mapping[str, Mounting],
+    prefix: str,
+) -> Link:
     scheme, _, rest = (text or "").partition(":")
     if text is None or scheme == "slcan":
         from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
@@ -99,7 +111,7 @@ def open_source(
     if scheme == "xela-server" and rest:
         from firmware_bridge.links.xela_server import XelaServerLink
 
-        return _placed(XelaServerLink(rest, geometry=model.geometry), mountings, tells_newtons=True)
+        return XelaServerLink(rest, geometry=model.geometry, prefix=prefix, mountings=mountings)
     if text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
@@ -111,13 +123,15 @@ def open_source(
         return CanBusLink(interface, channel, model=model, triggers=trigger_frames(model))
     if scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
+        from firmware_bridge.recording.formats import load_recording
 
-        paths = recording_paths(rest)
-        return place_recordings(ReplayLink(paths, rate_hz), paths, mountings)
+        replay = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
+        place_recordings(replay, mountings)
+        return replay
     if text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
-        return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP)
+        return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP, model=placed_map(USPA44_MAP, {}, prefix))
     raise _refusal(text)
 
 
@@ -126,22 +140,37 @@ def recording_paths(text: str) -> list[str]:
     return [text] if Path(text).exists() else text.split(",")
 
 
-def place_recordings(link: "ReplayLink", paths: Sequence[str | Path], mountings: Mapping[str, Mounting]) -> Link:
-    """Wrap a link that plays these files so that all taxels are in place: those of a CSV are as wired.
+def place_recordings(link: "ReplayLink", mountings: Mapping[str, Mounting]) -> None:
+    """Let a link put all taxels of its recordings in place: those of a CSV are as wired.
 
     Raises:
         SourceError: a CSV is of a pad with another number of taxels than its mounting.
     """
-    raw = {path.stem: path for path in map(Path, paths) if path.suffix.lower() == ".csv"}
-    mounted = {name: one for name, one in mountings.items() if name in raw}
-    for track in (track for recording in link.recordings for track in recording.tracks):
-        one, taxels = mounted.get(track.sensor), track.geometry.taxel_count
-        if one is not None and one.taxel_count != taxels:
+    raw = {
+        track.sensor: (recording.path, track)
+        for recording in link.recordings
+        if recording.path.suffix.lower() == ".csv"
+        for track in recording.tracks
+        if track.sensor in mountings
+    }
+    for sensor, (path, track) in raw.items():
+        taxels, expected = track.geometry.taxel_count, mountings[sensor].taxel_count
+        if taxels != expected:
             raise SourceError(
-                f"{raw[track.sensor]} has {taxels} taxels, and in the sensor file sensor {track.sensor} has "
-                f"{one.taxel_count}: leave out the sensor file, or give that of this pad"
+                f"{path} has {taxels} taxels, and in the sensor file sensor {sensor} has {expected}: leave out the "
+                "sensor file, or give that of this pad"
             )
-    return _placed(link, mounted)
+    link.place({sensor: mountings[sensor] for sensor in raw})
+
+
+def _named(recording: "Recording", prefix: str) -> "Recording":
+    """Return a recording whose sensors' names begin with `prefix`."""
+    return replace(
+        recording,
+        tracks=tuple(replace(one, sensor=prefix + one.sensor) for one in recording.tracks),
+        mountings={prefix + sensor: one for sensor, one in recording.mountings.items()},
+        poses=[one if one.sensor is None else replace(one, sensor=prefix + one.sensor) for one in recording.poses],
+    )
 
 
 def _port_and_baud(text: str, rest: str) -> tuple[str, int | None]:
@@ -156,14 +185,6 @@ def _port_and_baud(text: str, rest: str) -> tuple[str, int | None]:
     if port.startswith("serial="):
         port = find_by_serial(port.removeprefix("serial="), serial_ports()).path
     return port, int(baud) if at else None
-
-
-def _placed(link: Link, mountings: Mapping[str, Mounting], *, tells_newtons: bool = False) -> Link:
-    """Put taxels in their places for a link without CAN ids, and turn its forces, if any, to the pad's axes."""
-    moved = {name: one for name, one in mountings.items() if one.moves_taxels or (tells_newtons and one.reverses_axes)}
-    if not moved:
-        return link
-    return LastingLink(link, None, places=moved)
 
 
 def _refusal(text: str) -> SourceError:

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -85,6 +85,7 @@ class ReplayLink(Link):
             raise SourceError(f"{timed} has times of its own, which are kept: leave out --rate-hz, or add --paced")
         self.name = harmless(f"replay:{','.join(str(one.path) for one in self.recordings)}")
         self.kind: SourceKind = "replay"
+        self.lasts = False
         self.patient = not paced
         self.origin = one_origin(recording.origin for recording in self.recordings)
         self.mountings = {
@@ -150,6 +151,15 @@ class ReplayLink(Link):
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             scans.append(self._take())
         return scans
+
+    def place(self, mountings: Mapping[str, Mounting]) -> None:
+        """Put the taxels of sensors that were recorded as wired in their places, by the mountings of these sensors."""
+        self._tracks = [
+            replace(track, counts=mountings[track.sensor].place_counts(track.counts))
+            if track.sensor in mountings
+            else track
+            for track in self._tracks
+        ]
 
     def notices(self) -> list[Notice]:
         """Return the notes on the files, once."""

@@ -20,7 +20,7 @@ from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMP
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread, not_open
-from firmware_bridge.links.fd_reader import BurstReader, Piece
+from firmware_bridge.links.fd_reader import Piece, PortReader
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
 from firmware_bridge.links.usb_devices import in_use
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
@@ -89,7 +89,7 @@ class SlcanSerialLink(Link):
         self._dropped_bytes = 0
         self._unread = Unread()
         self._serial: serial.Serial | None = None
-        self._bursts: BurstReader | None = None
+        self._reader: PortReader | None = None
         self.fetches = True
         self._fetched: list[Piece] = []
 
@@ -106,7 +106,7 @@ class SlcanSerialLink(Link):
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        port, self._serial, self._bursts = self._serial, None, None
+        port, self._serial, self._reader = self._serial, None, None
         if port is None:
             return
         self._drop_fetched()
@@ -123,10 +123,10 @@ class SlcanSerialLink(Link):
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the port is gone."""
-        if self._bursts is None or self._serial is None:
+        if self._reader is None or self._serial is None:
             raise not_open()
         try:
-            pieces = self._take_fetched() or [self._receive(self._bursts, timeout_s)]
+            pieces = self._take_fetched() or [self._reader.read(timeout_s, self._scans.bytes_until_scan())]
         except _PORT_ERRORS as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
         scans: list[Scan] = []
@@ -150,12 +150,12 @@ class SlcanSerialLink(Link):
 
     def fetch(self) -> None:
         """Take the bytes there, without waiting for more."""
-        if self._bursts is None:
+        if self._reader is None:
             return
         with suppress(*_PORT_ERRORS):  # the next read reports it
-            data = self._bursts.take_all()
-            if data:
-                self._fetched.append(Piece(data, time.monotonic_ns(), round(self._bursts.empty_s * 1e9)))
+            piece = self._reader.take()
+            if piece.data:
+                self._fetched.append(piece)
 
     def _take_fetched(self) -> list[Piece]:
         pieces, self._fetched = self._fetched, []
@@ -163,14 +163,6 @@ class SlcanSerialLink(Link):
 
     def _drop_fetched(self) -> None:
         self._dropped_bytes += sum(len(piece.data) for piece in self._take_fetched())
-
-    def _receive(self, bursts: BurstReader, timeout_s: float) -> Piece:
-        """Return the bytes to decode, as soon as a scan may close."""
-        data = bursts.read(timeout_s, self._scans.bytes_until_scan())
-        empty_ns = round(bursts.empty_s * 1e9)
-        with suppress(OSError):  # the next call reports an error after bytes
-            bursts.look()
-        return Piece(data, time.monotonic_ns(), empty_ns)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of bytes received, and dropped on opening or closing, and the stages' counters."""
@@ -180,7 +172,7 @@ class SlcanSerialLink(Link):
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
-        return frozenset(self._scans.can_ids)
+        return self._scans.can_ids
 
     def serial_line(self) -> SerialLine:
         """Return the port and its speed."""
@@ -209,7 +201,7 @@ class SlcanSerialLink(Link):
             port.write(command)
             _wait_until_sent(port)
         self._drop_old_bytes(port)
-        self._bursts = BurstReader(port.fileno())  # empty from here on: this thread may not run for long after OPEN
+        self._reader = PortReader(port.fileno())  # empty from here on: this thread may not run for long after OPEN
         port.write(OPEN)
         for frame in self._triggers:
             _wait_until_sent(port)
@@ -229,8 +221,8 @@ class SlcanSerialLink(Link):
             _say(port, command)
         with suppress(*_PORT_ERRORS):  # gone, which the next read reports
             self._drop_old_bytes(port)
-            if self._bursts is not None:
-                self._bursts.look()
+            if self._reader is not None:
+                self._reader = PortReader(port.fileno())
         self._begin_anew()
         _say(port, OPEN)
 

@@ -3,8 +3,9 @@
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from threading import Event
+from types import MappingProxyType
 from typing import Final, Self
 from urllib.parse import urlsplit
 
@@ -20,6 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
 from firmware_bridge.scans.xela_server_scans import ServerScans
@@ -29,7 +31,7 @@ OPENING_S: Final = 3.0
 REOPENING_S: Final = 1.0  # time-out of a reopening, in [s]: a server that hangs must not delay other sources for longer
 ANSWER_S: Final = 1.0
 """Time-out of a ping, in [s]: a link read by itself reports a pulled cable, or a server that hangs, after 1.75 s
-without a message. LastingLink reopens it before that, and a server that hangs then fails in the handshake."""
+without a message. Its reader reopens it before that, and a server that hangs then fails in the handshake."""
 
 
 class XelaServerLink(Link):
@@ -44,14 +46,23 @@ class XelaServerLink(Link):
     """
 
     def __init__(
-        self, url: str, *, geometry: SensorGeometry = USPA44, clock_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        url: str,
+        *,
+        geometry: SensorGeometry = USPA44,
+        prefix: str = "",
+        mountings: Mapping[str, Mounting] = MappingProxyType({}),
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL."""
+        """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL.
+
+        `prefix` begins the names of its sensors; `mountings`, by these names, put taxels and the server's forces right.
+        """
         self._address = server_address(url)
         self.name = f"xela-server:{url}"
         self.kind: SourceKind = "device"
         self.url = self._address[2]
-        self._scans = ServerScans(geometry)
+        self._scans = ServerScans(geometry, prefix, mountings)
         self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0

@@ -10,52 +10,17 @@ unused. The unused bytes are not zero. The id of a taxel depends on the controll
 A sensor's label does not show its map; with the wrong one, half of the taxels stay silent.
 """
 
-import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from firmware_bridge.can.slcan import PACKED_BYTES, CanFrame
+from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.pad_geometry import MOST_TAXELS, USPA44, USPA46, SensorGeometry
 
 CONTROLLERS: Final = range(16)
 
 BOARDS: Final = range(1, 8)
-_unpack_xyz = struct.Struct(">HHH").unpack_from
-_unpack_packed = struct.Struct(">HxHHHx").unpack_from
-
-
-class Reading(NamedTuple):
-    """Raw counts of one taxel; `taxel` is its index, row-major from the top left."""
-
-    sensor: str
-    taxel: int
-    x: int
-    y: int
-    z: int
-
-
-class Cycle(NamedTuple):
-    """A scan on the wire: its sensor, its taxels in their order of arrival, and functions that put them in place."""
-
-    sensor: str
-    taxels: tuple[int, ...]
-    unpack: Callable[[bytes], tuple[int, ...]]
-    unpack_stamped: Callable[[bytes], tuple[int, ...]]
-    in_place: Callable[[Sequence[int]], tuple[int, ...]]
-    pack: Callable[..., bytes]
-
-    def counts(self, packed: bytes) -> NDArray[np.int32]:
-        """Return the counts in frames that `SlcanDecoder.cut` packed, stamped or not: (3, taxels), read-only."""
-        unpack = self.unpack if len(packed) == PACKED_BYTES * len(self.taxels) else self.unpack_stamped
-        # Plain integers up to the last step: for so few it takes a third of numpy's time, and less code has to be
-        # fetched where the processor slept since the scan before.
-        return np.frombuffer(self.pack(*self.in_place(unpack(packed))), dtype=np.int32).reshape(3, -1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,39 +39,6 @@ class ModelMap:
     def wire_order(self, sensor: str) -> list[tuple[int, int]]:
         """Return (CAN id, taxel) of one sensor by ascending id, which is the order of SDA, then taxel."""
         return sorted((can_id, taxel) for can_id, (name, taxel) in self.taxels.items() if name == sensor)
-
-    def cycle(self, can_ids: Sequence[int]) -> Cycle | None:
-        """Return the cycle in which these ids are every taxel of a sensor once, None if they are not."""
-        places = [self.taxels.get(can_id) for can_id in can_ids]
-        names = {place[0] if place is not None else None for place in places}
-        taxels = tuple(place[1] for place in places if place is not None)
-        if len(names) != 1 or sorted(taxels) != list(range(self.geometry.taxel_count)):
-            return None
-        frame_of = {taxel: frame for frame, taxel in enumerate(taxels)}
-        places_of_values = [3 * frame_of[taxel] + axis for axis in range(3) for taxel in range(len(taxels))]
-        return Cycle(
-            str(names.pop()),
-            taxels,
-            struct.Struct(">" + "3xHHHx" * len(taxels)).unpack,
-            struct.Struct(">" + "3xHHH3x" * len(taxels)).unpack,
-            itemgetter(*places_of_values),
-            struct.Struct(f"={3 * len(taxels)}i").pack,
-        )
-
-
-def decode(frame: CanFrame, model: ModelMap) -> Reading | None:
-    """Decode the reading in a frame, None if the frame is not one of this model's."""
-    place = model.taxels.get(frame.can_id)
-    if place is None or frame.extended or frame.remote or len(frame.data) != 8:
-        return None
-    return Reading(*place, *_unpack_xyz(frame.data, 1))
-
-
-def decode_packed(packed: bytes, offset: int, model: ModelMap) -> Reading | None:
-    """Decode the reading in one frame at `offset` of frames that `SlcanDecoder.cut` packed."""
-    id_and_length, x, y, z = _unpack_packed(packed, offset)
-    place = model.taxels.get(id_and_length >> 4)
-    return None if place is None else Reading(*place, x, y, z)
 
 
 def trigger_frames(model: ModelMap) -> list[CanFrame]:

@@ -15,14 +15,17 @@ class FrameScans:
     Attributes:
         clock: the adapter's clock.
         errors: what the adapter reported of its bus.
-        can_ids: the standard CAN ids received so far, of any device.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
         self.clock = DeviceClock(1_000, None)
         self.errors = BusErrors()
         self._assembler = ScanAssembler(model)
-        self.can_ids = self._assembler.can_ids
+
+    @property
+    def can_ids(self) -> frozenset[int]:
+        """Standard CAN ids received so far, of any device."""
+        return self._assembler.can_ids
 
     def begin_anew(self) -> None:
         """Discard open scans, since the link was broken."""

@@ -133,20 +133,20 @@ class Mounting:
         return gains * np.asarray(self.signs, dtype=np.float32)[:, None]
 
 
-def placed_map(model: ModelMap, mountings: Mapping[str, Mounting]) -> ModelMap:
+def placed_map(model: ModelMap, mountings: Mapping[str, Mounting], prefix: str = "") -> ModelMap:
     """Return the map of sensors as they are wired with taxels at their places on the pad; it sorts every scan anyway.
 
-    `mountings` are by sensor name; a sensor without one keeps the order of the map.
+    Names of sensors begin with `prefix`, and `mountings` are by these; a sensor without one keeps the order of the map.
     """
     place_of = {
         sensor: {taxel: place for place, taxel in enumerate(mounting.order)}
         for sensor, mounting in mountings.items()
         if mounting.moves_taxels
     }
-    if not place_of:
+    if not place_of and not prefix:
         return model
     placed = {
-        can_id: (sensor, place_of[sensor][taxel] if sensor in place_of else taxel)
+        can_id: (prefix + sensor, place_of[prefix + sensor][taxel] if prefix + sensor in place_of else taxel)
         for can_id, (sensor, taxel) in model.taxels.items()
     }
     return replace(model, taxels=MappingProxyType(placed))

@@ -1,4 +1,4 @@
-"""Assembly of taxel readings to scans. No I/O, no clock.
+"""Assembly of the frames on a wire to scans. No I/O, no clock.
 
 The wire has no end-of-scan marker. A scan closes when every taxel has come, or the last one of the sensor's cycle, or
 when the next reading belongs to another cycle: after a pause, or where the order of the taxels has wrapped round
@@ -8,20 +8,32 @@ the cycle into which the link was opened, and fragments of fewer than half of th
 Without time stamps a whole cycle that ends late waits for the next ones to show whether a cycle was lost: with sixteen
 frames lost between them, its halves may be of two. Then it is left out, too. Limit: nothing closes while no reading
 comes, so half a scan at the end of a stream is never returned.
+
+Frames that were read together are taken together: those of a sensor that go on in its order, without a pause, join its
+open scan at once. So a scan costs little, also where the frames of several sensors mix, and a read ends within it.
 """
 
-from typing import Final
+import struct
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from itertools import pairwise
+from operator import itemgetter
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.pad_geometry import SensorGeometry
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, Cycle, ModelMap, Reading, decode
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.device_clock import DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
-from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, SHORTEST_PAUSE_NS, WireCycle
+from firmware_bridge.scans.wire_cycle import LONGEST_PAUSE_NS, WireCycle
 from firmware_bridge.schedule import SCAN_GIVEN_UP_NS
+
+READING_BYTES: Final = 8
+"""Bytes of the data of a reading: one unused, X, Y, Z as unsigned big-endian 16 bit, one unused. The unused ones are
+not zero."""
 
 _COUNTED: Final[tuple[str, ...]] = (
     "scans",
@@ -34,6 +46,25 @@ _COUNTED: Final[tuple[str, ...]] = (
     "abandoned",
     "resynchronised",
 )
+_unpack_counts = struct.Struct(">xHHHx").unpack
+
+
+def key(can_id: int) -> int:
+    """Return the beginning of a reading's frame as one number: twelve bits of id, and four of its length."""
+    return can_id << 4 | READING_BYTES
+
+
+class Readings(NamedTuple):
+    """Readings that came together, one place of each column for each: the `key` of its id, and its counts."""
+
+    keys: tuple[int, ...]
+    x: tuple[int, ...]
+    y: tuple[int, ...]
+    z: tuple[int, ...]
+
+    def taken(self, places: Sequence[int]) -> "Readings":
+        """Return those at some places."""
+        return Readings(*(tuple(column[place] for place in places) for column in self))
 
 
 class ScanAssembler:
@@ -45,92 +76,98 @@ class ScanAssembler:
     Memory: one open scan per sensor name; a ModelMap has at most 16 names.
 
     Attributes:
-        can_ids: the standard CAN ids received so far, of any device.
         foreign: number of frames that are of no taxel of this model.
     """
 
     def __init__(self, model: ModelMap = USPA44_MAP) -> None:
-        self.can_ids: set[int] = set()
         self.foreign = 0
         self._model = model
-        self._geometry = model.geometry
-        self._taxels = model.geometry.taxel_count
+        self._places = {key(can_id): place for can_id, place in model.taxels.items()}
+        self._keys = set[int]()  # bounded: there are at most 2048 of standard ids
+        self._runs = lru_cache(maxsize=32)(self._find_runs)  # those of whole cycles come again and again
         self._readings = 0
         self._newest_ns = 0
         self._sensors: dict[str, _Sensor] = {}
 
-    def feed_frame(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Return the scans that a frame closes, whatever it holds; otherwise as `feed`."""
-        if not frame.extended:  # bounded: there are at most 2048 of these
-            self.can_ids.add(frame.can_id)
-        reading = decode(frame, self._model)
-        if reading is None:
-            self.foreign += 1
-            return []
-        return self.feed(reading, time_ns, device)
+    @property
+    def can_ids(self) -> frozenset[int]:
+        """Standard CAN ids received so far, of any device."""
+        return frozenset(one >> 4 for one in self._keys)
 
-    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
-        """Return the scans that this reading closes; `device` is when it was on the bus, by its time stamp."""
-        self._readings += 1
+    def feed_frame(self, frame: CanFrame, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+        """Return the scans that a frame closes, whatever it holds; `device` is when it was on the bus, by its stamp."""
+        if frame.extended or frame.remote or len(frame.data) != READING_BYTES:
+            self.foreign += 1
+            if not frame.extended:
+                self._keys.add(key(frame.can_id))
+            return []
+        readings = Readings((key(frame.can_id),), *zip(_unpack_counts(frame.data)))
+        if device is None:
+            return self.feed(readings, time_ns)
+        return self.feed(readings, time_ns, [device.own_ns], device.host_ns - device.own_ns)
+
+    def feed(
+        self, readings: Readings, time_ns: int, own_ns: Sequence[int] | None = None, offset_ns: int = 0
+    ) -> list[Scan]:
+        """Return the scans that readings close, which arrived together at `time_ns` in [ns], in their order on the bus.
+
+        With time stamps `own_ns` are the times at which they were on the bus by the device's own clock, and `offset_ns`
+        is that from it to the host's, in [ns].
+        """
         self._newest_ns = time_ns
-        return self._sensor(reading.sensor).feed(reading, time_ns, device)
+        runs, keys = self._runs(readings.keys), len(readings.keys)
+        closed: list[tuple[int, Scan]] = []
+        sorted_out = 0
+        for name, (numbers, taxels) in runs.items():
+            sorted_out += len(numbers)
+            mine, times_ns = readings, own_ns
+            if len(numbers) < keys:
+                mine = readings.taken(numbers)
+                times_ns = None if own_ns is None else [own_ns[number] for number in numbers]
+            found = self._sensor(name).feed(mine, taxels, time_ns, times_ns, offset_ns)
+            closed += [(numbers[at], scan) for at, scan in found]
+        self._readings += sorted_out
+        self.foreign += keys - sorted_out
+        if len(runs) > 1:
+            closed.sort(key=itemgetter(0))
+        return [scan for _, scan in closed]
+
+    def _find_runs(self, keys: tuple[int, ...]) -> dict[str, tuple[list[int], list[int]]]:
+        """Return the numbers and the taxels of each sensor's readings among those with these keys."""
+        self._keys.update(keys)
+        runs: dict[str, tuple[list[int], list[int]]] = {}
+        for number, one in enumerate(keys):
+            name, taxel = self._places.get(one, ("", 0))
+            if name:
+                numbers, taxels = runs.setdefault(name, ([], []))
+                numbers.append(number)
+                taxels.append(taxel)
+        return runs
 
     def _sensor(self, name: str) -> "_Sensor":
         sensor = self._sensors.get(name)
         if sensor is None:
             order = [taxel for _, taxel in self._model.wire_order(name)]
-            sensor = self._sensors[name] = _Sensor(name, self._geometry, order)
+            sensor = self._sensors[name] = _Sensor(name, self._model.geometry, order)
         return sensor
-
-    def longest_cycle_ns(self, cycle: Cycle, arrival_ns: int | None = None) -> int:
-        """Return the longest pause, in [ns], in a cycle that may be fed as one; 0: feed its readings one by one.
-
-        `arrival_ns` is given for a cycle without time stamps.
-        """
-        sensor = self._sensors.get(cycle.sensor)
-        if sensor is None or not sensor.awaits(cycle):
-            return 0
-        if sensor.wire.in_pieces if arrival_ns is None else sensor.doubts(arrival_ns):
-            return 0
-        return sensor.wire.pause_ns if sensor.wire.gaps_ns is None else SHORTEST_PAUSE_NS
-
-    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None = None) -> Scan:
-        """Return the scan of a cycle that came as one, where `longest_cycle_ns` allows it.
-
-        Its frames are packed as `SlcanDecoder.cut` does; `device` is when the last of them was on the bus.
-        """
-        self._readings += len(cycle.taxels)
-        self._newest_ns = time_ns
-        return self._sensors[cycle.sensor].feed_cycle(cycle, packed, time_ns, device)
-
-    def is_open(self, sensor: str) -> bool:
-        """Return True if a scan of the sensor is open."""
-        return sensor in self._sensors and self._sensors[sensor].open
 
     def begin_anew(self) -> None:
         """Discard open scans: the link broke, and the next readings do not belong to them."""
         for sensor in self._sensors.values():
             sensor.begin_anew()
 
-    def abandon(self, sensor: str, readings: int) -> None:
-        """Count readings of a sensor that were not fed when the link broke; no scan closes by them."""
-        self._readings += readings
-        self._sensor(sensor).counts["abandoned"] += readings
-
     def fewest_missing(self) -> int:
         """Return the number of readings that must come at least before a scan can close whole.
 
         A sensor that a flipped bit created, or that fell silent in mid-scan, is left out: it closes no scan.
         """
-        fewest = self._taxels + 1
-        for sensor in self._sensors.values():
-            missing = sensor.missing(self._newest_ns)
-            if missing is not None and missing < fewest:
-                fewest = missing
-        if fewest <= self._taxels:
-            return fewest
+        missing = [sensor.missing(self._newest_ns) for sensor in self._sensors.values()]
+        known = [one for one in missing if one is not None]
+        if known:
+            return min(known)
         # One as well while the order of a sensor is still to be learnt: no read may sleep through its pauses.
-        return 1 if any(not sensor.wire.order for sensor in self._sensors.values()) else self._taxels
+        learnt = all(sensor.wire.order for sensor in self._sensors.values())
+        return self._model.geometry.taxel_count if learnt else 1
 
     def counters(self) -> dict[str, int]:
         """Return the counters, summed over all sensors.
@@ -140,7 +177,7 @@ class ScanAssembler:
         since the beginning or end of their cycle was uncertain; scans; torn_wire: taxels missing; torn_source:
         complete, but only partly renewed; repeated: nothing renewed; missing_taxels.
         """
-        totals = dict.fromkeys(_COUNTED, 0)
+        totals: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         for sensor in self._sensors.values():
             for name, count in sensor.counts.items():
                 totals[name] += count
@@ -153,32 +190,29 @@ class _Sensor:
     def __init__(self, name: str, geometry: SensorGeometry, order: list[int]) -> None:
         self.confirmed = False
         self.wire = WireCycle(order)
-        self._geometry = geometry
-        self._scan_shape = geometry.scan_shape
-        self._series = ScanSeries(name, geometry)
-        self._last: Reading | None = None
-        self._last_cycle: tuple[Cycle, NDArray[np.int32]] | None = None
-        self._taxels: dict[int, Reading] = {}
-        self._place = -1
-        self._last_place = geometry.taxel_count - 1
-        self._begins_known = False
-        self._half_before = False
-        self._newest_ns = 0
-        self._device: DeviceTime | None = None
-        self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
         self.counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+        self._taxel_count, self._scan_shape = geometry.taxel_count, geometry.scan_shape
+        self._last_place = geometry.taxel_count - 1
+        self._series = ScanSeries(name, geometry)
+        self._order: list[int] = []
+        self._in_place: Callable[[Sequence[int]], tuple[int, ...]] = tuple
+        self._pack = struct.Struct(f"={3 * geometry.taxel_count}i").pack
+        self._held: list[tuple[NDArray[np.int32], int, int | None, int]] = []
+        self._begins_known = self._half_before = False
+        self._opened_ns = self._newest_ns = self._offset_ns = 0
+        self._last: tuple[int, ...] | None = None
+        self._own_ns: int | None = None
+        self._taxels: list[int] = []
+        self._columns: tuple[list[int], list[int], list[int]] = [], [], []
+        self._place = -1
 
     def begin_anew(self) -> None:
-        held = sum(self._geometry.taxel_count - missing for *_, missing in self._held)
+        held = sum(self._taxel_count - missing for *_, missing in self._held)
         self.counts["abandoned"] += len(self._taxels) + held
         self._held.clear()
-        self._taxels, self._place, self._begins_known = {}, -1, False
-        self._last = self._last_cycle = self._device = None
+        self._taxels, self._columns, self._place, self._begins_known = [], ([], [], []), -1, False
+        self._last = self._own_ns = None
         self.wire.begin_anew()
-
-    @property
-    def open(self) -> bool:
-        return bool(self._taxels)
 
     def missing(self, now_ns: int) -> int | None:
         """Return the number of readings until the open scan closes; 1 while the order is not learnt yet.
@@ -189,83 +223,94 @@ class _Sensor:
             return None
         return self._last_place - self._place if self.wire.order else 1
 
-    def awaits(self, cycle: Cycle) -> bool:
-        """Return True if no scan is open, and the taxels of this cycle come in the sensor's order."""
-        if self._taxels:
-            return False
-        if cycle is not self.wire.awaited:
-            if cycle.taxels != self.wire.order:
-                return False
-            self.wire.awaited = cycle
-        return True
-
-    def doubts(self, arrival_ns: int) -> bool:
-        """Return True if a cycle without stamps that ends now is the first, or this or one before may be of two."""
-        return self._device is not None or bool(self._held) or self.wire.late(arrival_ns)
-
-    def feed_cycle(self, cycle: Cycle, packed: bytes, time_ns: int, device: DeviceTime | None) -> Scan:
-        counts = cycle.counts(packed)
-        self._last_cycle = cycle, counts
-        self.confirmed = self._begins_known = True
-        self.wire.doubts = 0
-        self._newest_ns, self._device = time_ns, device
-        counts = counts.reshape(self._scan_shape)
-        if device is None:
-            self.wire.count(time_ns)
-            return self._count(self._series.close(counts, time_ns, whole=True), missing=0)
-        self.wire.count(device.own_ns)
-        return self._count(self._series.close(counts, time_ns, device.host_ns, whole=True), missing=0)
-
-    def feed(self, reading: Reading, time_ns: int, device: DeviceTime | None) -> list[Scan]:
-        if self._last_cycle is not None:
-            self._recall(*self._last_cycle)
-        if device is None and self._device is not None:
+    def feed(
+        self, readings: Readings, taxels: list[int], time_ns: int, own_ns: Sequence[int] | None, offset_ns: int
+    ) -> list[tuple[int, Scan]]:
+        """Return the scans that these readings of its taxels close, each with the place of the one that closed it."""
+        if own_ns is None and self._own_ns is not None:
             self.begin_anew()  # time stamps were dropped, and arrivals are on another clock
-        # The link causes the same frame twice in a row. Closing on it would tear a scan, and skipping it loses nothing.
-        if reading == self._last:
-            self.counts["duplicates"] += 1
-            return []
-        self._last = reading
-        wire, taxel = self.wire, reading.taxel
-        if device is None or self._device is None:
-            gap_ns = time_ns - self._newest_ns
-        else:  # by the device's times, a late read splits no scan
-            gap_ns = device.own_ns - self._device.own_ns
-        paused = gap_ns > wire.pause_ns
-        # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
-        if wire.gaps_ns is not None and (device is not None or not wire.order):
-            wire.follow_gap(gap_ns, taxel)
-        closed: list[Scan] = []
-        place = wire.places[taxel]
-        if (paused or place != self._place + 1) and self._taxels:
-            paced = device is None and wire.has_pace and gap_ns <= LONGEST_PAUSE_NS
-            if not wire.goes_on(self._place, place, came=taxel in self._taxels, paused=paused, paced=paced):
-                closed = self._close(by_pause=paused)
-                place = wire.places[taxel]
-        if not self._taxels:
-            self._opened_ns = time_ns
-            # A cycle begins at the first place of the order, after another's last, or, without an order, after a pause.
-            self._begins_known = self._begins_known or place == 0 if wire.order else paused
-        self._taxels[taxel] = reading
-        if place > self._place:
-            self._place = place
-        self._newest_ns, self._device = time_ns, device
-        if place == self._last_place or len(self._taxels) > self._last_place:
-            closed += self._close(by_pause=False)
+        closed: list[tuple[int, Scan]] = []
+        at = 0
+        while at < len(taxels):
+            # The link causes the same frame twice in a row. Closing on it would tear a scan, and skipping it loses
+            # nothing.
+            if self._last == (taxels[at], readings.x[at], readings.y[at], readings.z[at]):
+                self.counts["duplicates"] += 1
+                at += 1
+                continue
+            end = self._end_of_run(taxels, at, time_ns, own_ns)
+            if end == at:
+                end = at + 1
+                gap_ns = self._gap_ns(time_ns, own_ns, at)
+                closed += [(at, scan) for scan in self._judge(taxels[at], gap_ns, stamped=own_ns is not None)]
+            elif not self._taxels:
+                self._begins_known = True  # a run that opens a scan begins at the first place
+            if not self._taxels:
+                self._opened_ns = time_ns
+            self._taxels += taxels[at:end]
+            x, y, z = self._columns
+            x += readings.x[at:end]
+            y += readings.y[at:end]
+            z += readings.z[at:end]
+            self._last = taxels[end - 1], x[-1], y[-1], z[-1]
+            place = self.wire.places[taxels[end - 1]]
+            self._place = max(self._place, place)
+            self._own_ns = None if own_ns is None else own_ns[end - 1]
+            self._newest_ns, self._offset_ns = time_ns, offset_ns
+            at = end
+            if place == self._last_place or len(self._taxels) > self._last_place:
+                closed += [(end - 1, scan) for scan in self._close(by_pause=False)]
         return closed
 
-    def _recall(self, cycle: Cycle, counts: NDArray[np.int32]) -> None:
-        """Restore the last reading of a cycle that was fed as one."""
-        last = cycle.taxels[-1]
-        self._last, self._last_cycle = Reading(cycle.sensor, last, *counts.reshape(3, -1)[:, last].tolist()), None
+    def _gap_ns(self, time_ns: int, own_ns: Sequence[int] | None, at: int) -> int:
+        """Return the time since the newest reading; by the device's times, if any, a late read splits no scan."""
+        if own_ns is None or self._own_ns is None:
+            return time_ns - self._newest_ns
+        return own_ns[at] - self._own_ns
+
+    def _end_of_run(self, taxels: list[int], at: int, time_ns: int, own_ns: Sequence[int] | None) -> int:
+        """Return the end of the readings that surely go on in the open scan, or are a new one's beginning."""
+        wire = self.wire
+        if wire.gaps_ns is not None:
+            return at  # its pauses are still to be learnt
+        ahead = wire.order[self._place + 1 :]
+        run = tuple(taxels[at : at + len(ahead)])
+        if not run or run != ahead[: len(run)]:
+            return at
+        end = at + len(run)
+        if self._taxels and self._gap_ns(time_ns, own_ns, at) > wire.pause_ns:
+            return at
+        if own_ns is None or own_ns[end - 1] - own_ns[at] <= wire.pause_ns:
+            return end
+        # Half a cycle from before a pause and half from after it look like a whole one.
+        longest_ns = max(after - before for before, after in pairwise(own_ns[at:end]))
+        return end if longest_ns <= wire.pause_ns else at
+
+    def _judge(self, taxel: int, gap_ns: int, *, stamped: bool) -> list[Scan]:
+        """Return the scans that close before a reading, since it belongs to another cycle; its place is found."""
+        wire, closed = self.wire, list[Scan]()
+        paused = gap_ns > wire.pause_ns
+        # Late reads would look like pauses, so arrivals count only while the order is to be learnt.
+        if wire.gaps_ns is not None and (stamped or not wire.order):
+            wire.follow_gap(gap_ns, taxel)
+        place = wire.places[taxel]
+        if (paused or place != self._place + 1) and self._taxels:
+            paced = not stamped and wire.has_pace and gap_ns <= LONGEST_PAUSE_NS
+            if not wire.goes_on(self._place, place, came=taxel in self._taxels, paused=paused, paced=paced):
+                closed = self._close(by_pause=paused)
+        if not self._taxels:
+            # A cycle begins at the first place of the order, after another's last, or, without an order, after a pause.
+            self._begins_known = self._begins_known or wire.places[taxel] == 0 if wire.order else paused
+        return closed
 
     def _close(self, *, by_pause: bool) -> list[Scan]:
-        taxels, self._taxels, self._place = self._taxels, {}, -1
+        taxels, columns = self._taxels, self._columns
+        self._taxels, self._columns, self._place = [], ([], [], []), -1
         known, self._begins_known = self._begins_known, True
-        count, come = self._geometry.taxel_count, len(taxels)
+        count, come = self._taxel_count, len(taxels)
         half = 2 * come >= count
         if come == count and known:
-            self.wire.close_whole(tuple(taxels))
+            self.wire.close_whole(taxels)
             self.confirmed = self.confirmed or bool(self.wire.order)
         elif known and not (half or by_pause):
             self.wire.doubt()
@@ -282,21 +327,31 @@ class _Sensor:
             return []
         on_pace = None
         if half:
-            now_ns = self._newest_ns if self._device is None else self._device.own_ns
-            on_pace = self.wire.count(now_ns, ended=come == count or next(reversed(taxels)) == self.wire.order[-1])
-        axes_last = np.full((count, 3), ABSENT, dtype=np.int32)
-        axes_last[list(taxels)] = np.array([(reading.x, reading.y, reading.z) for reading in taxels.values()])
-        counts = np.ascontiguousarray(axes_last.T).reshape(self._geometry.scan_shape)
-        device_ns = None if self._device is None else self._device.host_ns
+            now_ns = self._newest_ns if self._own_ns is None else self._own_ns
+            on_pace = self.wire.count(now_ns, ended=come == count or taxels[-1] == self.wire.order[-1])
+        counts = self._counts_of(taxels, columns)
+        device_ns = None if self._own_ns is None else self._own_ns + self._offset_ns
         self._held.append((counts, self._newest_ns, device_ns, count - come))
-        shows_pauses = self._device is not None and not self.wire.in_pieces
+        shows_pauses = self._own_ns is not None and not self.wire.in_pieces
         if not shows_pauses and on_pace is None and (come == count or len(self._held) > 1):
             return []
         held, self._held = self._held, []
         if not (shows_pauses or on_pace):  # as many frames may be lost as make the parts of two cycles fit
             self.counts["resynchronised"] += count * sum(missing == 0 for *_, missing in held)
             held = [one for one in held if one[-1]]
-        return [self._count(self._series.close(*closed), missing) for *closed, missing in held]
+        return [self._count(self._series.close(*closed, whole=missing == 0), missing) for *closed, missing in held]
+
+    def _counts_of(self, taxels: list[int], columns: Sequence[list[int]]) -> NDArray[np.int32]:
+        """Return counts (3, rows, cols) of readings in their order of arrival, ABSENT where no reading came."""
+        if taxels != self._order:  # which is the same each time, unless a frame was lost
+            self._order, come = taxels, len(taxels)
+            places = dict(zip(taxels, range(come), strict=True))
+            in_a_column = [places.get(taxel, come) for taxel in range(self._taxel_count)]
+            self._in_place = itemgetter(*(axis * (come + 1) + place for axis in range(3) for place in in_a_column))
+        # Plain integers up to the last step: for so few, numpy takes several times as long to put them in place.
+        x, y, z = columns
+        placed = self._in_place([*x, ABSENT, *y, ABSENT, *z, ABSENT])
+        return np.frombuffer(self._pack(*placed), dtype=np.int32).reshape(self._scan_shape)
 
     def _count(self, scan: Scan, missing: int) -> Scan:
         self.counts["scans"] += 1

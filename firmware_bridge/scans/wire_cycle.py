@@ -19,8 +19,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from firmware_bridge.scans.can_id_maps import Cycle
-
 LONGEST_PAUSE_NS: Final = 60_000_000
 """Longest pause between two readings of one scan, whatever the period, in [ns]: the slowest sensor on record has 17 ms
 there, and an FTDI chip holds bytes back for 16. After a longer one, as when the bus was off, a reading may belong to
@@ -44,7 +42,6 @@ class WireCycle:
         gaps_ns: gaps between the newest readings, of one cycle at most, in [ns]; None where they are not needed.
         period_ns: time from cycle to cycle, in [ns], by the clock of the pauses; None until it is measured.
         in_pieces: True if several cycles seem to end at once by that clock, so that it does not show the pauses.
-        awaited: a cycle in this order that came as one, so that the next one like it is recognised at once.
     """
 
     NOWHERE: Final = -9
@@ -192,7 +189,6 @@ class WireCycle:
 
     def _learn(self, order: tuple[int, ...]) -> None:
         self.order = order
-        self.awaited: Cycle | None = None
         self.places = {taxel: place for place, taxel in enumerate(order)} if order else _Nowhere()
         self.doubts = 0
         if not order:

@@ -16,6 +16,8 @@ reading of each.
 """
 
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.device_clock import DeviceClock
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
@@ -42,8 +45,15 @@ _COUNTED_BY_SENSOR: Final = ["scans", "torn_wire", "torn_source", "repeated", "m
 class ServerScans:
     """Stage from messages to scans, for all sensors of one server."""
 
-    def __init__(self, geometry: SensorGeometry = USPA44) -> None:
+    def __init__(
+        self,
+        geometry: SensorGeometry = USPA44,
+        prefix: str = "",
+        mountings: Mapping[str, Mounting] = MappingProxyType({}),
+    ) -> None:
+        """Begin without a message; `prefix` begins the names of sensors in scans, and `mountings` are by these."""
         self.version = ""
+        self._prefix, self._mountings = prefix, mountings
         self._geometry = geometry
         self._decoder = ServerDecoder(geometry)
         self._sensors: dict[str, _ServerSensor] = {}
@@ -95,7 +105,8 @@ class ServerScans:
         for name in [*self._sensors, *new]:
             sensor = self._sensors.get(name)
             if sensor is None:
-                sensor = self._sensors[name] = _ServerSensor(name, self._geometry)
+                own_name = self._prefix + name
+                sensor = self._sensors[name] = _ServerSensor(own_name, self._geometry, self._mountings.get(own_name))
             scan = age_ns = None
             if name in readings:
                 age_ns = _age_ns(readings[name], message)
@@ -161,7 +172,8 @@ class ServerScans:
 class _ServerSensor:
     """Readings of one sensor, and the taxels renewed since its last scan."""
 
-    def __init__(self, name: str, geometry: SensorGeometry) -> None:
+    def __init__(self, name: str, geometry: SensorGeometry, mounting: Mounting | None) -> None:
+        self._mounting = mounting if mounting and (mounting.moves_taxels or mounting.reverses_axes) else None
         self.counted: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
         self._geometry = geometry
         self._series = ScanSeries(name, geometry)
@@ -246,7 +258,7 @@ class _ServerSensor:
         self.counted["torn_wire"] += missing > 0
         self.counted["torn_source"] += missing == 0 and scan.torn
         self.counted["repeated"] += scan.repeated
-        return scan
+        return scan if self._mounting is None else self._mounting.place(scan)
 
     def _vendor(self, reading: ServerReading) -> VendorReading:
         ups_hz = None

@@ -1,5 +1,6 @@
 """The contract of every link, each on a device that is as real as can be."""
 
+import math
 import threading
 import time
 
@@ -12,7 +13,7 @@ from edge.pipeline.cadence import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.reconnecting import LastingLink
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -126,7 +127,7 @@ def test_it_is_opened_again_once_it_is_back_and_numbers_go_on(rig):
 
 @of(THAT_COME_BACK)
 def test_it_comes_back_by_itself_under_the_name_of_its_sensors(rig):
-    with LastingLink(rig.link(), name="finger") as link:
+    with LinkReader(rig.link(prefix="finger/"), math.inf) as link:
         scans, notices, end_s = rig.give(link, 2), [], time.monotonic() + 60
         rig.lose()
         while not link.counters()["outages"]:
@@ -136,7 +137,7 @@ def test_it_comes_back_by_itself_under_the_name_of_its_sensors(rig):
             assert link.read(0.05) == [] and time.monotonic() < end_s
         scans += rig.give(link, 2)
         notices += link.notices()
-        assert link.can_ids() == (set() if rig.sensor == "1" else {frame.can_id for frame in frames_of(1)})
+        assert link.link.can_ids() == (set() if rig.sensor == "1" else {frame.can_id for frame in frames_of(1)})
     assert {scan.sensor for scan in scans} == {f"finger/{rig.sensor}"}
     assert [(notice.kind, notice.sensors) for notice in notices] == [("lost", "finger/"), ("back", "finger/")]
     assert all(notice.text.startswith("finger: ") and "\n" not in notice.text for notice in notices)
@@ -229,6 +230,7 @@ def test_what_lay_there_because_nobody_read_is_marked_old(rig):
         rig.give(link, 1)
         rig.hear(*frames_of(2))
         time.sleep(0.1)
+        link.fetch()
         assert all(scan.unread_ns > 80_000_000 for scan in read_scans(link, 2))
         end_s = time.monotonic() + 60
         while all(scan.unread_ns for scan in [*link.read(0.0), *rig.give(link, 1)]):

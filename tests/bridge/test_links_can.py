@@ -5,6 +5,7 @@ import itertools
 import sys
 import threading
 from functools import partial
+from math import inf
 from pathlib import Path
 
 import can
@@ -17,7 +18,7 @@ from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.links.reconnecting import LastingLink
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import trigger_frame
 
 
@@ -121,7 +122,7 @@ def lasting(bus, networks, opens):
     make_network(networks, "can0", up=True)
     opens(lambda **_: PulledBus(plugged, channel=bus.channel_id))
     inner = CanBusLink("socketcan", "can0", clock_ns=lambda: now_ns[0])
-    with LastingLink(inner, clock_ns=lambda: now_ns[0], sleep=lambda _: None) as link:
+    with LinkReader(inner, inf, clock_ns=lambda: now_ns[0], sleep=lambda _: None) as link:
 
         def read(*messages, cable=True):
             """Read messages, then let a second pass without any, and read again."""
@@ -142,22 +143,22 @@ def test_a_bus_that_is_off_stays_so_however_often_it_is_opened(lasting, told, wo
     """The kernel reports it once, to the sockets that are open then."""
     link = lasting(told)
     for _ in range(3):
-        assert words in (lasting().trouble or "")
+        assert words in (lasting().link.trouble or "")
     counters = link.counters()
     assert counters["reopenings"] >= 3 and counters["bus_off"] + counters["error_passive"] == 1
-    assert lasting(FRAME).trouble is None, "what told that it is over may have come meanwhile"
+    assert lasting(FRAME).link.trouble is None, "what told that it is over may have come meanwhile"
 
 
 def test_error_passive_goes_on_though_frames_come(lasting):
-    assert "passive" in (lasting(PASSIVE, FRAME).trouble or "")
+    assert "passive" in (lasting(PASSIVE, FRAME).link.trouble or "")
 
 
 def test_a_network_that_was_down_begins_anew(lasting):
-    assert "bus-off" in (lasting(BUS_OFF).trouble or "")
+    assert "bus-off" in (lasting(BUS_OFF).link.trouble or "")
     for _ in range(3):
         lasting(cable=False)
     lasting()
-    assert lasting().trouble is None
+    assert lasting().link.trouble is None
 
 
 def test_a_bus_that_says_it_is_off(bus, monkeypatch):

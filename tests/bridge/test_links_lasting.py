@@ -9,7 +9,7 @@ from edge_samples import FakeLink, make_scan
 from edge.doctor.link_checks import LineFacts, line_facts
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, Unread
-from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LastingLink
+from firmware_bridge.links.reconnecting import LATE_RETRY_S, LINK_SILENT_S, SOON_RETRY_S, SOON_S, LinkReader
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
 S = 1_000_000_000
@@ -63,14 +63,14 @@ class WorldLink(Link):
         return {"scans": self.scans}
 
 
-def wrapped(world, inner=None, give_up_s=float("inf")):
-    return LastingLink(inner or WorldLink(world), give_up_s, clock_ns=lambda: world.now_ns, sleep=world.sleep)
+def reader_of(world, inner=None, give_up_s=float("inf")):
+    return LinkReader(inner or WorldLink(world), give_up_s, clock_ns=lambda: world.now_ns, sleep=world.sleep)
 
 
 def lasting(world, until_s, give_up_s=float("inf"), inner=None):
     """Read until a time; all notices, the link, and when scans came, in [s]."""
     notices, heard_s = [], []
-    with wrapped(world, inner, give_up_s) as link:
+    with reader_of(world, inner, give_up_s) as link:
         while world.now_ns < until_s * S:
             scans = link.read(0.1)
             notices += link.notices()
@@ -127,10 +127,10 @@ def test_the_silence_of_one_that_is_back_begins_anew():
 
 def test_the_end_of_a_finite_source_is_no_silence():
     world = World()
-    with wrapped(world, FakeLink([[make_scan(0)]])) as link:
+    with reader_of(world, FakeLink([[make_scan(0)]], lasts=True)) as link:
         link.read(0.1)
         world.sleep(LINK_SILENT_S + 1)
-        assert link.read(0.1) == [] and link.ended and link.notices() == []
+        assert link.read(0.1) == [] and link.link.ended and link.notices() == []
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_the_first_opening_must_succeed():
             raise AssertionError("no such thing")
 
     with pytest.raises(DeviceError, match="unforeseen AssertionError no such thing"):
-        LastingLink(Broken(World())).__enter__()
+        LinkReader(Broken(World())).__enter__()
     with pytest.raises(DeviceError, match="no such port"):
         lasting(World(away=[(0.0, 1.0)]), 1.0)
 
@@ -214,11 +214,10 @@ def test_the_first_opening_must_succeed():
 def test_trouble_is_told_twice_and_lost_stamps_once():
     world, notices = World(), []
     inner = WorldLink(world)
-    with wrapped(world, inner) as link:
+    with reader_of(world, inner) as link:
         for trouble, dropped in ((None, False), ("bus-off", False), ("bus-off", True), (None, True)):
             inner.trouble, inner.stamps_dropped = trouble, dropped
             link.read(0.1)
-            assert link.trouble == trouble
             notices += link.notices()
     assert [(notice.kind, notice.text.split(",")[0]) for notice in notices] == [
         ("trouble", "bus-off"),
@@ -244,5 +243,5 @@ def test_a_clock_that_was_set_by_readings_which_waited_gives_no_times():
 
 def test_the_doctor_knows_the_port_behind_a_name():
     link = SlcanSerialLink("/dev/ttyUSB7", 115_200)
-    assert line_facts(link) == line_facts(LastingLink(link, name="left")) == LineFacts("/dev/ttyUSB7", 115_200)
+    assert line_facts(link) == LineFacts("/dev/ttyUSB7", 115_200)
     assert line_facts(FakeLink([])) == LineFacts() and FakeLink([]).can_ids() == frozenset()

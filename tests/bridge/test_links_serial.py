@@ -3,23 +3,24 @@
 import contextlib
 import errno
 import os
-import select
 import subprocess
 import sys
 import termios
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import serial
 from bridge_samples import SilentDevice, read_scans
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
+from firmware_bridge.emulation.pty_port import PseudoPort
 from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links import fd_reader as bursts
-from firmware_bridge.links import slcan_serial
+from firmware_bridge.links import fd_reader, slcan_serial
+from firmware_bridge.links.fd_reader import PortReader
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
@@ -36,7 +37,8 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
         raise OSError(errno.EIO, "Input/output error")
 
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        monkeypatch.setattr(bursts.os, "read", read)
+        os.write(device.device_fd, b"x")  # which shows that there is something to read
+        monkeypatch.setattr(fd_reader.os, "read", read)
         got = link.read(0.0), link.counters()["received_bytes"], link.counters()["replies"]
         with pytest.raises(LinkLostError):
             link.read(0.0)
@@ -65,63 +67,54 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
             assert [scan.complete for scan in scans] == complete
 
 
-# The reader of bursts.
+# The reader of the port.
 
 
-def test_few_reads_make_a_scan(monkeypatch):
-    """A plain loop wakes for every piece that comes; here the kernel gathers them."""
-    wakes = []
-    poll = select.poll
+def test_few_looks_make_a_scan(monkeypatch):
+    """A plain loop wakes for every piece that comes; this one sleeps until the end of the scan can have come."""
+    now_s, sent, takes, take = [0.0], [0], [], PortReader.take
 
-    class CountedPoll:
-        def __init__(self):
-            self._poll = poll()
-            self.register = self._poll.register
+    def sleep(time_s):
+        now_s[0] += time_s
+        while sent[0] < 16 and sent[0] * FRAME_S <= now_s[0]:
+            port.write(LINES[sent[0]])
+            sent[0] += 1
+        while port.unread_bytes() < 22 * sent[0] - sum(len(piece.data) for piece in takes):
+            time.sleep(0.001)  # the kernel delivers them late
 
-        def poll(self, timeout_ms):
-            wakes.append(timeout_ms)
-            return self._poll.poll(timeout_ms)
-
-    def send_scans():
-        begun_s = time.monotonic()
-        for number in range(30 * 16):
-            due_s = begun_s + number // 16 * 0.01 + number % 16 * FRAME_S
-            time.sleep(max(0.0, due_s - time.monotonic()))
-            os.write(device.device_fd, LINES[number % 16])
-
-    monkeypatch.setattr(select, "poll", CountedPoll)
-    with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        thread = threading.Thread(target=send_scans)
-        thread.start()
-        while link.counters()["frames"] < 30 * 16:
-            link.read(0.05)
-        thread.join()
-    assert len(wakes) < 30 * 5, "one for each of sixteen frames"
+    monkeypatch.setattr(fd_reader, "time", SimpleNamespace(sleep=sleep, monotonic_ns=time.monotonic_ns))
+    monkeypatch.setattr(PortReader, "take", lambda reader: takes.append(take(reader)) or takes[-1])
+    port = PseudoPort()
+    port.plug()
+    with SlcanSerialLink(port.path):
+        descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
+        reader = PortReader(descriptor, clock_ns=lambda: round(1e9 * now_s[0]))
+        takes.clear()
+        sleep(0.0)
+        assert reader.read(1.0, 22 * 16).data == b"".join(LINES)
+        os.close(descriptor)
+    port.unplug()
+    assert len(takes) <= 4 and now_s[0] < 15 * FRAME_S + 0.0005
 
 
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
     """Otherwise bytes that arrive meanwhile would look new."""
-    now_s = [100.0]
+    now_ns, half_s, read = [0], 500_000_000, os.read
 
-    def stands_still(system_call):
-        def call(*arguments):
-            try:
-                return system_call(*arguments)
-            finally:
-                now_s[0] += 0.5
-
-        return call
+    def stands_still(*arguments):
+        try:
+            return read(*arguments)
+        finally:
+            now_ns[0] += half_s
 
     with SilentDevice() as device, monkeypatch.context() as patched:
-        reader = bursts.BurstReader(device.client_fd, clock_s=lambda: now_s[0])
-        patched.setattr(bursts.fcntl, "ioctl", stands_still(bursts.fcntl.ioctl))
-        reader.look()
-        assert (reader.empty_s, now_s[0]) == (100.0, 100.5)
-        patched.setattr(bursts.os, "read", stands_still(os.read))
-        assert reader.read(0, 22) == b""
-        assert (reader.empty_s, now_s[0]) == (100.5, 101.0)
-        assert reader.take_all() == b""
-        assert (reader.empty_s, now_s[0]) == (101.0, 101.5)
+        reader = PortReader(device.client_fd, clock_ns=lambda: now_ns[0])
+        patched.setattr(fd_reader.os, "read", stands_still)
+        assert reader.take() == (b"", half_s, 0)
+        assert reader.take() == (b"", 2 * half_s, half_s)
+        os.write(device.device_fd, b"z\r")
+        assert reader.read(0, 1) == (b"z\r", 3 * half_s, half_s), "they may have come at once"
+        assert reader.read(0, 1) == (b"", 3 * half_s, 3 * half_s)
 
 
 # Opening and closing.

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import socket
 import threading
 from pathlib import Path
@@ -17,7 +18,8 @@ from xela_server_emulator import VERSIONS, ServerEmulator, VendorServer, looping
 from edge.cli import main as cli
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import xela_server
-from firmware_bridge.links.registry import open_source, open_sources
+from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.registry import open_source
 from firmware_bridge.links.xela_server import XelaServerLink
 from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 
@@ -109,7 +111,7 @@ def test_a_server_that_restarts_counts_its_messages_anew():
 
 def test_a_dead_sensor_is_told_of_once_and_not_taken_for_back():
     vendor = looping()
-    with ServerEmulator(vendor) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
+    with ServerEmulator(vendor) as server, LinkReader(XelaServerLink(server.url), math.inf) as link:
         read_scans(link, 3)
         vendor.silent = frozenset(range(16))
         notices = read_notices(link, 2)
@@ -236,7 +238,7 @@ def test_others_that_listen_there(answer, words, limits):
 
 def test_one_that_was_met_and_hangs_holds_up_nobody_long(limits):
     limits(xela_server, OPENING_S=20.0, REOPENING_S=0.2)
-    with ServerEmulator(looping()) as server, open_sources([f"xela-server:{server.url}"])[0] as link:
+    with ServerEmulator(looping()) as server, LinkReader(XelaServerLink(server.url), math.inf) as link:
         read_scans(link, 3)
         server.freeze()
         silent, lost = read_notices(link, 2)

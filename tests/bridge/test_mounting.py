@@ -7,14 +7,15 @@ from cli_samples import write_recording as write_npz
 from edge_samples import BASELINE, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from xela_server_emulator import message, sensor_entry
 
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.links.registry import open_source
 from firmware_bridge.recording.csv_reader import csv_header
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting, placed_map
 from firmware_bridge.scans.scan import VendorReading
+from firmware_bridge.scans.xela_server_scans import ServerScans
 from firmware_bridge.zeroing.baseline import deformation
 
 mountings = st.builds(
@@ -73,6 +74,18 @@ def test_what_the_vendor_says_lies_and_points_as_the_pad_does(mounting):
     assert nothing == VendorReading() and mounting.place(replace(wire, vendor=None)).vendor is None
 
 
+@pytest.mark.parametrize("mounting", [Mounting(swap_xy=True), Mounting(signs=(1, 1, -1)), TURNED])
+def test_forces_of_the_vendors_server_are_turned(mounting):
+    of_server = {"1": mounting, "2": Mounting(gains=(2.0,) * 48)}  # gains are of counts
+    plain, turned = ServerScans(), ServerScans(prefix="", mountings=of_server)
+    text = message(1, sensor_entry(), sensor_entry())
+    expected, scans = plain.feed(text, 0), turned.feed(text, 0)
+    assert [scan.sensor for scan in ServerScans(prefix="left/").feed(text, 0)] == ["left/1", "left/2"]
+    assert scans[0].vendor_force_n == pytest.approx(mounting.place(expected[0]).vendor_force_n)
+    assert (scans[0].counts == mounting.place(expected[0]).counts).all()
+    assert scans[1].vendor_force_n == expected[1].vendor_force_n
+
+
 def test_what_a_mounting_moves_and_what_costs_nothing():
     """The wire's top right taxel, 3, lies top left: its id, 0x004, now means place 0."""
     assert placed_map(USPA44_MAP, {"4": Mounting(swap_xy=True)}) is USPA44_MAP
@@ -120,6 +133,6 @@ def test_csv_of_the_vendors_server_alone_is_put_in_place(tmp_path):
     write_npz(tmp_path / "4.npz", [0])
     for name, expected in (("4.csv", TURNED.place_counts(counts)), ("4.npz", counts)):
         with open_source(f"replay:{tmp_path}/{name}", 1000.0, model=ID_MAPS["A"], mountings={"4": TURNED}) as link:
-            assert isinstance(link, LastingLink) == (name == "4.csv") and link.kind == "replay"
+            assert link.kind == "replay"
             (scan,) = [scan for _ in range(2) if not link.ended for scan in link.read(1.0)]
         assert np.array_equal(scan.counts, expected) and link.counters()["scans"] == 1

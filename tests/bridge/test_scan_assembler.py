@@ -7,22 +7,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, Reading
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.device_clock import DeviceClock, DeviceTime
 from firmware_bridge.scans.scan import ABSENT, Scan
-from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, ScanAssembler
-from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS, SHORTEST_PAUSE_NS
+from firmware_bridge.scans.scan_assembler import SCAN_GIVEN_UP_NS, Readings, ScanAssembler, key
+from firmware_bridge.scans.wire_cycle import LEAST_INTERVALS, LONGEST_PAUSE_NS, MOST_DOUBTS
 
+Reading = tuple[int, int, int, int]
+"""Key of its id, and counts x, y, z."""
 ORDER = [taxel for _, taxel in USPA44_MAP.wire_order("4")]
 
 
 def cycle(number: int, sensor: str = "4") -> list[Reading]:
     """One cycle of a sensor in wire order; every reading of every cycle is different."""
-    return [Reading(sensor, taxel, 1000 * taxel + number, 2000 + number, 3000 + number) for taxel in ORDER]
+    order = USPA44_MAP.wire_order(sensor)
+    return [(key(can_id), 1000 * taxel + number, 2000 + number, 3000 + number) for can_id, taxel in order]
+
+
+def feed_all(assembler: ScanAssembler, readings: list[Reading], time_ns: int, *stamps) -> list[Scan]:
+    """Feed readings of one moment together."""
+    return assembler.feed(Readings(*zip(*readings, strict=True)), time_ns, *stamps)
 
 
 def feed(assembler: ScanAssembler, readings: list[Reading], start_ns: int = 0) -> list[Scan]:
-    return [scan for i, reading in enumerate(readings) for scan in assembler.feed(reading, start_ns + i)]
+    return [scan for i, reading in enumerate(readings) for scan in feed_all(assembler, [reading], start_ns + i)]
+
+
+def feed_one(assembler: ScanAssembler, reading: Reading, time_ns: int, device: DeviceTime | None = None) -> list[Scan]:
+    if device is None:
+        return feed_all(assembler, [reading], time_ns)
+    return feed_all(assembler, [reading], time_ns, [device.own_ns], device.host_ns - device.own_ns)
 
 
 def counters(assembler: ScanAssembler) -> dict[str, int]:
@@ -32,7 +46,7 @@ def counters(assembler: ScanAssembler) -> dict[str, int]:
 def test_a_scan_closes_with_its_last_taxel():
     assembler = ScanAssembler(USPA44_MAP)
     assert feed(assembler, cycle(0)[:-1]) == []
-    (scan,) = assembler.feed(cycle(0)[-1], 99)
+    (scan,) = feed_all(assembler, cycle(0)[-1:], 99)
     assert (scan.sensor, scan.number, scan.time_ns) == ("4", 0, 99)
     assert scan.complete and not scan.torn and not scan.repeated
     assert scan.counts.dtype == np.int32 and scan.counts.shape == (3, 4, 4)
@@ -88,11 +102,11 @@ def test_parts_of_cycles_are_cut_where_one_ends(parts, fresh, counted):
 def test_a_lost_frame_tears_one_scan_and_no_other(lost):
     assembler = ScanAssembler(USPA44_MAP)
     torn_cycle = cycle(1)
-    gone = torn_cycle.pop(lost)
+    torn_cycle.pop(lost)
     scans = feed(assembler, cycle(0) + torn_cycle + cycle(2) + cycle(3))
     assert [scan.number for scan in scans] == [0, 1, 2, 3]
     assert [scan.complete for scan in scans] == [True, False, True, True]
-    row, col = divmod(gone.taxel, 4)
+    row, col = divmod(ORDER[lost], 4)
     assert scans[1].torn and not scans[1].repeated
     assert np.argwhere(~scans[1].fresh).tolist() == [[row, col]]
     assert scans[1].counts[:, row, col].tolist() == [ABSENT] * 3
@@ -105,12 +119,12 @@ def test_a_lost_frame_tears_one_scan_and_no_other(lost):
 def test_renewed_is_against_the_taxels_own_reading_before():
     assembler = ScanAssembler(USPA44_MAP)
     second = cycle(0)
-    second[2] = second[2]._replace(z=9)
+    second[2] = (*second[2][:3], 9)
     third = list(second)
     del third[4]
     fourth = list(second)
-    fourth[4] = fourth[4]._replace(x=8)
-    fourth[5] = fourth[5]._replace(y=8)
+    fourth[4] = (fourth[4][0], 8, *fourth[4][2:])
+    fourth[5] = (*fourth[5][:2], 8, fourth[5][3])
     scans = feed(assembler, cycle(0) + second + third + fourth + fourth)
     renewed = [np.flatnonzero(scan.renewed).tolist() for scan in scans]
     assert renewed == [list(range(16)), [ORDER[2]], [], sorted([ORDER[4], ORDER[5]]), []]
@@ -125,8 +139,8 @@ def test_a_bit_that_flips_in_one_id_of_fifty_invents_no_sensor():
     assembler, noise, ms, found = ScanAssembler(USPA44_MAP), random.Random(1), 1_000_000, set()
     for number in range(6_000):
         for place, reading in enumerate(cycle(number % 1000)):
-            flipped = reading._replace(sensor="5") if noise.random() < 0.02 else reading
-            found |= {scan.sensor for scan in assembler.feed(flipped, number * 10 * ms + place * 130_000)}
+            flipped = (reading[0] | key(1), *reading[1:]) if noise.random() < 0.02 else reading
+            found |= {scan.sensor for scan in feed_all(assembler, [flipped], number * 10 * ms + place * 130_000)}
     assert found == {"4"}
 
 
@@ -140,10 +154,11 @@ def test_what_comes_after_a_pause_is_of_another_scan(known):
     scans = []
     for reading, time_ns in zip([*before, *cycle(3)[:12]], times_ns, strict=True):
         # The device's own times count where there are any: being late here says nothing of the bus.
-        scans += assembler.feed(reading, 10 * time_ns if known else time_ns, DeviceTime(0, time_ns) if known else None)
+        device = DeviceTime(0, time_ns) if known else None
+        scans += feed_one(assembler, reading, 10 * time_ns if known else time_ns, device)
     assert [int(scan.fresh.sum()) for scan in scans] == [16, 16, 16, 11]
     device = DeviceTime(0, times_ns[-1] + 1) if known else None
-    (scan,) = [scan for reading in cycle(4) for scan in assembler.feed(reading, times_ns[-1] + 1, device)]
+    (scan,) = [scan for reading in cycle(4) for scan in feed_one(assembler, reading, times_ns[-1] + 1, device)]
     assert set(scan.counts[2].ravel().tolist()) == {3004} and counters(assembler)["resynchronised"] == 1
 
 
@@ -175,13 +190,13 @@ def test_a_scan_is_waited_for_as_long_as_the_slowest_takes():
     assert SCAN_GIVEN_UP_NS == 1_000_000_000
     assembler = ScanAssembler(USPA44_MAP)
     feed(assembler, cycle(0) + cycle(1))
-    assembler.feed(cycle(0, "5")[0], 50)
+    feed_all(assembler, cycle(0, "5")[:1], 50)
     assert assembler.fewest_missing() == 16
     feed(assembler, cycle(0, "6") + cycle(1, "6")[:9], 60)  # open since 76
     assert assembler.fewest_missing() == 7
-    assembler.feed(cycle(2)[0], 76 + SCAN_GIVEN_UP_NS)
+    feed_all(assembler, cycle(2)[:1], 76 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 7
-    assembler.feed(cycle(2)[1], 77 + SCAN_GIVEN_UP_NS)
+    feed_all(assembler, cycle(2)[1:2], 77 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 14
     feed(assembler, cycle(2)[2:], 78 + SCAN_GIVEN_UP_NS)
     assert assembler.fewest_missing() == 16
@@ -198,28 +213,22 @@ def test_no_read_sleeps_while_an_order_is_to_be_learnt():
     assert assembler.fewest_missing() == 16, "a sensor that exists does not wait for one that does not"
 
 
-# Cycles that are fed as one, stamped or not, among readings that come one by one.
+# Readings that were read together, stamped or not, among others that come one by one.
 
 MS = 1_000_000
-IDS = [can_id for can_id, _ in USPA44_MAP.wire_order("4")]
-WHOLE = USPA44_MAP.cycle(IDS)
 
 
 def feed_at(assembler: ScanAssembler, parts: list[Reading], time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
     """Feed readings of one moment; stamped, they were on the bus a tenth of that time from the device's beginning."""
     device = DeviceTime(time_ns - 7, time_ns // 10) if stamped else None
-    return [scan for reading in parts for scan in assembler.feed(reading, time_ns, device)]
+    return [scan for reading in parts for scan in feed_one(assembler, reading, time_ns, device)]
 
 
-def packed(number: int) -> bytes:
-    """The same readings as frames without stamps: counter or so, three words, another byte."""
-    words = (b"".join(word.to_bytes(2, "big") for word in reading[2:]) for reading in cycle(number))
-    return b"".join(b"abc" + six + b"z" for six in words)
-
-
-def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamped: bool = False) -> Scan:
-    device = DeviceTime(time_ns - 7, time_ns // 10) if stamped else None
-    return assembler.feed_cycle(WHOLE, packed(number), time_ns, device)
+def feed_cycle(assembler: ScanAssembler, number: int, time_ns: int = 0, *, stamped: bool = False) -> list[Scan]:
+    """Feed a whole cycle at once."""
+    if not stamped:
+        return feed_all(assembler, cycle(number), time_ns)
+    return feed_all(assembler, cycle(number), time_ns, [time_ns // 10] * 16, time_ns - 7 - time_ns // 10)
 
 
 @pytest.mark.parametrize("stamped", [False, True])
@@ -230,38 +239,27 @@ def test_a_cycle_fed_as_one_is_the_scan_of_its_readings(stamped):
         if number == 0:
             (got,) = feed_at(assembler, cycle(0), stamped=stamped)
         else:
-            got = feed_cycle(assembler, number, 100 * number * MS, stamped=stamped)
+            (got,) = feed_cycle(assembler, number, 100 * number * MS, stamped=stamped)
         assert (got.sensor, got.number, got.time_ns) == ("4", number, 100 * number * MS)
         assert got.device_ns == expected.device_ns == (100 * number * MS - 7 if stamped else None)
         np.testing.assert_array_equal(got.counts, expected.counts)
         assert got.counts.shape == (3, 4, 4) and got.whole and expected.whole
     assert counters(assembler) == counters(one_by_one) == {"readings": 48, "scans": 3}
-    assert feed_cycle(assembler, 2, 300 * MS, stamped=stamped).repeated
+    assert feed_cycle(assembler, 2, 300 * MS, stamped=stamped)[0].repeated
     assert counters(assembler) == {"readings": 64, "scans": 4, "repeated": 1}
 
 
-@pytest.mark.parametrize(("stamped", "pause_ns"), [(False, 50 * MS), (True, 5 * MS)])
-@pytest.mark.parametrize("first", [feed_at, feed_cycle])
-def test_the_period_is_measured_by_stamps_if_there_are_any(first, stamped, pause_ns):
+@pytest.mark.parametrize(("pause_ns", "whole"), [(5 * MS, True), (6 * MS, False)])
+@pytest.mark.parametrize("together", [False, True])
+def test_half_of_the_period_by_the_stamps_is_a_pause(together, pause_ns, whole):
     assembler = ScanAssembler(USPA44_MAP)
-    feed_at(assembler, cycle(0)[3:])  # of an unknown beginning: counts for nothing
-    first(assembler, cycle(1) if first is feed_at else 1, 10 * MS, stamped=stamped)
-    assert assembler.longest_cycle_ns(WHOLE) == SHORTEST_PAUSE_NS
-    for number in range(2, LEAST_INTERVALS + 2):
-        feed_cycle(assembler, number, 100 * (number - 1) * MS + 10 * MS, stamped=stamped)
-    assert assembler.longest_cycle_ns(WHOLE) == pause_ns
-
-
-def test_a_cycle_is_taken_as_one_only_in_the_usual_order():
-    assembler, other = ScanAssembler(USPA44_MAP), USPA44_MAP.cycle([*IDS[1:], IDS[0]])
-    assert assembler.longest_cycle_ns(WHOLE) == 0
-    feed_at(assembler, cycle(0))
-    for _ in range(2):
-        assert assembler.longest_cycle_ns(WHOLE) > 0 == assembler.longest_cycle_ns(other)
-    feed_at(assembler, cycle(1)[:1])
-    assert assembler.longest_cycle_ns(WHOLE) == 0
-    feed_at(assembler, cycle(1)[1:])
-    assert assembler.longest_cycle_ns(WHOLE) > 0
+    feed_at(assembler, cycle(0)[3:], stamped=True)  # of an unknown beginning: counts for nothing
+    for number in range(1, LEAST_INTERVALS + 2):
+        feed_cycle(assembler, number, 100 * number * MS, stamped=True)
+    own_ns = [100 * MS + place // 8 * pause_ns for place in range(16)]
+    parts = [slice(0, 16)] if together else [slice(0, 8), slice(8, 16)]
+    scans = [scan for part in parts for scan in feed_all(assembler, cycle(50)[part], 2000 * MS, own_ns[part], 0)]
+    assert [int(scan.fresh.sum()) for scan in scans] == ([16] if whole else [8, 8])
 
 
 @pytest.mark.parametrize("stamped", [False, True])
@@ -284,10 +282,9 @@ def test_a_cycle_takes_doubts_of_the_order_away():
     feed_cycle(assembler, 8)
     for number in range(MOST_DOUBTS + 1, 2 * MOST_DOUBTS):
         feed_at(assembler, ends[number])
-    assert assembler.longest_cycle_ns(WHOLE) > 0 and assembler.fewest_missing() == 16
+    assert assembler.fewest_missing() == 16
     feed_at(assembler, ends[19])
-    assert assembler.longest_cycle_ns(WHOLE) == 0, "one more, and the order is another"
-    assert assembler.fewest_missing() == 1, "no pause is slept through while it is learnt"
+    assert assembler.fewest_missing() == 1, "one more, and the order is another: no pause is slept through meanwhile"
     assert counters(assembler)["resynchronised"] == 15 * 3 and counters(assembler)["scans"] == 2
 
 
@@ -297,14 +294,8 @@ def test_before_the_period_is_known_gaps_of_stamps_tell_a_pause(stamped):
     assembler, scans, now_ns = ScanAssembler(USPA44_MAP), [], 0
     for number, reading in enumerate(cycle(0) + cycle(1)):
         now_ns += 5 * MS if number == 25 else 130_000
-        scans += assembler.feed(reading, now_ns, DeviceTime(now_ns, now_ns) if stamped else None)
+        scans += feed_one(assembler, reading, now_ns, DeviceTime(now_ns, now_ns) if stamped else None)
     assert [int(scan.fresh.sum()) for scan in scans] == ([16, 9] if stamped else [16, 16])
-
-
-def test_readings_of_a_broken_link_count_though_they_were_not_fed():
-    assembler = ScanAssembler(USPA44_MAP)
-    assembler.abandon("4", 5)
-    assert counters(assembler) == {"readings": 5, "abandoned": 5}
 
 
 def test_where_stamps_end_the_open_scan_ends_too():
@@ -320,6 +311,6 @@ def test_a_pause_is_measured_by_the_device_s_own_clock():
     assembler, clock = ScanAssembler(USPA44_MAP), DeviceClock(1_000_000, None)
     feed_at(assembler, cycle(0))
     for number, reading in enumerate(cycle(1)[:9]):
-        assembler.feed(reading, 400 * MS, clock.at(number, 400 * MS))
-    (torn,) = assembler.feed(cycle(2)[9], 450 * MS, clock.at(350, 450 * MS))
+        feed_one(assembler, reading, 400 * MS, clock.at(number, 400 * MS))
+    (torn,) = feed_one(assembler, cycle(2)[9], 450 * MS, clock.at(350, 450 * MS))
     assert not torn.complete

@@ -8,26 +8,28 @@ from firmware_bridge.scans.can_id_maps import (
     LAYOUT_B_MAP,
     USPA44_MAP,
     XR1944_MAP,
-    Reading,
-    decode,
     trigger_frame,
 )
+from firmware_bridge.scans.scan_assembler import ScanAssembler
 
 DATA = bytes.fromhex("937E317E1593120F")
 BACKWARDS = [3, 2, 1, 0]
 
 
 @pytest.mark.parametrize(
-    ("can_id", "data", "reading"),
+    ("can_id", "data", "place", "counts"),
     [  # the first two as a sensor sent them, with what its maker's server read in them
-        (0x004, DATA, Reading("4", 3, 32305, 32277, 37650)),
-        (0x104, bytes.fromhex("938406805591BB0C"), Reading("4", 7, 33798, 32853, 37307)),
-        (0x004, b"\0" + DATA[1:7] + b"\xff", Reading("4", 3, 32305, 32277, 37650)),
-        (0x33F, b"\1" + bytes.fromhex("0000 8000 FFFF") + b"\1", Reading("15", 12, 0, 32768, 65535)),
+        (0x004, DATA, (0, 3), [32305, 32277, 37650]),
+        (0x104, bytes.fromhex("938406805591BB0C"), (1, 3), [33798, 32853, 37307]),
+        (0x004, b"\0" + DATA[1:7] + b"\xff", (0, 3), [32305, 32277, 37650]),
+        (0x33F, b"\1" + bytes.fromhex("0000 8000 FFFF") + b"\1", (3, 0), [0, 32768, 65535]),
     ],
 )
-def test_golden_frames(can_id, data, reading):
-    assert decode(CanFrame(can_id, data), USPA44_MAP) == reading
+def test_golden_frames(can_id, data, place, counts):
+    assembler, sensor = ScanAssembler(USPA44_MAP), str(can_id & 0xF)
+    frames = [CanFrame(one, data if one == can_id else bytes(8)) for one, _ in USPA44_MAP.wire_order(sensor)]
+    (scan,) = [scan for frame in frames for scan in assembler.feed_frame(frame, 0)]
+    assert scan.sensor == sensor and scan.counts[:, *place].tolist() == counts
 
 
 @pytest.mark.parametrize(
@@ -58,9 +60,9 @@ def test_every_sensor_has_every_taxel_once(model, sensors, triggered):
 
 def test_every_id_of_layout_c_names_its_controller():
     for can_id in range(0x800):
-        reading = decode(CanFrame(can_id, DATA), USPA44_MAP)
+        place = USPA44_MAP.taxels.get(can_id)
         ours = can_id >> 8 <= 3 and can_id >> 4 & 0xF <= 3
-        assert (reading.sensor if reading else None) == (str(can_id & 0xF) if ours else None), hex(can_id)
+        assert (place[0] if place else None) == (str(can_id & 0xF) if ours else None), hex(can_id)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,9 @@ def test_every_id_of_layout_c_names_its_controller():
     ],
 )
 def test_foreign_frames(frame):
-    assert decode(frame, USPA44_MAP) is None
+    assembler = ScanAssembler(USPA44_MAP)
+    assert assembler.feed_frame(frame, 0) == []
+    assert (assembler.counters()["foreign"], assembler.counters()["readings"]) == (1, 0)
 
 
 def test_triggers():

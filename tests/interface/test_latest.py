@@ -14,7 +14,6 @@ from edge.pipeline.commands import Command, Commands
 from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
-from firmware_bridge.links.reconnecting import LastingLink
 from firmware_bridge.poses import PadPose, TimedPose
 
 BASELINES = {"4": BASELINE, "6": Baseline.of("6", REST, 1000.0, 100, "file")}
@@ -307,9 +306,9 @@ def test_asyncio_is_told_of_errors_and_of_time():
 
 def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
     """A sensor may still come before; one of another link, or with a baseline, at any time."""
-    left = StagedLink(scans(0), scans(*range(1, 20)), endless=True)
-    right = StagedLink(scans(0), endless=True)
-    with Source(LastingLink(left, None, name="a"), LastingLink(right, None, name="b")) as source:
+    left = StagedLink(scans(0), scans(*range(1, 20)), endless=True, prefix="a/")
+    right = StagedLink(scans(0), endless=True, prefix="b/")
+    with Source(left, right) as source:
         stream = Stream(source, open_runtime(FakeModel(), source, baselines={"a/8": BASELINE}))
         with pytest.raises(UsageError, match=r"^no sensor '4': the names begin with a/, b/$"):
             stream.latest("4")

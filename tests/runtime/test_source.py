@@ -15,8 +15,7 @@ from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
 from edge.pipeline.cadence import Pace
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
-from firmware_bridge.links.reconnecting import LastingLink
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.links.registry import open_source
 from firmware_bridge.recording.tracks import Recording, Track
 
 LIMIT_S = 30
@@ -97,7 +96,7 @@ class TestOpening:
             Source(FakeLink([]), FakeLink([], kind="emulated"))
         with pytest.raises(SourceError, match="of several kinds"):
             Source(Late([]), FakeLink([])).open()
-        with Source(Late([]), LastingLink(Late([]), None, name="b")) as source:
+        with Source(Late([]), Late([], prefix="b/")) as source:
             assert source.kind == "emulated"
 
 
@@ -139,8 +138,8 @@ class TestOne:
 class TestScripts:
     def test_a_link_that_hangs_holds_up_no_other(self):
         gate = threading.Event()
-        fast, slow = FakeLink([[make_scan(n)] for n in range(5)]), FakeLink([gate, [make_scan(0)]])
-        with Source(LastingLink(slow, None, name="slow"), LastingLink(fast, None, name="fast")) as source:
+        fast = FakeLink([[make_scan(n)] for n in range(5)], prefix="fast/")
+        with Source(FakeLink([gate, [make_scan(0)]], prefix="slow/"), fast) as source:
             taken = take_all(source, lambda taken: len(taken) >= 5)
             assert numbers(taken, "fast/4") == list(range(5)) and not numbers(taken, "slow/4")
             gate.set()
@@ -151,7 +150,7 @@ class TestScripts:
         told = [Notice(0, "lost", "told")]
         lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
         taken = []
-        with Source(lost, LastingLink(FakeLink([], endless=True), None, name="other")) as source:
+        with Source(lost, FakeLink([], endless=True, prefix="other/")) as source:
             with pytest.raises(LinkLostError, match="gone"):
                 while True:
                     taken += source.take(0.2) or ()
@@ -161,8 +160,8 @@ class TestScripts:
 
     def test_the_source_closes_while_a_link_is_away(self):
         before = set(threading.enumerate())
-        away = LastingLink(FakeLink([], error=LinkLostError("gone")))
-        with Source(away, LastingLink(FakeLink([], endless=True), None, name="right")) as source:
+        away = FakeLink([], error=LinkLostError("gone"), lasts=True)
+        with Source(away, FakeLink([], endless=True, prefix="right/"), give_up_s=float("inf")) as source:
             take_all(source, lambda taken: any(isinstance(one, Notice) for one in taken))
         assert not set(threading.enumerate()) - before
 
@@ -184,7 +183,8 @@ def test_what_is_read_does_not_depend_on_when(pace):
     with ExitStack() as closing:
         emulators = [closing.enter_context(Emulator([played], waits=True)) for _ in range(2)]
         named = enumerate(emulators)
-        source = Source(*(LastingLink(SlcanSerialLink(emulator.port), name=f"f{index}") for index, emulator in named))
+        links = [open_source(f"slcan:{emulator.port}", prefix=f"f{index}/") for index, emulator in named]
+        source = Source(*links, give_up_s=float("inf"))
         closing.enter_context(source)
         source.pace = pace
         taken: list[list[Scan]] = []

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -268,9 +269,17 @@ class FakeLink(Link):
     """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails."""
 
     def __init__(
-        self, batches, *, error: Exception | None = None, kind: SourceKind = "device", endless: bool = False
+        self,
+        batches,
+        *,
+        error: Exception | None = None,
+        kind: SourceKind = "device",
+        endless: bool = False,
+        prefix: str = "",
+        lasts: bool = False,
     ) -> None:
         self.name = "fake"
+        self.prefix, self.lasts = prefix, lasts
         self.kind: SourceKind = kind
         self.ended = False
         self.reads = 0
@@ -302,7 +311,7 @@ class FakeLink(Link):
             batch.wait(10)
             return []
         self._given += len(batch)
-        return batch
+        return [replace(scan, sensor=self.prefix + scan.sensor) for scan in batch] if self.prefix else batch
 
     def counters(self) -> dict[str, int]:
         return {"scans": self._given}

@@ -22,7 +22,9 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.links.xela_server import XelaServerLink
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.frame_scans import GsUsbScans
+from firmware_bridge.scans.mounting import placed_map
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.scan_assembler import ScanAssembler
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -46,7 +48,17 @@ class Rig:
     lost = away = ""
     decoder: type
 
-    def link(self, **settings) -> Link:
+    def link(self, prefix: str = "", **settings) -> Link:
+        """Return a link, the names of whose sensors begin so."""
+        if issubclass(type(self), CanRig) and prefix:
+            settings["model"] = placed_map(USPA44_MAP, {}, prefix)
+        elif prefix:
+            settings["prefix"] = prefix
+        link = self.make(**settings)
+        link.prefix = prefix
+        return link
+
+    def make(self, **settings) -> Link:
         raise NotImplementedError
 
     def give(self, link: Link, scans: int) -> list[Scan]:
@@ -115,7 +127,7 @@ class SlcanRig(CanRig):
         self._port.plug()
         self.name = f"slcan:{self._port.path}"
 
-    def link(self, **settings):
+    def make(self, **settings):
         return SlcanSerialLink(self._port.path, **settings)
 
     def hear_at(self, frame, bus_us):
@@ -152,7 +164,7 @@ class GsUsbRig(CanRig):
         self._port = GsUsbPort()
         self._backend = GsUsbBackend(self._port)
 
-    def link(self, **settings):
+    def make(self, **settings):
         return GsUsbLink(backend=self._backend, **settings)
 
     def hear_at(self, frame, bus_us):
@@ -206,7 +218,7 @@ class PythonCanRig(CanRig):
     def _open(self, *, channel, **_):
         return PulledBus(self._plugged, channel=channel)
 
-    def link(self, **settings):
+    def make(self, **settings):
         return CanBusLink("virtual", self._channel, **settings)
 
     def hear_at(self, frame, bus_us):
@@ -245,7 +257,7 @@ class ServerRig(Rig):
         self.name = f"xela-server:{self._server.url}"
         self.lose, self.put_back = self._server.kill, self._server.start_again
 
-    def link(self, **settings):
+    def make(self, **settings):
         return XelaServerLink(self._server.url, **settings)
 
     def close(self):
@@ -261,7 +273,7 @@ class DemoRig(Rig):
     def __init__(self, folder: Path, monkeypatch) -> None:
         self._recording = write_recording(folder / "demo.csv", make_counts(30), rate_hz=100)
 
-    def link(self, **settings):
+    def make(self, **settings):
         self._link = DemoLink(self._recording, loop=True)
         return self._link
 
@@ -279,5 +291,5 @@ class ReplayRig(Rig):
         self._recording = write_recording(folder / "finger.csv", make_counts(200), rate_hz=100)
         self.name = f"replay:{self._recording}"
 
-    def link(self, **settings):
+    def make(self, **settings):
         return ReplayLink([self._recording])

@@ -88,10 +88,6 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "_timings: tseg1 - prop_seg -> tseg1 + prop_seg": "sampled at three quarters or later, it is never the least",
     },
     "assembler": {
-        "awaits: return False -> return None": "its caller asks for nothing but whether it is true",
-        "awaits: self.wire.awaited = cycle -> pass": "it is found to be the same by its taxels, which takes longer",
-        "feed: place > self._place -> place >= self._place": "the place is set to what it is",
-        "fewest_missing: missing < fewest -> missing <= fewest": "the fewest is set to what it is",
         "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
         "begin_anew: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
     },
