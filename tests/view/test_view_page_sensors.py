@@ -286,7 +286,7 @@ def test_pauses_and_reconnects_lose_and_repeat_nothing(held, open_page):
     devtools.send("Performance.enable")
 
     def kept():
-        """Return Chromium's counts after garbage collection, the least of a few; nodes are those not in the document."""
+        """Return Chromium's counts after garbage collection, the least of a few; nodes are those not in the page."""
         counted = []
         for _ in range(4):
             devtools.send("HeapProfiler.collectGarbage")
