@@ -50,7 +50,9 @@ def stop_on_signals() -> Iterator[threading.Event]:
     woken.setblocking(False)
     with handled(("SIGINT", "SIGTERM", "SIGHUP"), handle) as numbers:
         before = signal.set_wakeup_fd(woken.fileno(), warn_on_full_buffer=False)
-        thread = threading.Thread(target=_watch, args=(waking, numbers), name="ending", daemon=True)
+        # The terminal as it is now: the caller may change it before the thread runs.
+        watched = (waking, numbers, _terminal_settings())
+        thread = threading.Thread(target=_watch, args=watched, name="ending", daemon=True)
         thread.start()
         try:
             yield stop
@@ -61,9 +63,9 @@ def stop_on_signals() -> Iterator[threading.Event]:
             waking.close()
 
 
-def _watch(waking: socket.socket, numbers: Collection[int]) -> None:
+def _watch(waking: socket.socket, numbers: Collection[int], terminal: list[Any] | None) -> None:
     """End the process by force if it goes on for END_S after one of these signals, and after any that come later."""
-    terminal, stopping = _terminal_settings(), False
+    stopping = False
     while True:
         try:
             received = waking.recv(64)

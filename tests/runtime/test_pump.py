@@ -101,7 +101,7 @@ class TestEnds:
         assert numbers(sink) == [0, 1, 2] and statistics.scans == 3
 
     def test_a_fault_in_the_reader_is_not_swallowed(self):
-        with pytest.raises(ZeroDivisionError):
+        with pytest.raises(LinkLostError, match="unforeseen ZeroDivisionError"):
             pumped(FakeLink([], error=ZeroDivisionError()), ListSink())
 
     def test_stop_and_duration_end_an_endless_source(self):
