@@ -168,11 +168,14 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
     noise = random.Random(seed)
     bus = [reading for n in range(30) for reading in cycle(n) + cycle(n, "6") if noise.randrange(100) >= percent_lost]
     bus = [reading for reading in bus for _ in range(1 + (noise.randrange(20) == 0))]
-    assembler = ScanAssembler(USPA44_MAP)
-    scans = feed(assembler, bus)
+    assembler, broken = ScanAssembler(USPA44_MAP), noise.randrange(len(bus))
+    scans = feed(assembler, bus[:broken])
+    assembler.begin_anew()
+    scans += feed(assembler, bus[broken:], broken)
     told = assembler.counters()
     fresh = sum(int(scan.fresh.sum()) for scan in scans)
-    still_open = told["readings"] - fresh - told["duplicates"] - told["unconfirmed"] - told["resynchronised"]
+    counted = sum(told[name] for name in ("duplicates", "unconfirmed", "resynchronised", "abandoned"))
+    still_open = told["readings"] - fresh - counted
     assert told["readings"] == len(bus) and 0 <= still_open < 2 * 16
     assert told["scans"] == len(scans) and told["torn_wire"] == sum(not scan.complete for scan in scans)
     assert told["missing_taxels"] == sum(int((~scan.fresh).sum()) for scan in scans)
@@ -183,6 +186,30 @@ def test_every_reading_is_in_a_scan_or_counted(seed, percent_lost):
         numbers = scan.counts[1][scan.fresh] - 2000
         assert (scan.counts[0][scan.fresh] == 1000 * np.flatnonzero(scan.fresh) + numbers).all()
         assert (scan.counts[2][scan.fresh] == 3000 + numbers).all()
+
+
+def test_a_link_that_broke_joins_no_halves():
+    assembler = ScanAssembler(USPA44_MAP)
+    feed(assembler, cycle(0) + cycle(1)[:8])
+    assembler.begin_anew()
+    assert feed(assembler, cycle(2)[8:], 100) == []
+    assert [scan.counts[2, 0, 0] for scan in feed(assembler, cycle(3), 200)] == [3003]
+    assert counters(assembler) == {"readings": 48, "scans": 2, "abandoned": 8, "resynchronised": 8}
+
+
+def test_a_scan_held_back_when_the_link_broke_never_comes():
+    assembler, ms = ScanAssembler(USPA44_MAP), 1_000_000
+
+    def played(number: int) -> list[int]:
+        readings = enumerate(cycle(number))
+        scans = [scan for i, one in readings for scan in feed_all(assembler, [one], number * 10 * ms + i * ms // 4)]
+        return [int(scan.counts[2, 0, 0]) - 3000 for scan in scans]
+
+    assert [number for paced in range(60) for number in played(paced)] == [*range(60)]
+    assert played(61) == [], "a cycle was lost, so it may be parts of two"
+    assembler.begin_anew()
+    assert [number for paced in range(70, 75) for number in played(paced)] == [*range(70, 75)]
+    assert assembler.counters()["abandoned"] == 16
 
 
 def test_a_scan_is_waited_for_as_long_as_the_slowest_takes():
@@ -247,6 +274,14 @@ def test_a_cycle_fed_as_one_is_the_scan_of_its_readings(stamped):
     assert counters(assembler) == counters(one_by_one) == {"readings": 48, "scans": 3}
     assert feed_cycle(assembler, 2, 300 * MS, stamped=stamped)[0].repeated
     assert counters(assembler) == {"readings": 64, "scans": 4, "repeated": 1}
+
+
+def test_the_first_cycle_after_an_outage_is_a_scan():
+    assembler = ScanAssembler(USPA44_MAP)
+    for number in range(2 * LEAST_INTERVALS):
+        feed_cycle(assembler, number, (1 + number) * 100 * MS, stamped=True)
+    assembler.begin_anew()
+    assert len(feed_cycle(assembler, 90, 20_000 * MS, stamped=True)) == 1
 
 
 @pytest.mark.parametrize(("pause_ns", "whole"), [(5 * MS, True), (6 * MS, False)])

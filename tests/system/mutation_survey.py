@@ -88,6 +88,9 @@ EQUIVALENT: dict[str, dict[str, str]] = {
         "_timings: tseg1 - prop_seg -> tseg1 + prop_seg": "sampled at three quarters or later, it is never the least",
     },
     "assembler": {
+        "__init__: self._newest_ns = 0 -> pass": "it is read of sensors alone, and the first reading sets it",
+        "_end_of_run: self._gap_ns(time_ns, own_ns, at) > wire.pause_ns -> self._gap_ns(time_ns, own_ns, at) >= "
+        "wire.pause_ns": "a reading that is judged by itself goes on in the scan just as well",
         "_close: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
         "begin_anew: 1 -> 2": "seventeen are missing behind a scan, and the most that is given out is sixteen",
     },
