@@ -17,7 +17,7 @@ OUTAGES: Final = ("lost", "silent")
 
 
 class Diagnostics:
-    """What is known of each sensor, from which a message is made once a second."""
+    """State of each sensor, from which a message is made once a second."""
 
     def __init__(self, topic: str) -> None:
         """Begin without a sensor; `topic` is the first part of their names."""
