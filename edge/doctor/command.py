@@ -24,7 +24,7 @@ from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
-from firmware_bridge.links.base import Link
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
@@ -77,13 +77,14 @@ class Visit:
     """
 
     def __init__(
-        self, options: argparse.Namespace, link: Link, known: SensorFile, err: TextIO, stop: threading.Event
+        self, options: argparse.Namespace, reader: LinkReader, known: SensorFile, err: TextIO, stop: threading.Event
     ) -> None:
         """Prepare the visit; requests to a person go to `err`."""
         self.mountings: dict[str, Mounting] = {}
         self.newtons: dict[str, float] = {}
         self.unfinished = False
-        self._options, self._link, self._known = options, link, known
+        self._options, self._reader, self._known = options, reader, known
+        self._link = reader.link
         self._err, self._stop = err, stop
 
     def watch(self, watched: Watched) -> None:
@@ -97,7 +98,7 @@ class Visit:
                     bar.set_postfix_str(f"{scans / passed_s:.0f} scans/s", refresh=False)
                 bar.update(min(passed_s, length_s) - bar.n)
 
-            watch(self._link, watched, length_s, self._stop, tell=show)
+            watch(self._reader, watched, length_s, self._stop, tell=show)
 
     def press(self, names: Sequence[str], examined: Examined) -> None:
         """Ask for presses on every pad that may be zeroed, and add what is found; raises LinkLostError."""
@@ -144,7 +145,7 @@ class Visit:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
-            for scan in self._link.read(POLL_S):
+            for scan in self._reader.read(POLL_S):
                 if scan.sensor == name:
                     received_s = time.monotonic()
                     ask(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
@@ -183,15 +184,16 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         check_writable(options.out, known)
     before = stored_baselines(options.baseline, known)
     with stop_on_signals() as stop:
-        link, known, watched = prepare(options.source, known, before, options.rate_hz)
+        reader, known, watched = prepare(options.source, known, before, options.rate_hz)
+        link = reader.link
         emulated = "emulated" in (link.kind, link.origin)
         if options.out is not None and emulated:
             refuse_device(options.out, known)
-        visit = Visit(options, link, known, err, stop)
+        visit = Visit(options, reader, known, err, stop)
         start_s = time.monotonic()
         failed: BridgeError | None = None
         whole = False
-        with link:
+        with reader:
             refuse_emulated(known, link.kind, options.force)
             try:
                 visit.watch(watched)

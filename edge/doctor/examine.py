@@ -19,7 +19,7 @@ from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.links.base import Link
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
@@ -163,8 +163,8 @@ def check_load(
 
 def prepare(
     texts: Sequence[str], known: SensorFile, before: Mapping[str, Baseline], rate_hz: float | None
-) -> tuple[Link, SensorFile, Watched]:
-    """Return the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
+) -> tuple[LinkReader, SensorFile, Watched]:
+    """Return a reader of the link to the source that `texts` names, the facts on its sensors, and an empty watch of it.
 
     `before` holds earlier baselines of the free pads, by sensor; `rate_hz` is expected of each sensor, in [Hz]. Raises
     what source_setup.links_to raises, and UsageError for several sources.
@@ -176,11 +176,12 @@ def prepare(
     check_baselines(before, known.model_map.geometry)
     (link,) = links_to(texts, known, rate_hz=rate_hz)
     known = with_recorded(known, [link])
-    return link, known, Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
+    watched = Watched(model=known.model_map, rate_hz=rate_hz, references=before, mountings=known.mountings)
+    return LinkReader(link), known, watched
 
 
 def watch(
-    link: Link,
+    reader: LinkReader,
     watched: Watched,
     length_s: float,
     stop: threading.Event,
@@ -192,10 +193,10 @@ def watch(
     `tell` is called after each read with the number of scans and the time that has passed, in [s].
     """
     start_s = now_s = received_s = time.monotonic()
-    scans = 0
+    link, scans = reader.link, 0
     try:
         while now_s - start_s < length_s and not (stop.is_set() or link.ended) and now_s - received_s <= GIVEN_UP_S:
-            for scan in link.read(POLL_S):
+            for scan in reader.read(POLL_S):
                 watched.scans.setdefault(scan.sensor, []).append(scan)
                 received_s = now_s
                 scans += 1
@@ -227,8 +228,8 @@ def examine(
     """
     check_positive("duration_s", duration_s)
     known = sensor_settings(sensor, id_map)
-    link, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
-    with link:
-        refuse_emulated(known, link.kind, force=False)
-        watch(link, watched, duration_s, threading.Event() if stop is None else stop)
+    reader, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
+    with reader:
+        refuse_emulated(known, reader.link.kind, force=False)
+        watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings

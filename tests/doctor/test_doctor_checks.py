@@ -1,16 +1,19 @@
 """A sensor that is well gives no finding but ok, each fault only its own, and all are on the page for users."""
 
 import ast
+import threading
 
 import numpy as np
 import pytest
 from doctor_samples import COUNTERS, REST, as_scans, healthy_counts, silenced, times_ns, watched
-from edge_samples import ROOT
+from edge_samples import ROOT, FakeLink, make_scan
 
-from edge.doctor.examine import Watched, judge
+from edge.doctor.examine import Watched, judge, watch
 from edge.doctor.link_checks import LineFacts, capacity_hz, check_baud, check_id_map, check_latency, check_link
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.errors import LinkLostError
+from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -283,3 +286,11 @@ def test_each_finding_has_a_row():
     page = (ROOT / "docs" / "trouble.md").read_text()
     rows = {one.strip() for line in page.splitlines() if line.startswith("| ") for one in line.split("|")[1].split(",")}
     assert names <= rows, names - rows
+
+
+def test_an_unforeseen_error_of_a_driver_is_the_loss_of_its_link():
+    seen = Watched(model=USPA44_MAP, rate_hz=None, references={}, mountings={})
+    link = FakeLink([[make_scan(0)]], error=ZeroDivisionError("in a driver"))
+    with LinkReader(link) as reader, pytest.raises(LinkLostError, match="unforeseen ZeroDivisionError in a driver"):
+        watch(reader, seen, 60.0, threading.Event())
+    assert len(seen.scans["4"]) == 1, "what came before it is kept"
