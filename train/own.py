@@ -268,7 +268,7 @@ def reported(program: str, run: Callable[[argparse.Namespace], int], options: ar
         sys.stderr.write(f"{program}: {error.filename}: {error.strerror}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write(f"{program}: interrupted; the same command continues\n")
+        sys.stderr.write(f"{program}: interrupted; run the same command again\n")
         return 130
 
 
