@@ -225,7 +225,8 @@ class Check:
 def _which(number: int, *, alone: bool) -> str:
     if number == 1:
         return "the tap before does"
-    return f"the {number}. tap before does" if alone else f"taps from the {number}. before on do"
+    ordinal = {2: "2nd", 3: "3rd"}.get(number, f"{number}th")  # of six earlier taps at most
+    return f"the {ordinal} tap before does" if alone else f"taps from the {ordinal} before on do"
 
 
 class SensorPad:

@@ -176,16 +176,16 @@ class Sensor:
         """Take a new baseline from the next scans, with an event for the outcome; `force` also in contact."""
         self._zeroing.zero_again(force=force, doubted=self._doubt.reported is not None)
 
-    def lose_touch(self, *, same_pad: bool = False) -> None:
+    def lose_touch(self) -> None:
         """Forget earlier readings and taps, since no scan of the sensor arrived for a time.
 
         Drift is followed again once the pad has been at rest and its rest level has been compared with the earlier one;
-        a contact is believed again once the pad was seen at rest, unless it is the `same_pad` for sure.
+        a contact is believed again once the pad was seen at rest.
         """
         self.tracker.reset()
         self.last.estimate = None
         self._health.forget()
-        self._doubt.lose_touch(same_pad=same_pad)
+        self._doubt.lose_touch()
         self._zeroing.lose_touch()
 
     def report(self, kind: EventKind, detail: str = "") -> None:
@@ -309,14 +309,11 @@ class Runtime:
         """
         return self._tracks.setdefault(sensor, PoseTrack()).add(time_ns, pose, holds=holds)
 
-    def lose_touch(self, sensors: str = "", *, same_pad: bool = False) -> None:
-        """Forget readings and taps of sensors whose names begin so, after their link broke; zeroing stays.
-
-        Contacts may have been missed, but a recording that goes on from another place is of the `same_pad`.
-        """
+    def lose_touch(self, sensors: str = "") -> None:
+        """Forget readings and taps of sensors whose names begin so, after their link broke; zeroing stays."""
         for name, sensor in self._sensors.items():
             if name.startswith(sensors):
-                sensor.lose_touch(same_pad=same_pad)
+                sensor.lose_touch()
 
     def push(self, scan: Scan, *, infer: bool = True) -> Result:
         """Make the result of one scan, inferred at once if it is in contact and `infer` is true; raises as `infer`."""

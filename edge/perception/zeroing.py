@@ -229,9 +229,9 @@ class BaselineDoubt:
         self._level = self._peak = self._still_counts = 0.0
         self._newest_ns = self._still_ns = 0
 
-    def lose_touch(self, *, same_pad: bool = False) -> None:
-        """Forget how a contact began, and after an outage that the pad was seen: it may not be the `same_pad`."""
-        if self._seen and not same_pad:
+    def lose_touch(self) -> None:
+        """Forget how a contact began, and that the pad was seen: after an outage it may be another one."""
+        if self._seen:
             self._before, self._newest = self._newest, None
             self._seen, self._unseen = False, "outage"
         self._touched = self._seen

@@ -57,11 +57,6 @@ class Cadence:
         """Rate of the newest scans in [Hz]; None as long as too few have arrived."""
         return None if self.period_ns is None else NS_PER_S / self.period_ns
 
-    def forget(self) -> None:
-        """Forget the scans: a recording goes on elsewhere, and none is missing."""
-        self.last = None
-        self._forget_pace()
-
     def follow(self, scan: Scan) -> None:
         """Take the next scan."""
         before, self.last = self.last, scan
@@ -169,12 +164,6 @@ class Cadences:
     def begin_anew(self, time_ns: int, sensors: str = "") -> None:
         """Restart the silence of sensors whose names begin so at `time_ns` [ns], when their link came back."""
         self._since_ns[sensors] = time_ns
-
-    def forget(self, sensors: str = "") -> None:
-        """Forget the scans of sensors whose names begin so: a recording goes on elsewhere."""
-        for name, cadence in self._sensors.items():
-            if name.startswith(sensors):
-                cadence.forget()
 
     def follow(self, result: Result) -> Event | None:
         """Take the next result of a sensor; return an event if the sensor was silent."""

@@ -315,12 +315,9 @@ class Loop:
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
         if notice.kind in ("lost", "silent", "back"):
-            self._runtime.lose_touch(notice.sensors, same_pad=not notice.text)  # no text: a recording jumped
+            self._runtime.lose_touch(notice.sensors)
             self._cadences.begin_anew(notice.time_ns, notice.sensors)
-        if notice.text:
-            self._tell(Event.of(notice))
-        else:
-            self._cadences.forget(notice.sensors)
+        self._tell(Event.of(notice))
 
     def _tell(self, event: Event) -> None:
         self.statistics.tell(event)

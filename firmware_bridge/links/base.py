@@ -24,7 +24,7 @@ class Notice(NamedTuple):
         kind: "lost", the link is gone; "silent", it is there and gives no scan; "back", it gives scans again, and
             all earlier readings of its sensors are old; "trouble", it works, but reports trouble; "well", it no
             longer does; "note", a remark on a recording or on time stamps.
-        text: message to the user; empty where the demo begins again.
+        text: message to the user.
         sensors: common prefix of the names of the sensors concerned.
     """
 

@@ -104,10 +104,7 @@ class LinkReader:
         prefix = self.link.prefix
         if not prefix:
             return notices
-        return [
-            one._replace(sensors=f"{prefix}{one.sensors}", text=one.text and f"{prefix[:-1]}: {one.text}")
-            for one in notices
-        ]
+        return [one._replace(sensors=f"{prefix}{one.sensors}", text=f"{prefix[:-1]}: {one.text}") for one in notices]
 
     def counters(self) -> dict[str, int]:
         """Return the link's counters; of one that lasts, also its outages (losses, silences) and reopenings."""
