@@ -112,7 +112,7 @@ def parsed_options(command: str, arguments: Sequence[str]) -> argparse.Namespace
         check_sink(text)
     check_apart(options.sink)
     if options.fields is not None:
-        from edge.sinks.json_encoding import chosen_fields
+        from edge.sinks.json_records import chosen_fields
 
         chosen_fields(options.fields)
         if not any(text.startswith("jsonl:") for text in options.sink):

@@ -25,7 +25,7 @@ from edge.perception.result import Result, mask_bits
 from edge.perception.result_fields import maps_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import CountersInTurn, record
+from edge.sinks.json_records import CountersInTurn, record
 from edge.sinks.ros2.messages import (
     IMAGE,
     LOG,

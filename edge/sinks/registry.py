@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from operator import methodcaller
+from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -20,6 +20,7 @@ from edge.sinks.ros2.messages import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.poses import TimedPose
 
+UNWRITTEN: Final = attrgetter("unwritten")
 LOOK_NS: Final = 500_000_000
 """Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
 
@@ -36,7 +37,7 @@ class Fan(Sink):
         self.failures: list[SinkError] = []
         self._sinks: list[Sink] = []
         self._given_up_unwritten = 0
-        self._counters: Mapping[str, int] = {}
+        self._counters: Mapping[str, int] = {}  # the newest, also for a sink that fails while no scan comes
         self._tell = tell
         self._clock_ns = clock_ns
         self._look_ns = clock_ns() + LOOK_NS
@@ -53,19 +54,21 @@ class Fan(Sink):
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Pass on one result, or raise where no sink is left; a SinkClosedError if only their readers have gone."""
-        self._each(methodcaller("write", result, counters), counters)
+        self._counters = counters
+        self._each("write", result, counters)
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Pass on one event."""
-        self._each(methodcaller("tell", event, counters), counters)
+        self._counters = counters
+        self._each("tell", event, counters)
 
     def pose(self, poses: Sequence[TimedPose]) -> None:
         """Pass on poses."""
-        self._each(methodcaller("pose", poses), self._counters)
+        self._each("pose", poses)
 
     def wait(self) -> None:
         """Pass on that no scan came."""
-        self._each(methodcaller("wait"), self._counters)
+        self._each("wait")
 
     def close(self) -> None:
         """Close every sink; raises the error of the first that failed, now or before, unless another ends the run."""
@@ -78,26 +81,25 @@ class Fan(Sink):
         if self.failures and sys.exception() is None:  # else the error that ended the run is reported
             raise self.failures[0]
 
-    def _each(self, act: Callable[[Sink], None], counters: Mapping[str, int]) -> None:
-        self._counters = counters  # still true for a sink that fails while no scan comes
+    def _each(self, act: str, *given: object) -> None:
         for sink in tuple(self._sinks):
             if sink not in self._sinks:  # given up by an earlier call of this loop
                 continue
             try:
-                act(sink)
+                getattr(sink, act)(*given)
             except SinkError as error:
-                self._give_up(sink, error, counters)
-        self.unwritten = self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
+                self._give_up(sink, error)
+        self.unwritten = self._given_up_unwritten + sum(map(UNWRITTEN, self._sinks))
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             known, self._known_trouble = self._known_trouble, self._troubles()
             for trouble in sorted(self._known_trouble - known):
-                self._tell_all(trouble, counters)
+                self._tell_all(trouble)
 
     def _troubles(self) -> set[str]:
         return {sink.trouble for sink in self._sinks if sink.trouble is not None}
 
-    def _give_up(self, sink: Sink, error: SinkError, counters: Mapping[str, int]) -> None:
+    def _give_up(self, sink: Sink, error: SinkError) -> None:
         self._sinks.remove(sink)
         self._given_up_unwritten += sink.unwritten
         closed = isinstance(error, SinkClosedError)
@@ -110,12 +112,12 @@ class Fan(Sink):
         if not self._sinks:
             self.unwritten = self._given_up_unwritten
             raise self.failures[0] if self.failures else error
-        self._tell_all(f"{error}; the other sinks continue", counters)
+        self._tell_all(f"{error}; the other sinks continue")
 
-    def _tell_all(self, text: str, counters: Mapping[str, int]) -> None:
+    def _tell_all(self, text: str) -> None:
         event = Event(self._clock_ns(), "sink", None, text)
         self._tell(event)
-        self.tell(event, counters)
+        self.tell(event, self._counters)
 
 
 class Form(NamedTuple):
@@ -185,7 +187,7 @@ def _open_status(target: str, contract: Contract, source: Source, options: SinkO
 
 
 def _open_jsonl(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.jsonl import JsonLinesSink
+    from edge.sinks.json_records import JsonLinesSink
 
     return JsonLinesSink(target, source, options)
 

@@ -21,7 +21,7 @@ from edge.perception.result import Result
 from edge.perception.result_fields import maps_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import CountersInTurn, event_record, pack, record
+from edge.sinks.json_records import CountersInTurn, event_record, pack, record
 from firmware_bridge.extras import how_to_install
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.cadence import Cadence
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import event_record, pack, record
+from edge.sinks.json_records import event_record, pack, record
 from firmware_bridge.errors import harmless
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.schedule import SENSOR_SILENT_NS

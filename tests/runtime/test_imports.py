@@ -16,8 +16,15 @@ from firmware_bridge.extras import how_to_install, need
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
-    *("edge.sinks.jsonl", "edge.sinks.converted_files", "edge.sinks.ros2.sink", "cyclonedds", "tqdm", "edge.bench"),
-    *("edge.cli.demo", "edge.terminal.heatmap", "websockets", "usb", "can", "subprocess"),
+    *(
+        "edge.sinks.json_records",
+        "edge.sinks.converted_files",
+        "edge.sinks.ros2.sink",
+        "cyclonedds",
+        "tqdm",
+        "edge.bench",
+    ),
+    *("edge.cli.demo", "edge.terminal.heatmap", "cyclonedds", "tqdm", "websockets", "usb", "can", "subprocess"),
     *("firmware_bridge.emulation.slcan_emulator", "firmware_bridge.links.demo"),
     *("firmware_bridge.links.slcan_serial", "firmware_bridge.links.xela_server"),
     *("firmware_bridge.links.gs_usb_link", "firmware_bridge.links.can_bus"),

@@ -9,7 +9,7 @@ from runtime_samples import Pushed, make_runtime
 
 from edge.api import BaselineRefusedError, DeviceError, LinkLostError, Source, take_baselines
 from edge.perception.zeroing import GIVE_UP_NS
-from edge.sinks.json_encoding import record
+from edge.sinks.json_records import record
 from edge.sinks.status_line import StatusSink
 from firmware_bridge.links.base import Notice
 

@@ -28,8 +28,7 @@ from sink_samples import (
 
 from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
 from edge.pipeline.sink import SinkOptions
-from edge.sinks.json_encoding import COUNTED_NS
-from edge.sinks.jsonl import JsonLinesSink
+from edge.sinks.json_records import COUNTED_NS, JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
 from edge.sinks.ros2.messages import RESULT
 

@@ -16,8 +16,7 @@ from sink_samples import RUN, make_results, make_sure_results
 
 from edge.api import Event, MessageError, Runtime
 from edge.pipeline.sink import SinkOptions
-from edge.sinks.json_encoding import ALWAYS, pack, unpack
-from edge.sinks.jsonl import JsonLinesSink, has_room, record_line
+from edge.sinks.json_records import ALWAYS, JsonLinesSink, has_room, pack, record_line, unpack
 from firmware_bridge.scans.scan import VendorReading
 
 

@@ -27,7 +27,7 @@ from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
 from edge.api import Event, Note, Result, SinkError, UsageError
 from edge.cli.main import parser
-from edge.sinks.json_encoding import record
+from edge.sinks.json_records import record
 from edge.sinks.registry import check_sink
 from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type

@@ -22,7 +22,7 @@ from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interru
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
-from edge.sinks.json_encoding import event_record, record, unpack
+from edge.sinks.json_records import event_record, record, unpack
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.stop_signals import EXIT_FORCED

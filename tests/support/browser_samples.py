@@ -19,7 +19,7 @@ from edge_samples import ROOT
 
 from edge.api import load_model
 from edge.inference.bundled import demo_recording
-from edge.sinks.json_encoding import unpack
+from edge.sinks.json_records import unpack
 from edge.terminal.heatmap import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44

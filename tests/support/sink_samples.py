@@ -211,7 +211,7 @@ class Zenoh(Opened):
         self._consumer.stop()
 
     def results(self) -> list[Back]:
-        from edge.sinks.json_encoding import unpack
+        from edge.sinks.json_records import unpack
 
         heard = self._heard
         packed = [unpack(data) for key, *_, data in heard if key.endswith("/pattern")]

@@ -18,7 +18,7 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
-from edge.sinks.json_encoding import unpack
+from edge.sinks.json_records import unpack
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose
 

@@ -34,7 +34,7 @@ from chaos_wire import FaultyBus, Sent, stretches
 from numpy.typing import NDArray
 
 from edge.pipeline.result_stream import uncollected
-from edge.sinks.jsonl import PIPE_BYTES
+from edge.sinks.json_records import PIPE_BYTES
 from edge.terminal.argument_types import whole
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.can.slcan import CanFrame

@@ -110,7 +110,7 @@ def run_child(core: int) -> None:
     from edge.api import load_model
     from edge.perception.runtime import Runtime
     from edge.pipeline.run_statistics import Statistics
-    from edge.sinks.jsonl import record_line
+    from edge.sinks.json_records import record_line
     from firmware_bridge.can.slcan import CanFrame, encode_frame
     from firmware_bridge.scans.can_id_maps import USPA44_MAP
     from firmware_bridge.scans.slcan_scans import SlcanScans

@@ -17,7 +17,7 @@ from edge_samples import ROOT, wait_for, write_model
 from view_samples import HANDSHAKE, LONG_PING, Swallowing
 from websockets.sync.client import connect
 
-from edge.sinks.json_encoding import unpack
+from edge.sinks.json_records import unpack
 from edge.terminal.stop_signals import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}

@@ -10,7 +10,7 @@ from edge_samples import PERIOD_NS
 from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
-from edge.sinks.json_encoding import event_record, record, unpack
+from edge.sinks.json_records import event_record, record, unpack
 from edge.view.frames import (
     EVENTS,
     MAX_FPS,

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.sinks.json_encoding import record
+from edge.sinks.json_records import record
 from edge.sinks.ros2.messages import DIAGNOSTIC_ARRAY, header
 from firmware_bridge.schedule import SHOWN_SILENT_S
 

@@ -162,7 +162,7 @@ def transforms(frames: Mapping[str, PadFrame], unix_ns: int) -> bytes:
 
 
 def result_message(result: Result, record: Mapping[str, Any], unix_ns: int) -> bytes:
-    """Return a result without its maps as a message; `record` is its record from edge.sinks.json_encoding."""
+    """Return a result without its maps as a message; `record` is its record from edge.sinks.json_records."""
     values = dict(zip(_NAMES, _COLUMNS.flat(result), strict=True))
     values["header"] = header(frame_of(result), unix_ns)
     values["record"] = orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY).decode()

@@ -19,7 +19,7 @@ from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.sinks.json_encoding import event_record
+from edge.sinks.json_records import event_record
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
 from edge.sinks.ros2.diagnostics import OUTAGES, Diagnostics
 from edge.sinks.ros2.messages import (
