@@ -10,9 +10,9 @@ from edge import api
 from export.to_onnx import export
 from firmware_bridge.pad_geometry import USPA44, USPA46
 from train.data.frozen_presses import freeze_presses
-from train.data.paper_taps import tap
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
+from train.families.catalogue import tap
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet

@@ -58,6 +58,13 @@ class Taps:
     touching: NDArray[np.bool_]  # (n, H, W) at FINE_SCALE, contact area on the pad
 
 
+def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return values (b, m, ...) at shares (b, m) of presses, between frames (b, FRAMES, ...) and 0 at the start."""
+    away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))
+    weights = np.maximum(1 - away, 0).astype(np.float32)
+    return (weights @ frames.reshape(*frames.shape[:2], -1)).reshape(*share.shape, *frames.shape[2:])
+
+
 class GrippedPad:
     """One pad, and presses onto it.
 
