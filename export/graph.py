@@ -25,10 +25,11 @@ from edge.inference.contract import (
     TRACTION_NAME,
 )
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
+from train.errors import TrainError
 from train.networks.blocks import PatternNet
 
 
-class ExportError(Exception):
+class ExportError(TrainError):
     """Root of all errors of the export."""
 
 

@@ -100,11 +100,11 @@ def quantised(model: onnx.ModelProto, seen: Batch) -> onnx.ModelProto:
 
 def _inputs(model: onnx.ModelProto, seen: Batch) -> dict[str, NDArray[np.float32]]:
     """Return the inputs of a graph for a batch, by name."""
-    inputs = {INPUT_NAME: seen.window.numpy()}
-    if takes_poses(model) and seen.poses is not None:
+    names, inputs = {given.name for given in model.graph.input}, {INPUT_NAME: seen.window.numpy()}
+    if POSES_NAME in names and seen.poses is not None:
         inputs[INPUT_NAME] = seen.window.unflatten(1, (-1, len(AXES))).numpy()
         inputs[POSES_NAME] = seen.poses.numpy()
-    if seen.pad is not None and any(given.name == PAD_NAME for given in model.graph.input):
+    if PAD_NAME in names and seen.pad is not None:
         inputs[PAD_NAME] = seen.pad.numpy()
     return inputs
 
@@ -132,11 +132,6 @@ def _quiet() -> Iterator[Any]:
             yield
     finally:
         root.setLevel(before)
-
-
-def takes_poses(model: onnx.ModelProto) -> bool:
-    """Return True if the graph has an input for poses."""
-    return any(given.name == POSES_NAME for given in model.graph.input)
 
 
 def integer_nodes(model: onnx.ModelProto) -> list[str]:

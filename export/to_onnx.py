@@ -22,7 +22,6 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from edge.errors import EdgeError
 from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error, windows_of
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
@@ -31,7 +30,7 @@ from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust import Trust
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from export.graph import ExportError, outputs, to_model
+from export.graph import outputs, to_model
 from export.int8 import calibration_batch, convolutions, quantised
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
@@ -39,7 +38,7 @@ from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
 from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
 from train.data.presses import SEED, PressSet, join_presses, load_presses
-from train.errors import CheckpointError, TrainError
+from train.errors import CheckpointError, ended_by_errors
 from train.learning.checkpoint import load_network, origin, sensor_of
 from train.learning.interval_fit import Run, conform, fit_correction, half_width_mm, readings_of_presses
 from train.networks.blocks import PatternNet
@@ -292,7 +291,7 @@ def main(arguments: list[str] | None = None) -> None:
     add("--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx, with ranges from these taps")
     options = parser.parse_args(arguments)
     lossy: list[str] = []
-    try:
+    with ended_by_errors("export"):
         options.out.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(load_network(options.checkpoints[0])[1])
         nuisances = Nuisances() if sensor is None else sensor.nuisances
@@ -317,10 +316,6 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.write(line + "\n")
             lossy += [exceeded] * bool(exceeded)
-    except (ExportError, TrainError, EdgeError) as error:
-        sys.exit(f"export: {error}")
-    except OSError as error:
-        sys.exit(f"export: {error.filename}: {error.strerror}")
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")
 

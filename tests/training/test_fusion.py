@@ -93,14 +93,3 @@ def test_every_parameter_has_a_gradient_with_one_tap_and_with_four():
         batch = PosedBatches(presses, given, 8, seed=1)(0)
         HeteroscedasticError().loss(net, batch).backward()
         assert all(part.grad is not None for part in net.parameters())
-
-
-class TestBatches:
-    def test_a_batch_has_one_number_of_taps_and_follows_from_its_number(self):
-        presses = make_press_set(48, taps=4)
-        draw = PosedBatches(presses, (0.25,) * 4, 16, seed=3)
-        shapes = {draw(number).window.shape[1] for number in range(24)}
-        assert shapes == {3, 6, 9, 12}
-        one, again = draw(5), PosedBatches(presses, (0.25,) * 4, 16, seed=3)(5)
-        assert torch.equal(one.window, again.window) and torch.equal(one.poses, again.poses)
-        assert one.poses.shape[1] * 3 == one.window.shape[1] and not one.poses[:, 0].any()

@@ -80,15 +80,6 @@ def test_traction_adds_up_to_force_and_twist(pad, slide_mm, twist_rad):
     assert np.abs(done.force_n[0, :2]).max() > 0.1 or abs(done.twist_nmm[0]) > 1, "it is dragged"
 
 
-def test_what_is_dragged_holds_with_the_pressure_times_friction_at_most(pad):
-    dragged = press(pad, figure(pad), 0.3, slide_mm=(2.0, 0.0), friction=0.4)
-    assert dragged.force_n[0, 0] == pytest.approx(0.4 * dragged.force_n[0, 2], rel=0.01)
-    assert dragged.force_n[0, 2] == pytest.approx(press(pad, figure(pad), 0.3).force_n[0, 2], rel=1e-5)
-    left = press(pad, figure(pad), 0.3, slide_mm=(-2.0, 0.0), friction=0.4)
-    assert left.force_n[0, 0] == pytest.approx(-dragged.force_n[0, 0], rel=1e-3)
-    assert np.abs(dragged.counts - left.counts).max() > 50, "the readings tell which way"
-
-
 @pytest.mark.parametrize("name", ["C", "O"])
 def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
     pose = Pose(1.0, -0.5, 30.0)

@@ -23,25 +23,6 @@ def test_every_constant_is_drawn_over_its_whole_range_and_not_beyond():
     assert len({pad.seed for pad in DRAWN}) == len(DRAWN)
 
 
-def test_a_spread_draws_it_towards_the_nominal_pad():
-    near = draw_pad(np.random.default_rng([7, 0]), spread=0.1)
-    for name in RANGES:
-        nominal = getattr(NOMINAL, name)
-        assert getattr(near, name) - nominal == pytest.approx(0.1 * (getattr(DRAWN[0], name) - nominal), abs=1e-12)
-
-
-def test_known_numbers_are_values_flags_and_gains_and_zeros_where_nothing_is_known():
-    scaled = np.arange(1, 2 * len(INPUTS) + 1, dtype=np.float32).reshape(2, -1)
-    known = np.zeros(scaled.shape, dtype=bool)
-    known[0, 1] = True
-    numbers = known_numbers(scaled, known, np.array([True, False]))
-    assert numbers.shape == (2, KNOWN)
-    assert not numbers[1].any()
-    expected = np.zeros(KNOWN)
-    expected[[1, len(INPUTS) + 1, -1]] = (scaled[0, 1], 1, 1)
-    assert np.array_equal(numbers[0], expected)
-
-
 @pytest.mark.parametrize("gains", [None, (1.0,) * 48])
 def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
     """Pads drawn for training equal those that the runtime makes of a sensor's file."""

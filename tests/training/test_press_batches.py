@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import make_pad_contract
 from press_samples import make_press_set
 
-from train.data.frozen_presses import FrozenPresses, freeze_presses, load_frozen_presses, main
+from train.data.frozen_presses import freeze_presses, load_frozen_presses, main
 from train.data.press_batches import COUNTS_PER_UNIT, PressBatches
 from train.families.catalogue import SHARES
-from train.physics.pad_draws import INPUTS, KNOWN, input_scale
+from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import NAMES, Nuisances
 
 QUIET = Nuisances().without(*NAMES)
@@ -25,16 +24,6 @@ def presses():
 def counts_of(batch):
     """Newest taps of a batch, (n, 3, rows, cols) in counts."""
     return batch.window[:, :3].numpy() * np.asarray(COUNTS_PER_UNIT, dtype=np.float32)[:, None, None]
-
-
-def test_one_number_is_one_batch_whatever_was_drawn_before(presses):
-    one, other = (PressBatches(presses, (0.4, 0.6), 16, seed=3) for _ in range(2))
-    for number in (5, 0, 9):
-        other(number + 1)
-        for name in ("window", "pattern", "pad", "traction"):
-            assert getattr(one(number), name).equal(getattr(other(number), name)), name
-    assert not one(0).window.equal(one(4).window)
-    assert not one(0).window.equal(PressBatches(presses, (0.4, 0.6), 16, seed=4)(0).window)
 
 
 def test_an_epoch_takes_every_sequence_once_with_its_own_truth(presses):
@@ -115,16 +104,6 @@ def test_frozen_presses_are_read_once_by_sensors_whose_gains_divide_out(presses)
     assert np.array_equal(frozen.pads(known=True)[:, : len(INPUTS)], presses.constants)
 
 
-def test_a_frozen_set_is_saved_without_its_gains_and_has_them_again(presses, tmp_path):
-    frozen = freeze_presses(presses, 9)
-    frozen.presses.save(tmp_path / "test.npz", compressed=True)
-    read = load_frozen_presses(tmp_path / "test.npz")
-    assert isinstance(read, FrozenPresses) and np.array_equal(read.gains, frozen.gains)
-    assert np.array_equal(read.windows(1, gains_known=True), frozen.windows(1, gains_known=True))
-    some = read.pick(np.arange(3))
-    assert len(some) == 3 and np.array_equal(some.gains, frozen.gains[:3])
-
-
 WIDE_SHA256 = "edeb2202b59f15f51a49c3e5c96b8a1d752b877ffb50361257bf527b2cbedac2"
 
 
@@ -137,17 +116,6 @@ def test_the_wide_set_is_the_one_that_figures_are_of(wide):
     assert wide.presses.sha256() == WIDE_SHA256
     assert set(wide.presses.family) == set(SHARES) and len(np.unique(wide.presses.pad)) == 126
     assert min(np.unique(wide.presses.family, return_counts=True)[1]) >= 30
-
-
-def test_a_pad_as_a_sensor_file_holds_it_is_the_one_that_networks_are_trained_with(wide):
-    """The contract's row of a `firmware_bridge.scans.pad_constants.Pad` is what `FrozenPresses.pads` gives."""
-    contract = make_pad_contract(pad_inputs=tuple(input_scale()))
-    rows = wide.pads(known=True)
-    assert rows.shape == (len(wide), KNOWN)
-    for index in (0, 500, 1100):
-        assert contract.pad_row(wide.pad(index, gains=True)) == pytest.approx(rows[index], abs=1e-5)
-        assert contract.pad_row(wide.pad(index))[-1] == 0
-    assert not wide.pads(known=False).any()
 
 
 def test_it_is_written_by_one_command(tmp_path, capsys):

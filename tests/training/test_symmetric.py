@@ -94,22 +94,3 @@ def assert_network_keeps(net):
             for got, before, channels in pairs:
                 expected = moved(before, channels, number).reshape(got.shape)
                 assert (got - expected).abs().max() <= TOLERANCE * before.abs().max()
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_written_out_it_computes_the_same(group):
-    torch.manual_seed(0)
-    layer = SymmetricConv2d(vectors(group, 2), fields(group, 16), 3)
-    plain = layer.written_out()
-    given = maps_of(6)
-    with torch.inference_mode():
-        torch.testing.assert_close(plain(given), layer(given), rtol=1e-6, atol=1e-6)
-        plain.weight.zero_()
-        assert layer.weight.abs().max() > 0, "weights of its own"
-    net = CompactNet(1, 10, channels=16, blocks=1).eval()
-    with torch.inference_mode():
-        before = net(maps_of(3))
-        write_out(net)
-        for true, mine in zip(before, net(maps_of(3)), strict=True):
-            assert (true - mine).abs().max() <= TOLERANCE * true.abs().max()
-    assert not any(isinstance(module, SymmetricConv2d) for module in net.modules())

@@ -7,8 +7,6 @@ import pytest
 from press_samples import make_press_set
 
 from train.data.presses import PressSet, load_presses
-from train.data.world import World
-from train.errors import DatasetError
 from train.surfaces.poses import (
     HALF_PITCH_MM,
     HELD_OUT_RADIUS_MM,
@@ -50,11 +48,6 @@ def test_turns_are_the_papers_and_near_poses_are_within_their_bounds():
 def test_a_slide_goes_one_way_in_even_steps():
     steps = np.diff(SCHEDULES["slide"](np.random.default_rng(3), 5), axis=0)
     assert np.allclose(steps, steps[0]) and np.hypot(*steps[0, :2]) > 0.1
-
-
-def test_an_unknown_schedule_is_refused():
-    with pytest.raises(DatasetError, match="no schedule 'spiral': expected one of turns, half-pitch"):
-        World(schedule="spiral")
 
 
 def test_a_file_of_version_2_has_the_poses_of_its_turns_and_its_hash(tmp_path):

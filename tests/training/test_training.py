@@ -2,7 +2,6 @@ import json
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from press_samples import make_press_set
@@ -12,7 +11,7 @@ from train.data.frozen_presses import freeze_presses
 from train.data.presses import SEED
 from train.errors import CheckpointError, DatasetError
 from train.fit import bundled, given_taps, main
-from train.learning.checkpoint import Training, best_contact_level, fit_network, infer, load_network
+from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import Recipe
 from train.networks.registry import grown
@@ -127,12 +126,6 @@ def test_a_share_of_the_weights_it_starts_from_is_kept(folder, data, validation,
     assert not torch.equal(mixed["leave.0.weight_free"], fully["leave.0.weight_free"])
     assert report["validation_psnr_db"] != plain["validation_psnr_db"]
     assert report["training_sha256"] != plain["training_sha256"] == replace(further, keep=0.0).sha256(data.sha256())
-
-
-def test_the_contact_level_is_the_one_that_overlaps_best():
-    rows, cols = np.mgrid[:40, :40] - 19.5
-    cone = np.maximum(1 - np.hypot(rows, cols) / 15, 0)[None].astype(np.float32)
-    assert best_contact_level(cone, cone >= 0.6 * cone.max()) == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("taps", range(1, 8))

@@ -10,7 +10,6 @@ from edge_samples import write_model
 from press_samples import make_press_set
 from trust_samples import make_trusted_contract
 
-from edge.inference.trust import small_network
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 from train import trust
@@ -18,11 +17,7 @@ from train.data.press_batches import stated_poses
 from train.data.presses import PressSet
 from train.errors import CheckpointError
 from train.learning.checks import (
-    contact_check,
-    drawn_readings,
-    features_of,
     fit_tap_network,
-    in_contact,
     pair_features,
     relative,
     strong_taps,
@@ -100,17 +95,6 @@ class TestFile:
             with pytest.raises(SystemExit, match=rf"trust: .*{told}"):
                 trust.main([str(tmp_path / "trust.json"), "--data", str(tmp_path / name)])
         assert not (tmp_path / "trust.json").exists()
-
-
-class TestLimits:
-    def test_contacts_exceed_theirs_by_the_share(self, path, presses):
-        share = 0.2
-        network = small_network(json.loads(path.read_text())["contact"])
-        check = contact_check(network, presses, share, seed=5)
-        counts, pads = drawn_readings(presses, 5)
-        met = in_contact(counts)
-        scores = np.array(network(features_of(counts[met], pads[met])))
-        assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share
 
 
 TAPS = 4

@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from edge.errors import EdgeError
 from edge.inference.bundled import BUNDLE_DIR
 from edge.terminal.progress_bar import tracked
-from train.errors import TrainError
+from train.errors import ended_by_errors
 from train.experiments.families import families, pads
 from train.experiments.fig5 import fig5
 from train.experiments.posed_taps import posed_taps
@@ -54,14 +53,10 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     bench = Workbench(models=options.models)
-    try:
+    with ended_by_errors("experiments"):
         names = list(EXPERIMENTS) if "all" in options.names else options.names
         for name in tracked(names, "experiments", "page"):
             sys.stdout.write(f"{run(name, bench, options.reports)}\n")
-    except (TrainError, EdgeError) as error:
-        sys.exit(f"experiments: {error}")
-    except KeyboardInterrupt:
-        sys.exit("experiments: stopped; the same command continues")
 
 
 if __name__ == "__main__":

@@ -65,9 +65,9 @@ class Training:
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep < 1:
-            raise ValueError(f"keep is {self.keep}, expected a share from 0 to below 1")
+            raise CheckpointError(f"keep is {self.keep}, expected a share from 0 to below 1")
         if self.keep and self.start is None:
-            raise ValueError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
+            raise CheckpointError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
 
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""

@@ -24,7 +24,7 @@ from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.presses import PressSet, load_presses
 from train.data.world import World
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, ended_by_errors
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES, Pad, draw_pad
 from train.physics.sensor_noise import Nuisances, apply_nuisances, neighbours
@@ -253,24 +253,20 @@ def _given_constants(
     return softmax(np.stack(log_densities, axis=1) + np.log(mixture.share), axis=1)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when done, 1 on an error of the user."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m train.learning.contact_mixture", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     options = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("train.learning.contact_mixture"):
         mixture = fit_mixture(load_presses(options.presses))
         with quiet_workers():
             presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
-    except TrainError as error:
-        sys.stderr.write(f"train.learning.contact_mixture: {error}\n")
-        return 1
     sys.stdout.write(f"{options.out}: {len(mixture.share)} components\n")
-    return 0
 
 
 def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> None:
@@ -292,4 +288,4 @@ def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> Non
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import torch
 from torch import distributed, nn
@@ -29,7 +29,7 @@ from torch.utils.tensorboard import SummaryWriter
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
-from train.errors import TrainError
+from train.errors import CheckpointError, TrainError
 from train.networks.blocks import Objective, PatternNet
 
 Batches = Callable[[int], Batch]  # function from a number to its batch; the same number always gives the same batch
@@ -71,7 +71,7 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate"):
             if not (value := getattr(self, name)) > 0:
-                raise ValueError(f"{name} is {value}, expected more than 0")
+                raise CheckpointError(f"{name} is {value}, expected more than 0")
 
 
 def rank_and_world() -> tuple[int, int]:
@@ -144,12 +144,14 @@ def train(
     """Train a network in place, leave it in evaluation mode, and return the seconds that all parts of the run took.
 
     An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
-    in `resume_path`, which the caller deletes when the result is safe. ValueError if a batch cannot be shared evenly by
-    the processes, DivergedError if the loss is not finite; the network is then as before that step.
+    in `resume_path`, which the caller deletes when the result is safe. CheckpointError if a batch cannot be shared
+    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
     """
     rank, world = rank_and_world()
     if recipe.batch % world:
-        raise ValueError(f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each")
+        raise CheckpointError(
+            f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each"
+        )
     device = device_of_rank(rank)
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
@@ -187,10 +189,7 @@ def train(
     return time.monotonic() - started_s
 
 
-Drawn = TypeVar("Drawn")
-
-
-def drawn_ahead(batches: Callable[[int], Drawn], first: int, end: int) -> Generator[Drawn, None, None]:
+def drawn_ahead(batches: Batches, first: int, end: int) -> Generator[Batch, None, None]:
     """Yield the batches from number `first` to before `end`, each drawn in a thread while the one before is used."""
     with ThreadPoolExecutor(1, "batches") as thread:
         coming = thread.submit(batches, first)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.elastic_layer import FreeSides, Layer, PadGrid, SideGive, surface_compliance, waves
+from train.physics.elastic_layer import Layer, PadGrid, SideGive, surface_compliance, waves
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,28 +64,8 @@ The pad bulges next to a contact, by at most 0.39 of the indentation over the 18
 """
 
 
-@dataclass(frozen=True, slots=True)
-class ContactResult:
-    """Solution of a batch of poses."""
-
-    pressure_mpa: NDArray[np.float32]  # (n, size, size)
-    steps: int  # of the slowest pose's conjugate gradients
-    residual: NDArray[np.float32]  # (n,), RMS gap where pressure acts or surfaces overlap, over the indentation
-    solver: "ContactSolver"
-
-    @property
-    def displacement_mm(self) -> NDArray[np.float32]:
-        """Surface displacement downwards on the whole pad, (n, size, size) in [mm]; computed on every access."""
-        return self.solver.displacement_mm(self.pressure_mpa)
-
-    @property
-    def force_n(self) -> NDArray[np.float32]:
-        """Force on the pad, (n,) in [N]."""
-        return self.pressure_mpa.sum(axis=(1, 2)) * np.float32(self.solver.cell_mm**2)
-
-
 class ContactSolver:
-    """Solver of poses on a square grid over one pad, `size` cells a side; without `sides` the layer is infinite."""
+    """Solver of poses on a square grid over one pad, `size` cells a side; `sides` is the amplitude of free ones."""
 
     def __init__(
         self,
@@ -94,13 +74,13 @@ class ContactSolver:
         cell_mm: float,
         dtype: torch.dtype = torch.float32,
         cover: Cover = BARE,
-        sides: FreeSides | None = None,
+        sides: float = 0.0,
     ) -> None:
         self.size = size
         self.cell_mm = cell_mm
         self._grid = PadGrid(layer, size, cell_mm, dtype, lambda q_x, q_y: cover.compliance(layer, np.hypot(q_x, q_y)))
         self._dtype = dtype
-        self._side_give = None if sides is None else SideGive.of(sides, layer, size, cell_mm, dtype)
+        self._side_give = SideGive.of(sides, layer, size, cell_mm, dtype) if sides else None
 
     @property
     def cell_compliance_mm_per_mpa(self) -> float:
@@ -118,15 +98,16 @@ class ContactSolver:
         indentation_mm: float | NDArray[np.floating] = 1.0,
         tolerance: float = 1e-3,
         covered: NDArray[np.floating] | None = None,
-    ) -> ContactResult:
-        """Press surfaces into the pad until the residual is below the tolerance.
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Press surfaces into the pad, and return the pressures (n, size, size) in [MPa] and the residuals (n,).
 
+        A residual is the RMS gap where pressure acts or surfaces overlap, over the indentation.
         For flat surfaces the solution is linear in the indentation: one solve serves all depths of a tap.
 
         Args:
             depth_mm: (n, size, size), depth of each cell below the point of first contact, in [mm].
             indentation_mm: indentation of that point, one for all or (n,), > 0, in [mm].
-            tolerance: largest residual.
+            tolerance: residual at which a solution is good enough.
             covered: share of each cell that the surface covers, (n, size, size), above 0 wherever a cell is reached; 1
                 everywhere if None. Pressures are then means over cells.
         """
@@ -142,7 +123,6 @@ class ContactSolver:
             )
         pressure_mpa = np.zeros(depth_mm.shape, dtype=np.float32)
         residual = np.zeros(len(depth_mm), dtype=np.float32)
-        steps = 0
         for poses, place in self._grid.boxes(depth_mm < REACH * indentation[:, None, None]):
             press = torch.as_tensor(indentation[poses, None, None], dtype=self._dtype)
             depth = torch.as_tensor(depth_mm[place], dtype=self._dtype)
@@ -150,11 +130,10 @@ class ContactSolver:
             # The pressure on the covered share is 1 / share times the cell's mean.
             give = self.cell_compliance_mm_per_mpa * torch.where(share > 0, 1 / share - 1, 0.0)
             sides = None if self._side_give is None else self._side_give.boxes(*place[1:])
-            found, error, taken = self._conjugate_gradients(depth, press, tolerance, give, sides)
+            found, error = self._conjugate_gradients(depth, press, tolerance, give, sides)
             pressure_mpa[place] = found.numpy()
             residual[poses] = error.numpy()
-            steps = max(steps, taken)
-        return ContactResult(pressure_mpa, steps, residual, self)
+        return pressure_mpa, residual
 
     def _conjugate_gradients(
         self,
@@ -163,8 +142,8 @@ class ContactSolver:
         tolerance: float,
         give: torch.Tensor,
         sides: SideGive | None,
-    ) -> tuple[torch.Tensor, torch.Tensor, int]:
-        """Return pressures, residuals and steps of boxes (n, height, width) pressed in by (n, 1, 1).
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return pressures and residuals of boxes (n, height, width) pressed in by (n, 1, 1).
 
         `give` is the additional displacement per pressure of partly covered cells, in [mm/MPa].
         """
@@ -214,7 +193,7 @@ class ContactSolver:
             if bool(bent.any()):
                 again = self._respond(pressure[bent], give[bent], None if sides is None else sides[bent]) - wanted[bent]
                 gap[bent] = torch.where(reachable[bent], again, 0.0)
-        return result, residual, steps
+        return result, residual
 
     def _respond(self, pressure: torch.Tensor, give: torch.Tensor, sides: SideGive | None) -> torch.Tensor:
         """Return the displacement including the partial cells' compliance and the free sides."""

@@ -192,7 +192,7 @@ class GrippedPad:
         pressure = np.empty_like(cells_mm)
         open_ = np.arange(len(cells_mm))
         for _ in range(_MOST_TRIES):
-            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_]).pressure_mpa
+            pressure[open_], _ = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_])
             force_n = pressure[open_].sum(axis=(1, 2)) * self.cell_mm**2
             over = force_n > most_force_n
             if not over.any():
@@ -255,7 +255,7 @@ class GrippedPad:
     def _solver(self, cover: Cover) -> ContactSolver:
         if cover not in self._solvers:
             pad = self.pad
-            self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.sides)
+            self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.free_sides)
         return self._solvers[cover]
 
 
