@@ -28,8 +28,7 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
 from train.data.presses import SEED, PressSet, join_presses, one_thread
-from train.data.recorded_taps import RecordedTap, recorded_taps
-from train.data.tapped_surface import Surface, image_surface, placed, pressed, surface_of
+from train.data.recorded_taps import RecordedTap, Surface, image_surface, placed, pressed, recorded_taps, surface_of
 from train.errors import DatasetError, ended_by_errors
 from train.networks.tactile_psf import PsfNet, fit_psf_net
 from train.own import Knowledge, knowledge_of, say

@@ -30,7 +30,7 @@ def test_it_runs_in_miniature(tmp_path, tmp_path_factory, name):
         assert rows and columns <= set(rows[0])
 
 
-def test_a_folder_without_recordings_is_named_before_anything_is_made(tmp_path, monkeypatch):
+def test_a_folder_without_recordings_is_named_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TACTILE_RECORDINGS", str(tmp_path / "none"))
     with pytest.raises(SystemExit, match=r"^experiments: .*TACTILE_RECORDINGS"):

@@ -31,7 +31,7 @@ def recordings(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(tmp_path):
+def test_known_gains_and_pads_enter_the_model(tmp_path):
     contract = make_pad_contract(taps=1, output_full_scale=0.5, interval_factor=1.6, interval_levels={"90": [1.6] * 4})
     model = ModelSession(write_model(tmp_path / "stsr-int8.onnx", contract))
     few = load_frozen_presses().pick(np.arange(5))

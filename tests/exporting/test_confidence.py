@@ -25,7 +25,7 @@ def maps(about, size=0.5):
     return pattern, about * pattern
 
 
-def test_between_doubts_it_is_interpolated_and_beyond_them_it_grows():
+def test_between_doubts_the_error_is_interpolated():
     for about, share, another in ((0.05, 0.2, False), (0.139, 0.239, False), (0.2, 0.3, True), (0.6, 0.8, True)):
         rmse, worth_it = expect(TABLE, 1, *doubt(*maps(about)))
         assert rmse == pytest.approx(0.5 * share, rel=1e-4) and worth_it is another and WORTH_A_TAP == 0.02
@@ -91,7 +91,7 @@ def expected_and_true(path, test_set):
 
 
 @pytest.mark.parametrize("path", IN_INTEGERS, ids=lambda path: path.stem)
-def test_of_the_wide_test_set_the_expected_error_is_near_the_true_one(path):
+def test_the_expected_error_is_near_the_true_one(path):
     """The table is of other presses of the wide world; measured 1.05 to 1.09 of the true error, small ones 1.20.
 
     Quarters have .91 to 1.18, small ones to 1.38; correlation .66 to .72.

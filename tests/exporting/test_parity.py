@@ -165,7 +165,7 @@ def test_integers_that_say_something_else_break_the_bound(pattern_factor, deviat
         ({}, r"the float32 model stsr\.onnx is not in the folder of its int8 model"),
     ],
 )
-def test_integers_without_the_network_that_they_are_of_are_refused(tmp_path, beside, complaint):
+def test_integers_without_their_network_are_refused(tmp_path, beside, complaint):
     for name, source in {"stsr-int8.onnx": "stsr-int8", **beside}.items():
         (tmp_path / name).write_bytes(find_model(source).read_bytes())
     with pytest.raises(SystemExit, match=complaint):
@@ -185,7 +185,7 @@ def test_what_is_not_finite_is_no_parity(spoil):
         differences(["pattern"], [maps], [maps[:1]], 0.5)
 
 
-def test_a_difference_is_a_share_of_full_scale_or_of_what_is_larger():
+def test_a_difference_is_a_share_of_the_larger_scale():
     small, large = np.full((1, 4, 4), 0.1, np.float32), np.full((1, 4, 4), 10.0, np.float32)
     for size, expected in ((small, 0.02), (large, 0.001)):
         (found,) = differences(["pattern"], [size], [size + np.float32(0.01)], 0.5)

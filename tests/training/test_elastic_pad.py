@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.contact import ContactSolver
+from train.physics.contact import ContactSolver, FrictionSolver
 from train.physics.elastic_layer import (
     Layer,
     inner_displacement,
@@ -17,7 +17,6 @@ from train.physics.elastic_layer import (
     surface_compliance,
     surface_tangential_compliance,
 )
-from train.physics.friction import FrictionSolver
 from train.physics.magnets import Magnet, MagnetArray
 from train.physics.pad_draws import Pad
 from train.physics.taxel_response import Skin

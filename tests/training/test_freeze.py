@@ -22,7 +22,7 @@ def frozen():
 
 
 def test_the_frozen_set_is_made_as_the_bundled_one(frozen):
-    """Of its first figures, whose outlines are of an earlier release; draws depend on how many sequences there are."""
+    """Its first figures have outlines of an earlier release, and draws depend on how many sequences there are."""
     bundled = load_frozen_set(BUNDLE_DIR / "frozen.npz")
     taps, frames = len(frozen.surface), len(frozen)
     assert frozen.surface.tolist() == bundled.surface[:taps].tolist() == ["C"] * 4 + ["F"] * 4
@@ -34,7 +34,7 @@ def test_the_frozen_set_is_made_as_the_bundled_one(frozen):
         assert np.corrcoef(ours, theirs)[0, 1] > 0.998, "each tap is turned back one more step"
 
 
-def test_frames_rise_to_the_set_force_and_share_their_earlier_taps(frozen):
+def test_frames_rise_to_the_set_force(frozen):
     assert len(frozen) == 2 * 4 * FRAMES and frozen.earlier.shape[:2] == (8, MAX_TAPS - 1)
     force, depth = frozen.force_n.reshape(8, FRAMES), frozen.indentation_mm.reshape(8, FRAMES)
     assert np.all(np.diff(force) > 0) and np.allclose(np.diff(depth, n=2), 0, atol=1e-6)
@@ -77,7 +77,7 @@ def test_the_demo_is_made_as_the_bundled_one(tmp_path):
 
 
 @pytest.mark.night
-def test_the_command_makes_all_files_but_the_frozen_set_that_models_name(tmp_path):
+def test_the_command_keeps_a_frozen_set_that_is_there(tmp_path):
     shutil.copy(BUNDLE_DIR / "frozen.npz", tmp_path)
     make_press_set(600).save(tmp_path / "seen.npz")
     before = (tmp_path / "frozen.npz").stat()
@@ -92,7 +92,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
         main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
 
 
-def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
+def test_kinds_of_contact_are_separated_at_any_scale():
     rng = np.random.default_rng(0)
     shapes = rng.uniform(100, 1000, (2, 48)) * [[1], [0.2]]
     shapes[1, :40] = 0

@@ -46,7 +46,7 @@ def sensor(mixture, seed, count=100):
     return log_gains, constants, learned(read, mixture.model(widening=1.3))
 
 
-def test_gains_and_the_constant_that_shows_are_recovered_within_their_intervals(mixture):
+def test_gains_are_recovered_within_their_intervals(mixture):
     cases = [sensor(mixture, seed) for seed in range(8)]
     true = np.array([case[0] for case in cases])
     found = np.log([case[2].gains for case in cases])

@@ -62,7 +62,7 @@ def laplace():
     return truth, truth + rng.laplace(0, deviation / math.sqrt(2)), deviation
 
 
-def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_wrong_ones_back():
+def test_a_factor_makes_intervals_cover_what_they_state():
     truth, pattern, deviation = laplace()
     assert interval_coverage(truth, pattern, deviation) == pytest.approx(0.9, abs=0.005)
     factor = calibrate(truth, pattern, 7 * deviation)
@@ -76,7 +76,7 @@ def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_
         calibrate(truth, pattern, 0 * deviation)
 
 
-def test_the_correction_changes_deviations_alone_and_only_in_use():
+def test_the_correction_changes_deviations_in_use_alone():
     net = make_net()
     before = net(windows())
     corrected(net)
@@ -109,7 +109,7 @@ def test_factors_are_bounded_whatever_the_weights():
         assert torch.isfinite(factor).all() and low * 0.999 < factor.min() and factor.max() < high * 1.001
 
 
-def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
+def test_conformal_intervals_hold_in_every_region():
     """Errors are ten times as large at the edge, and twice as large of one tap."""
     net = make_net()
     correction = corrected(net)

@@ -76,7 +76,7 @@ def test_a_file_of_several_bodies_is_one_surface(tmp_path):
     assert load_mesh(saved(tmp_path, "touching.stl", binary_stl(along_an_edge))).volume == pytest.approx(2 * 10 * 8 * 3)
 
 
-def test_names_in_an_old_encoding_and_materials_beside_the_file_are_no_fault(tmp_path, caplog):
+def test_old_encodings_and_absent_materials_are_no_fault(tmp_path, caplog):
     for name, content in (
         ("part.stl", ascii_stl(box(), "Prüfkörper")),
         ("part.obj", obj(box(), "o Prüfkörper\nmtllib absent.mtl\nusemtl gold\n")),
@@ -86,7 +86,7 @@ def test_names_in_an_old_encoding_and_materials_beside_the_file_are_no_fault(tmp
     assert not caplog.records
 
 
-def test_what_is_no_file_of_triangles_in_a_known_format_and_unit_is_refused(tmp_path):
+def test_what_is_no_file_of_triangles_is_refused(tmp_path):
     refused(tmp_path / "absent.stl", "cannot be read: No such file")
     (tmp_path / "folder.stl").mkdir()
     refused(tmp_path / "folder.stl", "cannot be read")

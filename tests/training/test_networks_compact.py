@@ -36,7 +36,7 @@ def test_absent_taps_are_the_same_as_fewer_taps(net):
 
 
 @pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])
-def test_another_width_or_other_inputs_of_the_pad_are_not_taken_over(other):
+def test_another_width_is_not_taken_over(other):
     start = CompactNet(1, 4, **{"channels": 16, "blocks": 1, **other})
     with pytest.raises(ValueError, match="its width and inputs of the pad are"):
         CompactNet(2, 4, 16, 1).take_over(start)
@@ -46,15 +46,6 @@ def test_patterns_are_cut_at_zero_in_use_alone(net):
     assert net(window())[0].min() == 0
     assert net.train()(window())[0].min() < 0
     net.eval()
-
-
-@pytest.mark.parametrize("factor", [0.0, 1e-40, 1e-6, 1e3, 1e6])
-def test_extreme_windows_give_finite_patterns_and_deviations_above_zero(net, factor):
-    pattern, deviation, traction = net(factor * window())
-    assert torch.isfinite(pattern).all()
-    assert torch.isfinite(deviation).all()
-    assert torch.isfinite(traction).all()
-    assert (deviation > 0).all()
 
 
 def test_the_pattern_learns_as_if_there_were_no_deviation():
@@ -74,7 +65,7 @@ def test_the_pattern_learns_as_if_there_were_no_deviation():
             assert torch.equal(both, one)
 
 
-def test_what_is_known_of_the_pad_changes_the_outputs_and_nothing_known_is_zeros():
+def test_what_is_known_of_the_pad_changes_the_outputs():
     torch.manual_seed(0)
     net = CompactNet(1, 4, channels=16, blocks=1, known=3).eval()
     unknown, zeros = net(window(taps=1)), net(window(taps=1), torch.zeros(3, 3))
@@ -82,7 +73,7 @@ def test_what_is_known_of_the_pad_changes_the_outputs_and_nothing_known_is_zeros
     assert not torch.allclose(unknown[0], net(window(taps=1), torch.ones(3, 3))[0])
 
 
-def test_traction_is_learned_where_it_is_known_and_light_pulls_count_as_firm_ones():
+def test_light_pulls_count_as_much_as_firm_ones():
     torch.manual_seed(0)
     net = CompactNet(1, 4, channels=16, blocks=1)
     pattern, _, traction = net(window(taps=1))

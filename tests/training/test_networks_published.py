@@ -65,7 +65,7 @@ def test_a_network_grown_from_another_computes_the_same(start, name, scale):
     assert next(old.parameters()).abs().max() > 0
 
 
-def test_at_another_scale_a_compact_network_keeps_all_but_what_makes_pixels():
+def test_at_another_scale_a_compact_network_keeps_its_trunk():
     torch.manual_seed(6)
     old = build("compact-mtsr2", 4, channels=16, blocks=1)
     net = grown(old, "compact-mtsr2", 10, channels=16, blocks=1)

@@ -14,11 +14,10 @@ from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from firmware_bridge.sensor_file.model import load_sensor_file
 from train import own, taps
-from train.data import recorded_taps, tapped_surface
+from train.data import recorded_taps
 from train.data.press_batches import OneSensor, PressBatches, with_own_taps
 from train.data.presses import load_presses
-from train.data.recorded_taps import load_tap_parts
-from train.data.tapped_surface import image_surface, surface_of
+from train.data.recorded_taps import image_surface, load_tap_parts, surface_of
 from train.errors import DatasetError
 from train.networks.compact import HeteroscedasticError
 from train.own import OWN, TAPPED, compared, knowledge_of
@@ -46,7 +45,7 @@ def tapped(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def few(limits):
     """Fewer taps to fit the poses by, and a network of the PSF that is hardly trained."""
-    limits(tapped_surface, FIT_FROM=6)
+    limits(recorded_taps, FIT_FROM=6)
     limits(taps, EPOCHS=1)
 
 

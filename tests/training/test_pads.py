@@ -13,7 +13,7 @@ from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL, RANGES, Pad, constan
 DRAWN = [draw_pad(np.random.default_rng([7, number])) for number in range(300)]
 
 
-def test_every_constant_is_drawn_over_its_whole_range_and_not_beyond():
+def test_every_constant_is_drawn_over_its_whole_range():
     for name, (low, high) in RANGES.items():
         values = np.array([getattr(pad, name) for pad in DRAWN])
         assert low <= values.min() and values.max() <= high, name
@@ -41,7 +41,7 @@ def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
     assert not takes.pad_row(None).any()
 
 
-def test_every_input_can_be_told_by_a_sensors_file_over_all_that_is_drawn():
+def test_a_sensor_file_can_hold_every_constant_that_is_drawn():
     assert set(INPUTS) <= set(PAD_RANGES) and set(INPUTS) <= set(RANGES)
     for name, centre, spread in input_scale():
         low, high = PAD_RANGES[name]

@@ -90,7 +90,7 @@ def test_sets_are_joined_with_their_pads_apart():
         join_presses([])
 
 
-def test_only_sequences_with_all_taps_are_trained_on_and_none_is_said():
+def test_only_sequences_with_all_taps_are_trained_on():
     joined = join_presses([make_press_set(taps=1), make_press_set(count=6, taps=2, seed=1)])
     batch = batches_of(joined, 10, Recipe(1, batch=64, given=(0.0, 1.0)), seed=0)(0)
     assert len(batch.window) == 6 and (batch.window[:, 3:].abs().amax(dim=(1, 2, 3)) > 0).all()

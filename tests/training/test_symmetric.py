@@ -58,7 +58,7 @@ def test_a_convolution_keeps_every_symmetry(group, kind, kernel):
     assert_keeps(SymmetricConv2d(enter, leave, kernel), enter, leave)
 
 
-def test_what_points_to_the_right_points_up_after_a_quarter_turn_and_to_the_left_in_a_mirror():
+def test_x_points_up_after_a_quarter_turn_and_left_in_a_mirror():
     right = torch.zeros(1, 3, 3, 3)
     right[0, 0, 1, 2] = 1  # x at the right edge
     right[0, 2] = 0.5  # z does not turn

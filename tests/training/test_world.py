@@ -51,7 +51,7 @@ def test_what_is_made_is_what_was_asked_for(small):
 
 
 @pytest.mark.parametrize("begun", [0.0, 1.0])
-def test_newest_taps_that_have_only_begun_are_lighter_than_earlier_ones(begun):
+def test_newest_taps_that_have_only_begun_are_lighter(begun):
     """Level faces, so that force goes with depth wherever the pad taps."""
     world = World(
         count=24, taps=2, per_pad=24, families={"flat": 1.0}, spread=0.0, schedule="turns", begun=begun, seed=2
@@ -94,7 +94,7 @@ def test_what_was_made_otherwise_is_not_overwritten(small, tmp_path):
         make_presses(replace(SMALL, count=5, seed=6), tmp_path / "other.npz")
 
 
-def test_a_mesh_of_which_few_places_give_a_press_is_pressed_as_often_as_asked(tmp_path, capsys):
+def test_a_narrow_mesh_is_pressed_as_often_as_asked(tmp_path, capsys):
     """A finger as thin as a sheet whose top slopes: most places that are drawn touch it beside the pattern."""
     outline = shapely.Polygon(np.array([(0, 0), (44, 0), (44, 10), (0, 20)]) / 25.4)
     trimesh.creation.extrude_polygon(outline, 0.5 / 25.4).apply_transform(

@@ -185,10 +185,9 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         net = build(report["network"], report["scale"], **report["options"])
         net.load_state_dict(torch.load(path, weights_only=True))
     except DAMAGES as error:
-        said = reason(error)
-        if path.suffix == _GRAPH:
-            raise CheckpointError(f"{path} is no model to start from: {said}") from error
-        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
+        graph = path.suffix == _GRAPH
+        what = "no model to start from" if graph else f"no checkpoint of train.fit with {path.stem}.json"
+        raise CheckpointError(f"{path} is {what}: {reason(error)}") from error
     return net.eval(), report
 
 

@@ -48,10 +48,6 @@ def reason(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
-class NotResumableError(TrainError, ValueError):
-    """State of an interrupted run that had another configuration."""
-
-
 class DivergedError(TrainError, ArithmeticError):
     """Loss or gradient that is not finite."""
 
@@ -236,9 +232,9 @@ def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: 
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except DAMAGES as error:
-        raise NotResumableError(f"{path} is not a run's state ({reason(error)}): delete it to start again") from error
+        raise CheckpointError(f"{path} is not a run's state ({reason(error)}): delete it to start again") from error
     if not isinstance(state, dict) or state.get("recipe") != recipe_sha256:
-        raise NotResumableError(f"{path} is of a run with another recipe or on other data: delete it to start again")
+        raise CheckpointError(f"{path} is of a run with another recipe or on other data: delete it to start again")
     for name, part in parts.items():
         part.load_state_dict(state[name])
     return state

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import SurfaceError
-from train.physics.contact import BARE, REACH, ContactSolver, Cover
-from train.physics.friction import FrictionSolver
+from train.physics.contact import BARE, REACH, ContactSolver, Cover, FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.taxel_response import Skin, on_pad
 from train.physics.tpsf import heights_pattern, resample, resample_touching
