@@ -51,15 +51,15 @@ _AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bu
 
 
 @one_thread()
-def freeze(surfaces: Sequence[str] = SURFACES, taps: int = MAX_TAPS) -> FrozenSet:
+def freeze(surfaces: Sequence[str] = SURFACES) -> FrozenSet:
     """Return the frames of the paper's protocol, in the simulated world with one pad, and a sensor for each sequence.
 
-    A sequence is K whole taps of one flat figure by the nominal pad, each turned by a step from the one before and off
-    by a robot's error; the newest, at the test's place in four turns, is the target.
+    A sequence is MAX_TAPS whole taps of one flat figure by the nominal pad, each turned by a step from the one before
+    and off by a robot's error; the newest, at the test's place in four turns, is the target.
 
     Source: Wu and Liu 2024, Sec. V and Table II.
     """
-    names = [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    taps, names = MAX_TAPS, [name for name in surfaces for _ in TARGET_ANGLES_DEG]
     turns_deg = [angle - ANGLE_STEP_DEG * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
     sent = [Pose(*PLACES_MM["test"], turn_deg) for _ in surfaces for turn_deg in turns_deg]
     poses: list[Pose] = []
