@@ -2,25 +2,22 @@
 
 python -m export.stability --out reports
 
-Three parts: the simulated pad (nearly incompressible, thin, thick, touched by a cell or by a ball of a metre), the
-bundled graphs (no touch, denormals, presses beyond any sensor, soft and stiff pads, on one and on several threads), and
-the program from raw counts to records (saturated, wrapped, absent and single taxels).
+Two parts: the bundled graphs (no touch, denormals, presses beyond any sensor, soft and stiff pads, one and several
+threads), and the program from raw counts to records (saturated, wrapped, absent and single taxels).
 """
 
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from edge.api import infer
-from edge.errors import EdgeError, UsageError, WindowError
+from edge.errors import UsageError, WindowError
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, find_model
 from edge.inference.contract import Contract
 from edge.inference.intervals import doubt
@@ -31,19 +28,10 @@ from export.parity import FULL_RANGE_COUNTS, extreme_windows
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.scans.scan import ABSENT
-from train.errors import TrainError
-from train.physics.contact import ContactSolver
-from train.physics.elastic_layer import Layer
-from train.physics.magnets import MOVEMENT, Magnet, MagnetArray
+from train.errors import ended_by_errors
 from train.physics.pad_draws import RANGES
 from train.report import Report, Row
 
-SIZE: Final = 42
-CELL_MM: Final = 0.47
-INDENTATION_MM: Final = 0.3
-FAR_MM: Final = 1e3  # depth outside the shape, in [mm]
-RESIDUAL: Final = 1e-3
-WIDE: Final = 24  # factor of a grid whose copies are farther away than any thickness requires
 INT8_BEYOND: Final = 1.05
 """Largest difference of int8 from itself on windows beyond any touch, where it saturates, as a share of the pattern."""
 TOUCHES: Final = ("press", "press x 1e-06", "press x 0.001")
@@ -89,74 +77,6 @@ def refused(name: str, work: Callable[[], object], by: type[Exception], model: s
     except by as error:
         return Case(name, "refused", None, 0.0, str(error), model)
     return Case(name, "refused", float("nan"), 0.0, f"expected {by.__name__}, but there was none", model)
-
-
-def pad_cases() -> Iterator[Case]:
-    """Yield the cases of the simulated pad: contact, layer and magnets."""
-    whole = Layer()
-    stiff = {f"Poisson's ratio {one:g}": replace(whole, poisson=one) for one in (0.0, 0.3, 0.45, 0.49, 0.499, 0.4999)}
-    stiff |= {f"{one:g} mm thick": replace(whole, thickness_mm=one) for one in (0.1, 0.5, 2.0, 10.0, 50.0)}
-    for name, layer in stiff.items():
-        yield from _pressed(name, layer, punch())
-    shapes = {"one cell touches": punch(0.4 * CELL_MM, CELL_MM / 2), "the whole face touches": np.zeros((SIZE, SIZE))}
-    shapes |= {f"ball of radius {radius_mm:g} mm": ball(radius_mm) for radius_mm in (0.5, 10.0, 1000.0)}
-    for name, depth_mm in shapes.items():
-        yield from _pressed(name, whole, depth_mm)
-    for thickness_mm in (4.5, 50.0):
-        yield against_a_wide_grid(replace(whole, thickness_mm=thickness_mm), f"{thickness_mm:g} mm thick")
-    solver = ContactSolver(whole, SIZE, CELL_MM)
-    yield refused("nothing touches", lambda: solver.solve(punch(-1.0)[None], INDENTATION_MM), ValueError)
-    yield refused("pressed by 0 mm", lambda: solver.solve(punch()[None], 0.0), ValueError)
-    yield refused("Poisson's ratio 0.5", lambda: replace(whole, poisson=0.5), ValueError)
-    yield refused("dipole near its chip", lambda: MagnetArray(USPA44, Magnet(height_mm=1.0)), ValueError)
-    array = MagnetArray(USPA44, Magnet())
-    through = np.zeros((1, USPA44.taxel_count, len(MOVEMENT)), np.float32)
-    through[..., MOVEMENT.index("down_mm")] = Magnet().clearance_mm
-    yield refused("magnet pressed through its chip", lambda: array.change_mt(through), ValueError)
-    rng = np.random.default_rng(0)
-    for size_mm in (1e-6, 0.5):
-        moved = rng.uniform(-size_mm, size_mm, (100, USPA44.taxel_count, len(MOVEMENT)))
-        single, double = (array.change_mt(moved.astype(dtype)) for dtype in (np.float32, np.float64))
-        name = f"magnets moved by {size_mm:g} mm"
-        yield Case(name, "float32 to float64, mT (two counts are 2e-3)", float(np.abs(single - double).max()), 2e-3)
-
-
-def punch(radius_mm: float = 4.0, middle_mm: float = 0.0) -> NDArray[np.float64]:
-    """Return the depth image of a flat round punch, (size, size) in [mm]; with a radius below 0 nothing touches."""
-    return np.where(_off_mm(middle_mm) <= radius_mm, 0.0, FAR_MM)
-
-
-def ball(radius_mm: float) -> NDArray[np.float64]:
-    """Return the depth image of a ball, (size, size) in [mm], without cancellation."""
-    square = np.minimum(np.square(_off_mm(0.0)), radius_mm**2)
-    return square / (radius_mm + np.sqrt(radius_mm**2 - square))
-
-
-def _off_mm(middle_mm: float) -> NDArray[np.float64]:
-    """Return the distance of each cell to a point on the diagonal, (SIZE, SIZE) in [mm]."""
-    along_mm = (np.arange(SIZE) - (SIZE - 1) / 2) * CELL_MM - middle_mm
-    return np.hypot(along_mm, along_mm[:, None])
-
-
-def _pressed(name: str, layer: Layer, depth_mm: NDArray[np.float64]) -> Iterator[Case]:
-    single, double = (
-        ContactSolver(layer, SIZE, CELL_MM, dtype).solve(depth_mm[None], INDENTATION_MM)
-        for dtype in (torch.float32, torch.float64)
-    )
-    note = f"{single.steps} steps"
-    yield Case(name, "residual, share of the indentation", float(single.residual[0]), RESIDUAL, note)
-    apart = abs(float(single.force_n[0] / double.force_n[0]) - 1)
-    yield Case(name, "force, float32 to float64", apart, 1e-4)
-
-
-def against_a_wide_grid(layer: Layer, name: str) -> Case:
-    """Return the case of the periodic grid of the pad's response, whose copies must have no effect."""
-    wide = np.pad(punch(), (WIDE - 1) * SIZE // 2, constant_values=FAR_MM)
-    narrow_n, wide_n = (
-        float(ContactSolver(layer, len(depth), CELL_MM, torch.float64).solve(depth[None], INDENTATION_MM).force_n[0])
-        for depth in (punch(), wide)
-    )
-    return Case(name, f"force, to a grid {WIDE} times as wide", abs(narrow_n / wide_n - 1), RESIDUAL)
 
 
 def graph_cases() -> Iterator[Case]:
@@ -289,7 +209,6 @@ def _pressed_raw(counts: int) -> NDArray[np.int32]:
 
 
 PARTS: Final[Mapping[str, Callable[[], Iterator[Case]]]] = {
-    "The simulated pad": pad_cases,
     "Bundled graphs": graph_cases,
     "From raw counts to records": program_cases,
 }
@@ -326,10 +245,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m export.stability", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("reports"), help="folder of the report (default: reports)")
     options: Any = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("stability"):
         broken = run(options.out)
-    except (TrainError, EdgeError) as error:
-        sys.exit(f"stability: {error}")
     sys.stdout.write(f"{options.out / 'stability.md'}\n")
     if broken:
         names = "\n".join(f"  {case.name}, {case.what}: {case.value}, at most {case.most}" for case in broken)

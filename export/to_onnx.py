@@ -22,7 +22,6 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from edge.errors import EdgeError
 from edge.evaluation.test_set import FrozenSet, judge_model, load_frozen_set, mean_error, windows_of
 from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
@@ -31,17 +30,16 @@ from edge.inference.onnx_session import ModelSession, load_session
 from edge.inference.trust import Trust
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from export.graph import ExportError, outputs, to_model
-from export.int8 import calibration_batch, convolutions, quantised
+from export.graph import calibration_batch, convolutions, outputs, quantised, to_model
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of
 from train.data.frozen_presses import freeze_presses
-from train.data.press_batches import COUNTS_PER_UNIT, OneSensor
+from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import SEED, PressSet, join_presses, load_presses
-from train.errors import CheckpointError, TrainError
+from train.errors import CheckpointError, ended_by_errors
 from train.learning.checkpoint import load_network, origin, sensor_of
-from train.learning.interval_fit import Run, conform, fit_correction, half_width_mm, readings_of_presses
+from train.learning.interval_fit import Readings, conform, fit_correction, half_width_mm, readings_of_presses
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.symmetric import write_out
@@ -103,13 +101,7 @@ class IntervalData:
 
     validation: PressSet
     training: PressSet | None = None
-    sensor: OneSensor | None = None  # that reads them, instead of any
     steps: int = 2000  # of the fit
-
-    def conformed(self, net: CompactNet, run: Run) -> dict[str, list[float]]:
-        """Shift a corrected network's deviations until they hold for `run`, and return its levels; see `conform`."""
-        sensor = self.sensor
-        return conform(net, run, readings_of_presses(self.validation, net.taps, posed=net.takes_poses, sensor=sensor))
 
 
 def export(
@@ -132,14 +124,16 @@ def export(
     net, report = load_network(checkpoint)
     write_out(net)
     contract = contract_of(net, report, frozen)
-    pad = pad_of(contract.rows, contract.cols)
+    pad, readings = pad_of(contract.rows, contract.cols), list[Readings]()
     if intervals is not None and isinstance(net, CompactNet):
         report = {**report, "options": {**report["options"], "intervals": True}}
         if intervals.training is None:
             net.add_intervals().contact_level.fill_(contract.contact_level)
         else:
             fit_correction(net, intervals.training, contract.contact_level, steps=intervals.steps)
-        levels = intervals.conformed(net, lambda *given: run_network(net, *given))
+        posed, sensor = net.takes_poses, sensor_of(report)
+        readings = readings_of_presses(intervals.validation, net.taps, posed=posed, sensor=sensor)
+        levels = conform(net, lambda *given: run_network(net, *given), readings)
         contract = replace(contract, interval_levels=levels)
     name, model = checkpoint.stem, to_model(net, pad)
     facts = [f"parity {check_parity(net, model, frozen, contract):.1e}"]
@@ -147,8 +141,8 @@ def export(
     if calibration is not None:
         seen, in_float = calibration_batch(calibration, contract), model
         name, model = name + INT8_SUFFIX, quantised(in_float, seen)
-        if intervals is not None and isinstance(net, CompactNet):
-            contract = replace(contract, interval_levels=intervals.conformed(net, GraphRun(model)))
+        if readings and isinstance(net, CompactNet):
+            contract = replace(contract, interval_levels=conform(net, GraphRun(model), readings))
             model = quantised(to_model(net, pad), seen)
         integer, convs = convolutions(model)
         facts = [f"{integer} of {convs} convolutions in int8"]
@@ -292,7 +286,7 @@ def main(arguments: list[str] | None = None) -> None:
     add("--int8", type=Path, nargs="+", metavar="DATA", help="write NAME-int8.onnx, with ranges from these taps")
     options = parser.parse_args(arguments)
     lossy: list[str] = []
-    try:
+    with ended_by_errors("export"):
         options.out.mkdir(parents=True, exist_ok=True)
         sensor = sensor_of(load_network(options.checkpoints[0])[1])
         nuisances = Nuisances() if sensor is None else sensor.nuisances
@@ -304,7 +298,7 @@ def main(arguments: list[str] | None = None) -> None:
         taps = None if options.int8 is None else join_presses([*map(load_presses, options.int8)])
         trust = None if options.trust is None else load_trust(options.trust, presses)
         validation = [freeze_presses(presses, SEED, nuisances).as_frozen_set()]
-        intervals = IntervalData(presses, training, sensor=sensor)
+        intervals = IntervalData(presses, training)
         for checkpoint in tracked(options.checkpoints, "exporting", "model"):
             line, exceeded = export(
                 checkpoint,
@@ -317,10 +311,6 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.write(line + "\n")
             lossy += [exceeded] * bool(exceeded)
-    except (ExportError, TrainError, EdgeError) as error:
-        sys.exit(f"export: {error}")
-    except OSError as error:
-        sys.exit(f"export: {error.filename}: {error.strerror}")
     if lossy:
         sys.exit(f"export: quantisation costs too much in {', '.join(lossy)}: use the float32 model")
 

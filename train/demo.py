@@ -19,10 +19,10 @@ from shapely.geometry.base import BaseGeometry
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
-from train.data.paper_taps import between_frames, tap
 from train.data.presses import SEED
+from train.families.catalogue import tap
 from train.physics.contact import BARE
-from train.physics.gripped import FINE_SCALE, GrippedPad, Taps
+from train.physics.gripped import FINE_SCALE, SCALE, GrippedPad, Taps, between_frames
 from train.physics.magnets import Magnet, dipole_mt
 from train.physics.pad_draws import NOMINAL, draw_pad
 from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
@@ -38,7 +38,6 @@ _PLACE_MM: Final = PLACES_MM["test"]
 ANGLE_DEG: Final = 30.0  # angle of the last scored tap; each tap before is a step back, each later one a step on
 TAPS: Final = 4
 FORCE_N: Final = 5.0
-SCALE: Final = 10
 RATE_HZ: Final = 100.0
 REST_FRAMES, PRESS_FRAMES, HOLD_FRAMES, LIFT_FRAMES, GAP_FRAMES, STILL_FRAMES = 150, 20, 24, 12, 24, 30
 TAP_FRAMES: Final = PRESS_FRAMES + HOLD_FRAMES + LIFT_FRAMES + GAP_FRAMES
@@ -150,7 +149,7 @@ def _options(pad: GrippedPad, rest: NDArray[np.float32]) -> dict[str, NDArray]:
     """Return the taps that may be proposed; the pad is where the robot states, but for the usual error."""
     first = Pose(*_PLACE_MM, ANGLE_DEG + (1 - TAPS) * ANGLE_STEP_DEG)
     wanted = [over_surface(first, float(x_mm), float(y_mm), 0.0) for x_mm, y_mm in OPTIONS_MM]
-    poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted, Nuisances())
+    poses = jitter_poses(np.random.default_rng([SEED, 3]), wanted)
     taps = tap(pad, [SURFACE] * len(poses), poses, FORCE_N)
     course = _course()[:-GAP_FRAMES]
     counts = between_frames(taps.counts, np.tile(course, (len(poses), 1)))

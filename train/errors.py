@@ -1,4 +1,11 @@
-"""Errors of training: TrainError is the root of all others."""
+"""Errors of training, TrainError being the root of all others, and how they end a program."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from edge.errors import EdgeError
+from firmware_bridge.errors import BridgeError
 
 
 class TrainError(Exception):
@@ -19,3 +26,17 @@ class DatasetError(TrainError, ValueError):
 
 class CheckpointError(TrainError, ValueError):
     """Weights or configuration that are absent, damaged, or do not fit each other."""
+
+
+@contextmanager
+def ended_by_errors(program: str) -> Iterator[None]:
+    """End a program by an error of its user, in one line and with exit code 1, or with 130 when interrupted."""
+    try:
+        yield
+    except (TrainError, BridgeError, EdgeError) as error:
+        sys.exit(f"{program}: {error}")
+    except OSError as error:
+        sys.exit(f"{program}: {error.filename}: {error.strerror}")
+    except KeyboardInterrupt:
+        sys.stderr.write(f"{program}: interrupted; the same command continues\n")
+        sys.exit(130)

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from train.data.frozen_presses import freeze_presses
 from train.data.presses import SEED, PressSet, join_presses, load_presses
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, ended_by_errors
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
 from train.networks.registry import NETWORKS
@@ -80,15 +80,11 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(arguments)
     started_s = time.monotonic()
-    try:
+    with ended_by_errors("fit"):
         data = join_presses([*map(load_presses, options.data)])
         frozen = freeze_presses(load_presses(options.validation), SEED).as_frozen_set()
         for training in bundled(data) if options.network is None else (_training(options),):
             _say(_line(fit_network(training, data, frozen, options.folder)))
-    except (TrainError, ValueError) as error:
-        sys.exit(f"fit: {error}")
-    except KeyboardInterrupt:
-        sys.exit("fit: stopped; the same command continues")
     _say(f"all in {(time.monotonic() - started_s) / 60:.1f} min")
     leave_group()
 

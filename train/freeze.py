@@ -8,7 +8,7 @@ to freeze it again.
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,19 +18,24 @@ from numpy.typing import NDArray
 from edge.evaluation.classical_methods import bicubic, bilinear, fit_gain, fit_linear_map, fitted_methods
 from edge.evaluation.test_set import FrozenSet, load_frozen_set
 from edge.perception.taxel_health import Kinds, load_estimator, ridged
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.formats import load_recording
-from train.data.paper_taps import PaperTaps, between_frames, paper_taps
 from train.data.press_batches import read_presses
-from train.data.presses import SEED, PressSet, join_presses, load_presses
+from train.data.presses import SEED, PressSet, join_presses, load_presses, one_thread
 from train.demo import demo_recording, grip_recording
-from train.errors import TrainError
+from train.errors import ended_by_errors
+from train.families.catalogue import tap
 from train.networks.symmetric import moved_scans
-from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
-from train.physics.sensor_noise import Nuisances, apply_nuisances
+from train.physics.gripped import FINE_SCALE, FRAMES, MAX_INDENTATION_MM, SCALE, GrippedPad, between_frames
+from train.physics.pad_draws import NOMINAL
+from train.physics.sensor_noise import Nuisances, apply_nuisances, jitter_poses
+from train.physics.tpsf import resample, resample_touching
+from train.surfaces.depth_image import Pose
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS, PLACES_MM, TARGET_ANGLES_DEG
 
-SCALE: Final = 10
 TEST_FORCE_N: Final = 5.0
 """Force at which every tap of a frozen set ends, unless the sensor's largest depth is reached before, in [N]."""
 CLASSICAL_WINDOWS: Final = 12_000
@@ -41,31 +46,48 @@ More kinds reduce it on figures, but not on contacts that vary little over the p
 """
 FIRST_FRAME: Final = 6
 """Frames of a press before the first one kept: kept frames begin at about 30 % of the set force, as in the paper."""
+_PRESSED_TO_N: Final = 9.2  # force at which presses end; their courses lead to TEST_FORCE_N
+_AT_ONCE: Final = 48  # sequences whose pose errors are drawn at once: so the bundled frozen set has its poses
 
 
-def freeze(
-    sequences: PaperTaps, nuisances: Nuisances, seed: int, force_n: float = TEST_FORCE_N, scale: int = SCALE
-) -> FrozenSet:
-    """Return the frames of sequences of the paper's protocol, with a different sensor for each sequence."""
-    flat = sequences.at_scale(scale)
-    index = np.arange(len(flat))
-    share = flat.share_at_force(index, force_n)
+@one_thread()
+def freeze(surfaces: Sequence[str] = SURFACES) -> FrozenSet:
+    """Return the frames of the paper's protocol, in the simulated world with one pad, and a sensor for each sequence.
+
+    A sequence is MAX_TAPS whole taps of one flat figure by the nominal pad, each turned by a step from the one before
+    and off by a robot's error; the newest, at the test's place in four turns, is the target.
+
+    Source: Wu and Liu 2024, Sec. V and Table II.
+    """
+    taps, names = MAX_TAPS, [name for name in surfaces for _ in TARGET_ANGLES_DEG]
+    turns_deg = [angle - ANGLE_STEP_DEG * back for angle in TARGET_ANGLES_DEG for back in range(taps)]
+    sent = [Pose(*PLACES_MM["test"], turn_deg) for _ in surfaces for turn_deg in turns_deg]
+    poses: list[Pose] = []
+    while part := sent[len(poses) :][: _AT_ONCE * taps]:
+        poses += jitter_poses(np.random.default_rng([SEED, len(poses) // (_AT_ONCE * taps)]), part)
+    pad, numbers = GrippedPad(NOMINAL), tracked(range(len(names)), "tapping", "sequence")
+    solved = [tap(pad, [names[at]] * taps, poses[at * taps : (at + 1) * taps], _PRESSED_TO_N) for at in numbers]
+    true_poses = np.array(poses).reshape(-1, taps, 3)
+    end_n = np.stack([one.force_n[:, -1] for one in solved])
+    end_mm = np.stack([one.indentation_mm[0, -1] for one in solved])
+
+    share = np.minimum(np.float64(TEST_FORCE_N) / end_n, 1.0)
     course = np.arange(1, FIRST_FRAME + FRAMES + 1) / (FIRST_FRAME + FRAMES)
-    every = share.reshape(-1, 1) * course
-    clean = between_frames(flat.counts.reshape(-1, *flat.counts.shape[2:]), every)
+    clean = between_frames(np.concatenate([one.counts for one in solved]), share.reshape(-1, 1) * course)
     presses = clean.reshape(*share.shape, *clean.shape[1:])
-    readings = apply_nuisances(presses, nuisances, seed, angle_deg=flat.poses[..., 2])
+    readings = apply_nuisances(presses, Nuisances(), SEED, angle_deg=true_poses[..., 2])
     moments = share[:, :1] * course[FIRST_FRAME:]
+    unit_patterns = np.stack([one.unit_patterns[0] for one in solved])
     return FrozenSet(
         newest=readings[:, 0, FIRST_FRAME:].reshape(-1, *readings.shape[3:]).astype(np.int16),
         earlier=readings[:, 1:, -1].astype(np.int16),
-        tap=np.repeat(index, FRAMES).astype(np.int16),
-        indentation_mm=(flat.indentation_mm[:, 0, -1:] * moments).ravel().astype(np.float32),
-        force_n=(flat.force_n[:, 0, -1:] * moments).ravel().astype(np.float32),
-        unit_patterns=flat.unit_patterns.astype(np.float16),
-        touched=flat.touching,
-        surface=flat.surfaces,
-        angle_deg=flat.poses[:, 0, 2].astype(np.float32),
+        tap=np.repeat(np.arange(len(share)), FRAMES).astype(np.int16),
+        indentation_mm=(end_mm[:, None] * moments).ravel().astype(np.float32),
+        force_n=(end_n[:, :1] * moments).ravel().astype(np.float32),
+        unit_patterns=resample(unit_patterns, FINE_SCALE, SCALE).astype(np.float16),
+        touched=resample_touching(np.stack([one.touching[0] for one in solved]), FINE_SCALE, SCALE),
+        surface=np.array(names),
+        angle_deg=true_poses[:, 0, 2].astype(np.float32),
         full_scale_mm=MAX_INDENTATION_MM,
     )
 
@@ -127,13 +149,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, nargs="+", required=True, help=help_of_data)
     options = parser.parse_args(arguments)
     folder: Path = options.folder
-    try:
+    with ended_by_errors("freeze"):
         taps = join_presses([*map(load_presses, options.data)])
-    except TrainError as error:
-        sys.exit(f"freeze: {error}")
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "frozen.npz").exists():
-        freeze(paper_taps("test"), Nuisances(), SEED).save(folder / "frozen.npz")
+        freeze().save(folder / "frozen.npz")
     frozen = load_frozen_set(folder / "frozen.npz")
     _save(folder / "classical.npz", fit_classical(taps), lambda draft: fitted_methods(draft, frozen.scale))
     grid = (USPA44.rows, USPA44.cols)

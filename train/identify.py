@@ -16,16 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.gain_learning import load_contact_model
-from firmware_bridge.errors import BridgeError
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.scans.pad_constants import PAD_RANGES, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from train.data.real_grips import recorded_sets, recording_paths
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, ended_by_errors
 from train.learning.contact_mixture import CONSTANTS, learned, normalise
 from train.physics.pad_draws import RANGES
 
@@ -84,13 +82,13 @@ def table(sensor: str, contacts: int, pad: Pad) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when done, 1 on an error of the user."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m train.identify", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recordings", type=Path, metavar="RECORDINGS", help="a folder of TRIAL/xela_SENSOR.csv")
     parser.add_argument("--out", type=Path, metavar="SENSOR.toml", help="a sensor file to extend or to write")
     options = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("train.identify"):
         contacts = recorded_contacts(options.recordings)
         model = load_contact_model(CONTACTS)
         pads = {}
@@ -103,11 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with changing(options.out):
                 save_sensor_file(options.out, extended(options.out, pads))
             sys.stdout.write(f"{options.out}: pads of {', '.join(pads)}\n")
-    except (TrainError, BridgeError, EdgeError) as error:
-        sys.stderr.write(f"train.identify: {error}\n")
-        return 1
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -22,21 +22,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge.errors import EdgeError
 from edge.evaluation.classical_methods import fitted_methods
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, INT8_SUFFIX, find_model
 from edge.inference.contract import GAINS_CERTAINTY
 from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
-from firmware_bridge.errors import BridgeError
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
 from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
@@ -47,7 +45,7 @@ from train.data.presses import SEED, PressSet
 from train.data.real_grips import Grip, has_hole, play, recorded_grips
 from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, TrainError, ended_by_errors
 from train.families.catalogue import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
@@ -124,33 +122,17 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     return Knowledge(name, pad, ranges)
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(NamedTuple):
     """Amount of work of a training."""
 
     presses: int
     steps: int
-
-    def line(self, press_s: float, step_s: float) -> str:
-        """Return how long it takes, in a line."""
-        parts = (self.presses * press_s / 60, self.steps * step_s / 60, REST_S / 60)
-        return (
-            f"about {sum(parts):.0f} minutes: {parts[0]:.1f} for {self.presses} presses, {parts[1]:.1f} for "
-            f"{self.steps} steps, {parts[2]:.1f} to export and to compare"
-        )
 
 
 REST_S: Final = 150.0  # of two cores, to export and to compare
 TRIED: Final = 96  # presses and steps by which their time is measured
 SIMULATING: Final = 0.25  # share of the time for presses, up to
 MOST_PRESSES: Final = 24_000
-
-
-def planned(minutes: float, press_s: float, step_s: float) -> Plan:
-    """Return as many presses and steps as take so long, with the times of one."""
-    left_s = max(60 * minutes - REST_S, 0)
-    presses = min(int(SIMULATING * left_s / press_s), MOST_PRESSES)
-    return Plan(max(presses, TRIED), max(int((left_s - presses * press_s) / step_s), 1))
 
 
 def tried(world: World, folder: Path) -> tuple[float, float]:
@@ -252,27 +234,14 @@ UNLIKE: Final = "pads a fifth unlike it"
 TAPPED: Final = "own taps at other poses"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when a model was handed over, 1 where not, 130 when interrupted."""
-    return reported("train.own", _train, _parser().parse_args(arguments))
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line, with exit code 1 where no model was handed over."""
+    options = _parser().parse_args(arguments)
+    with ended_by_errors("train.own"):
+        _train(options)
 
 
-def reported(program: str, run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a program with its options; an error is a line, and interrupted it is 130."""
-    try:
-        return run(options)
-    except (TrainError, BridgeError, EdgeError) as error:
-        sys.stderr.write(f"{program}: {error}\n")
-        return 1
-    except OSError as error:
-        sys.stderr.write(f"{program}: {error.filename}: {error.strerror}\n")
-        return 1
-    except KeyboardInterrupt:
-        sys.stderr.write(f"{program}: interrupted; run the same command again\n")
-        return 130
-
-
-def _train(options: argparse.Namespace) -> int:
+def _train(options: argparse.Namespace) -> None:
     out: Path = options.out
     work = out / "work"
     work.mkdir(parents=True, exist_ok=True)
@@ -322,11 +291,10 @@ def _train(options: argparse.Namespace) -> int:
         )
     if objection is not None:
         say(f"not handed over: {objection}")
-        return 1
+        sys.exit(1)
     handed = out / f"{name}.onnx"
     write_in_place(handed, lambda draft: draft.write_bytes(path.read_bytes()), load_session)
     say(f"from now on: edge-sr --sensor {options.sensor_file} --model {handed}")
-    return 0
 
 
 COMPARED: Final = 480  # presses of each set that nothing is trained on
@@ -352,8 +320,14 @@ def plan_of(minutes: float, world: World, folder: Path) -> Plan:
     if path.exists() and (kept := json.loads(path.read_text()))["minutes"] == minutes:
         return Plan(kept["presses"], kept["steps"])
     press_s, step_s = tried(world, folder)
-    plan = planned(minutes, press_s, step_s)
-    say(plan.line(press_s, step_s))
+    left_s = max(60 * minutes - REST_S, 0)
+    presses = min(int(SIMULATING * left_s / press_s), MOST_PRESSES)
+    plan = Plan(max(presses, TRIED), max(int((left_s - presses * press_s) / step_s), 1))
+    parts = (plan.presses * press_s / 60, plan.steps * step_s / 60, REST_S / 60)
+    say(
+        f"about {sum(parts):.0f} minutes: {parts[0]:.1f} for {plan.presses} presses, {parts[1]:.1f} for "
+        f"{plan.steps} steps, {parts[2]:.1f} to export and to compare"
+    )
     text = json.dumps({"minutes": minutes, "presses": plan.presses, "steps": plan.steps}) + "\n"
     write_in_place(path, lambda draft: draft.write_text(text), lambda draft: draft.read_text(), keep_before=False)
     return plan
@@ -383,4 +357,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

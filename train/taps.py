@@ -15,7 +15,6 @@ Source: Wu and Liu 2024, Section IV, Eq. 4-10, Table II.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,11 +28,10 @@ from edge.terminal.progress_bar import tracked
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
 from train.data.presses import SEED, PressSet, join_presses, one_thread
-from train.data.recorded_taps import RecordedTap, recorded_taps
-from train.data.tapped_surface import Surface, image_surface, placed, pressed, surface_of
-from train.errors import DatasetError
+from train.data.recorded_taps import RecordedTap, Surface, image_surface, placed, pressed, recorded_taps, surface_of
+from train.errors import DatasetError, ended_by_errors
 from train.networks.tactile_psf import PsfNet, fit_psf_net
-from train.own import Knowledge, knowledge_of, reported, say
+from train.own import Knowledge, knowledge_of, say
 from train.physics.gripped import FINE_SCALE, MAX_INDENTATION_MM, SCALE, TRACTION_SCALE, GrippedPad
 from train.physics.pad_draws import Pad, constants
 from train.physics.tpsf import resample_touching, spread, tpsf_pattern
@@ -132,12 +130,14 @@ def with_patterns(taps: PressSet, truth: str, scale: int) -> tuple[PressSet, str
     return replace(taps, patterns=patterns.astype(np.float16), touching=touching, config=config), told
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
-    return reported("train.taps", _make, _parser().parse_args(arguments))
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    options = _parser().parse_args(arguments)
+    with ended_by_errors("train.taps"):
+        _make(options)
 
 
-def _make(options: argparse.Namespace) -> int:
+def _make(options: argparse.Namespace) -> None:
     file = load_sensor_file(options.sensor_file)
     knowledge = knowledge_of(file, options.sensor)
     surfaces = [surface_of(path, options.unit_mm, options.pixel_mm) for path in options.surface]
@@ -147,7 +147,6 @@ def _make(options: argparse.Namespace) -> int:
     shares = [f"{np.isin(made.pad, part).sum()} {name}" for name, part in made.config["split"].items()]
     deepest = f"deepest {made.indentation_mm.max():.2f} mm by the constants of the sensor file"
     say(f"{options.out}: {len(made)} LR-HR pairs, {', '.join(shares)}; {told}; {deepest}")
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -180,4 +179,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -23,7 +23,7 @@ from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import COUNTS_PER_UNIT
 from train.data.presses import PressSet, join_presses, load_presses
-from train.errors import CheckpointError, DatasetError, TrainError
+from train.errors import CheckpointError, DatasetError, ended_by_errors
 from train.learning.checks import contact_check, fit_contact_network, fit_tap_network, tap_check
 from train.physics.pad_draws import INPUTS, input_scale
 from train.physics.sensor_noise import Nuisances
@@ -112,15 +112,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("out", type=Path, metavar="OUT.json", help="trust.json in the folder of the checkpoints")
     parser.add_argument("--data", type=Path, nargs="+", required=True, help="files of train.data.make_presses")
     options = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("trust"):
         data = join_presses([*map(load_presses, options.data)])
         text = json.dumps(fit_trust(data, seed=1)) + "\n"
         options.out.parent.mkdir(parents=True, exist_ok=True)
         write_in_place(options.out, lambda draft: draft.write_text(text), lambda draft: json.loads(draft.read_text()))
-    except TrainError as error:
-        sys.exit(f"trust: {error}")
-    except OSError as error:
-        sys.exit(f"trust: {error.filename or options.out}: {error.strerror}")
     sys.stdout.write(f"{options.out}: {len(text) / 1e3:.0f} kB\n")
 
 

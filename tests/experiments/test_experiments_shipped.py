@@ -13,7 +13,6 @@ from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
 from train.data.real_grips import (
     has_hole,
-    neighbours_mean,
     play,
     recorded_grips,
     recorded_sets,
@@ -22,9 +21,7 @@ from train.data.real_grips import (
 )
 from train.errors import DatasetError
 from train.experiments.__main__ import run
-from train.experiments.families import NONE_OFF, OffPad
 from train.experiments.workbench import infer_presses
-from train.physics.pad_draws import NOMINAL
 
 
 @pytest.fixture
@@ -34,7 +31,7 @@ def recordings(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(tmp_path):
+def test_known_gains_and_pads_enter_the_model(tmp_path):
     contract = make_pad_contract(taps=1, output_full_scale=0.5, interval_factor=1.6, interval_levels={"90": [1.6] * 4})
     model = ModelSession(write_model(tmp_path / "stsr-int8.onnx", contract))
     few = load_frozen_presses().pick(np.arange(5))
@@ -44,22 +41,6 @@ def test_readings_are_divided_by_gains_and_the_pad_enters_where_they_are_known(t
     by_hand = [model.run(one, row).copy() for one, row in zip(scaled, rows, strict=True)]
     assert found[True] == pytest.approx(np.stack(by_hand), rel=1e-5)
     assert not np.allclose(found[False], found[True])
-
-
-def test_one_constant_of_a_pad_is_off():
-    assert OffPad("thickness_mm", -10).pad == replace(NOMINAL, thickness_mm=NOMINAL.thickness_mm * 0.9)
-    assert OffPad("free_sides", 20).pad.free_sides == pytest.approx(0.2)
-    assert NONE_OFF.pad == NOMINAL
-    assert not OffPad("poisson", 20).can_be and not OffPad("free_sides", -5).can_be
-    assert OffPad("poisson", 10).can_be
-
-
-def test_neighbours_give_a_plane_exactly_inside_the_rim():
-    row, col = np.mgrid[:4, :4]
-    plane = (100 + 30 * row - 50 * col).astype(float)
-    mean = neighbours_mean(plane.reshape(1, 16)).reshape(4, 4)
-    np.testing.assert_allclose(mean[1:3, 1:3], plane[1:3, 1:3])
-    np.testing.assert_allclose(mean[0, 0], (plane[0, 1] + plane[1, 0]) / 2)
 
 
 def test_recordings_are_zeroed_by_the_trial_that_lets_go(recordings):

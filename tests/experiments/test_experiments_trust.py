@@ -13,7 +13,7 @@ from train.data.frozen_presses import load_frozen_presses
 from train.errors import CheckpointError
 from train.experiments import trust_checks
 from train.experiments.__main__ import run
-from train.experiments.sensor_faults import FAULTS, PushedSensor
+from train.experiments.sensor_faults import FAULTS
 from train.families.catalogue import SHARES
 
 
@@ -50,14 +50,6 @@ class TestVerdicts:
         assert trust_checks.share(np.ones(100, dtype=bool)) == "100.0 (96.4..100.0)"
         assert trust_checks.share(np.zeros(100, dtype=bool), np.zeros(100, dtype=int)) == "0.0 (0.0..97.5)"
 
-    def test_presses_of_a_pad_get_the_gains_of_one_sensor(self, wide):
-        one = trust_checks.of_one_sensor_each(wide)
-        for pad in np.unique(wide.presses.pad):
-            mine = wide.presses.pad == pad
-            assert np.ptp(one.gains[mine], axis=0).max() == 0
-            even = one.presses.counts[mine] / one.gains[mine][:, None]
-            assert even == pytest.approx(wide.presses.counts[mine] / wide.gains[mine][:, None], rel=1e-4)
-
 
 def test_patterns_that_are_off_are_counted_by_how_far(wide):
     """The fake model's patterns are in no relation to the truth: what counts is who is counted where."""
@@ -81,29 +73,6 @@ class TestTaps:
         assert (used.tolist(), foreign.tolist()) == ([1], [[True] * 3])
         alone_db, _, _ = trust_checks.guarded(model, wrong, truth, 1)
         assert alone_db == pytest.approx(wrong_db, abs=0.05) and right_db != wrong_db
-
-    def test_cases_change_earlier_taps_alone_or_mirror_all(self, wide):
-        firm = trust_checks.firm(wide)
-        made = trust_checks.cases(firm)
-        right, truth = made["right"]
-        for name in ("another surface", "order reversed", "not turned"):
-            counts = made[name][0]
-            assert np.array_equal(counts[:, 0], right[:, 0]), name
-            assert (counts[:, 1] != right[:, 1]).any(axis=(1, 2, 3)).all(), name
-        mirrored, image = made["turned the other way"]
-        assert np.array_equal(image[..., ::-1], truth)
-        assert np.array_equal(mirrored[:, :, 0, :, ::-1], -right[:, :, 0])
-        assert np.array_equal(mirrored[:, :, 1:, :, ::-1], right[:, :, 1:])
-
-
-def test_a_pushed_sensor_remembers_suspicion():
-    sensor = PushedSensor(FakeModel(make_trusted_contract()))
-    for _ in range(6):
-        assert sensor.touch(press(x=9000)).untrusted_reason == "unfamiliar"
-    assert sensor.suspected
-    for _ in range(60):
-        sensor.touch(press())
-    assert not sensor.suspected
 
 
 class TestPage:

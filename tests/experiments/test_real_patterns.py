@@ -48,7 +48,7 @@ def test_every_scan_under_load_has_a_pattern(played):
         assert len(one.patterns) > 50 and np.isfinite(one.patterns).all(), name
 
 
-def test_the_strongest_moment_of_every_grip_covers_the_pad_evenly_without_a_hole(played):
+def test_the_strongest_moment_of_a_grip_covers_the_pad(played):
     for name, one in played.items():
         strongest = one.patterns[one.zeroed[:, 2].sum(axis=(1, 2)).argmax()][None]
         assert share_touched(strongest)[0] >= LEAST_SHARE, name

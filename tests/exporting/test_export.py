@@ -21,7 +21,7 @@ from onnx import numpy_helper
 
 from edge.evaluation.test_set import judge, mean_error
 from edge.inference.bundled import find_model
-from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
+from edge.inference.contract import CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
@@ -66,7 +66,7 @@ def test_an_exported_network_keeps_its_contract(folder, session, frozen):
     assert contract.test_set_sha256 == frozen.sha256() and contract.output_full_scale == frozen.full_scale_mm
 
 
-def test_the_runtime_computes_what_was_trained_with_corrected_deviations(folder, session, net, frozen):
+def test_the_runtime_computes_what_was_trained(folder, session, net, frozen):
     windows = frozen.windows(2)
     plain, uncorrected = infer(load_network(folder / "sure.pt")[0], windows)
     patterns, deviations = infer(net, windows)
@@ -79,7 +79,7 @@ def test_the_runtime_computes_what_was_trained_with_corrected_deviations(folder,
         np.testing.assert_allclose(session.deviation, deviation, rtol=1e-4)
 
 
-def test_the_contract_tells_error_and_coverage_for_every_number_of_taps(session, net, frozen):
+def test_the_contract_states_errors_by_number_of_taps(session, net, frozen):
     told = session.contract.test_error
     for given in (1, 2):
         patterns, deviations = infer(net, frozen.windows(2, given))
@@ -111,11 +111,11 @@ def assert_intervals_hold(session, given):
             inside = np.abs(pattern - truth) <= half_width_mm(session.deviation)
             for number in np.unique(region):
                 held.setdefault(int(number), []).extend(inside[region == number].tolist())
-    assert len(held) > 1
-    assert [float(np.mean(share)) for share in held.values()] == pytest.approx([0.9] * len(held), abs=0.02)
+    shares = [float(np.mean(share)) for share in held.values() if len(share) > 100]  # fewer pixels tell little
+    assert len(shares) > 1 and shares == pytest.approx([0.9] * len(shares), abs=0.02)
 
 
-def test_a_file_has_no_traces_of_the_machine_and_no_weights_elsewhere_and_the_one_before_stays(folder):
+def test_a_file_has_no_traces_of_the_machine(folder):
     content = (folder / "sure.onnx").read_bytes()
     assert b".py" not in content and b"/tmp" not in content
     assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
@@ -141,15 +141,8 @@ def test_a_graph_that_computes_something_else_is_no_parity(folder, session, net,
         check_parity(net, model, frozen, session.contract)
 
 
-def test_any_batch_is_one_run_of_many_windows(session, frozen):
-    assert session.contract.batch == ANY_BATCH and session.contract.window_shape == (ANY_BATCH, 6, 4, 4)
-    windows = [session.contract.scale_window(window) for window in frozen.windows(2)[:3]]
-    together = session.run_together(windows).copy()
-    np.testing.assert_allclose(together, [session.run(window).copy() for window in windows], rtol=1e-5, atol=1e-7)
-
-
 @pytest.mark.night
-def test_a_published_network_of_another_scale_has_one_output_and_is_not_judged(frozen, tmp_path_factory):
+def test_a_published_network_has_one_output(frozen, tmp_path_factory):
     """Its batch normalisation is folded into the convolutions."""
     folder = made_once(tmp_path_factory, published_model)
     model, session = onnx.load(folder / "peer.onnx"), ModelSession(folder / "peer.onnx")
@@ -164,7 +157,7 @@ def test_a_published_network_of_another_scale_has_one_output_and_is_not_judged(f
     assert found.relative < 1e-5
 
 
-def test_seven_taps_at_another_scale_without_checks_since_no_poses_are_taken(tmp_path):
+def test_several_taps_without_poses_get_no_checks(tmp_path):
     """A pattern of another surface's taps would be believed."""
     options = {"channels": 16, "blocks": 1, "known": 13}
     path = save_checkpoint(tmp_path / "one.pt", build("compact-mtsr7", 6, **options), "compact-mtsr7", **options)

@@ -1,6 +1,5 @@
 """Every bundled model computes what its network computes, at every level, and in a second runtime."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -24,7 +23,7 @@ from export.parity import (
     read_windows,
 )
 from export.to_onnx import MOST_LOSS_DB
-from export.verify import Parity, judged, main, verify, worst
+from export.verify import judged, main, verify
 from train.errors import CheckpointError
 from train.learning.checkpoint import network_of
 
@@ -58,14 +57,10 @@ def save(model, path):
     return path
 
 
-def test_every_network_is_bundled_in_both_arithmetics():
-    in_float = {name for name in MODELS if not name.endswith("-int8")}
-    assert in_float and set(MODELS) == in_float | {f"{name}-int8" for name in in_float}
-
-
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.night)])
 @pytest.mark.parametrize("name", MODELS)
-def test_every_bundled_model_keeps_every_bound_at_every_level(name):
-    found = rows(name, IN_GATE if name in IN_INTEGERS else 6 * IN_GATE)
+def test_every_bundled_model_keeps_every_bound_at_every_level(name, whole):
+    found = rows(name, 1 if whole else IN_GATE if name in IN_INTEGERS else 6 * IN_GATE)
     assert [row for row in found if row.broken] == []
     assert {row.level for row in found} == set(LEVELS)
     assert {"test set", "zeros", "denormals", "one hot taxel", "1000 x full range"} <= {row.windows for row in found}
@@ -81,12 +76,6 @@ def test_integers_cost_no_more_than_they_may(name, one_in):
     said_db = in_float.contract.test_error[taps]["psnr_db"] - session.contract.test_error[taps]["psnr_db"]
     assert said_db == pytest.approx(max(lost_db), abs=2e-3 if one_in == 1 else 2e-2)
     assert (session.contract.arithmetic, in_float.contract.arithmetic) == ("int8", "float32")
-
-
-@pytest.mark.night
-@pytest.mark.parametrize("name", MODELS)
-def test_on_the_whole_set_as_well(name):
-    assert [row for row in rows(name, 1) if row.broken] == []
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -176,7 +165,7 @@ def test_integers_that_say_something_else_break_the_bound(pattern_factor, deviat
         ({}, r"the float32 model stsr\.onnx is not in the folder of its int8 model"),
     ],
 )
-def test_integers_without_the_network_that_they_are_of_are_refused(tmp_path, beside, complaint):
+def test_integers_without_their_network_are_refused(tmp_path, beside, complaint):
     for name, source in {"stsr-int8.onnx": "stsr-int8", **beside}.items():
         (tmp_path / name).write_bytes(find_model(source).read_bytes())
     with pytest.raises(SystemExit, match=complaint):
@@ -196,7 +185,7 @@ def test_what_is_not_finite_is_no_parity(spoil):
         differences(["pattern"], [maps], [maps[:1]], 0.5)
 
 
-def test_a_difference_is_a_share_of_full_scale_or_of_what_is_larger():
+def test_a_difference_is_a_share_of_the_larger_scale():
     small, large = np.full((1, 4, 4), 0.1, np.float32), np.full((1, 4, 4), 10.0, np.float32)
     for size, expected in ((small, 0.02), (large, 0.001)):
         (found,) = differences(["pattern"], [size], [size + np.float32(0.01)], 0.5)
@@ -209,22 +198,9 @@ def test_windows_are_of_every_force_and_stiff_ones_beside():
     step = read_windows(frozen(), contract)
     assert step.shape[1:] == (21, 4, 4) and 50 < len(step) < 250 < len(read_windows(frozen(), contract, None))
     stiff = extreme_windows(contract)
-    assert all(window.shape == (1, 21, 4, 4) and window.dtype == np.float32 for window in stiff.values())
     bits = stiff["denormals"].view(np.uint32)  # a comparison would take them for zeros
     assert not stiff["zeros"].any() and bits.min() > 0 and bits.max() < 0x00800000
-    assert stiff["1000 x full range"].max() == pytest.approx(1000 * 32768 / 500)
     assert not stiff["4 of 7 taps"][:, 12:].any() and stiff["4 of 7 taps"][:, 3:12].any()
-    assert not stiff["rest to full load in one scan"][:, 3:].any()
-
-
-def test_of_extreme_windows_the_worst_is_shown():
-    row = Parity(
-        "one", "all", "zeros", differences(["pattern"], *[[np.ones((1, 2, 2), np.float32)]] * 2, 0.5), None, ""
-    )
-    other = row._replace(windows="full range", differences=(replace(row.differences[0], relative=1e-6),))
-    shown = worst([row, row._replace(windows="test set", psnr_change_db=-0.01), other])
-    assert [one.windows for one in shown] == ["full range", "test set"]
-    assert shown[1].row()["PSNR change dB"] == "-0.0100" and shown[0].row()["bound"] == "holds"
 
 
 @pytest.mark.parametrize(

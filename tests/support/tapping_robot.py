@@ -21,10 +21,9 @@ from firmware_bridge.recording.csv_reader import CSV_HEADER, CSV_POSES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, Pad
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
-from train.data.paper_taps import between_frames
 from train.data.presses import PressSet, one_thread
 from train.families.catalogue import heights_of
-from train.physics.gripped import FINE_SCALE, SAMPLES, SCALE, GrippedPad, Taps
+from train.physics.gripped import FINE_SCALE, SAMPLES, SCALE, GrippedPad, Taps, between_frames
 from train.physics.pad_draws import INPUTS, RANGES, constants, draw_pad
 from train.physics.tpsf import resample, resample_touching
 from train.surfaces.depth_image import Pose, Relief, depth_image

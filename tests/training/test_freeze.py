@@ -5,38 +5,37 @@ import pytest
 from press_samples import make_press_set
 
 from edge.evaluation.classical_methods import fitted_methods
-from edge.evaluation.test_set import judge
+from edge.evaluation.test_set import judge, load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR
 from firmware_bridge.recording.formats import load_recording
-from train.data.paper_taps import PaperTaps, paper_taps
-from train.data.presses import SEED
 from train.data.world import World, solve_pad
 from train.demo import demo_recording
 from train.freeze import KINDS, TEST_FORCE_N, drawn, fit_classical, fit_kinds, fit_taxels, freeze, main
 from train.physics.gripped import FRAMES, MAX_INDENTATION_MM
-from train.physics.sensor_noise import Nuisances
-from train.surfaces.poses import PLACES_MM
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import MAX_TAPS
 
 
 @pytest.fixture(scope="module")
-def sequences() -> PaperTaps:
-    return paper_taps("test", ("O", "small circle"), taps=3)
+def frozen():
+    return freeze(SURFACES[:2])
 
 
-@pytest.fixture(scope="module")
-def frozen(sequences):
-    return freeze(sequences, Nuisances(), SEED)
+def test_the_frozen_set_is_made_as_the_bundled_one(frozen):
+    """Its first figures have outlines of an earlier release, and draws depend on how many sequences there are."""
+    bundled = load_frozen_set(BUNDLE_DIR / "frozen.npz")
+    taps, frames = len(frozen.surface), len(frozen)
+    assert frozen.surface.tolist() == bundled.surface[:taps].tolist() == ["C"] * 4 + ["F"] * 4
+    np.testing.assert_allclose(frozen.angle_deg, bundled.angle_deg[:taps], rtol=1e-6)
+    np.testing.assert_allclose(frozen.force_n, bundled.force_n[:frames], rtol=1e-3)
+    assert np.abs(frozen.unit_patterns - bundled.unit_patterns[:taps].astype(np.float32)).mean() < 0.01
+    assert (frozen.touched != bundled.touched[:taps]).mean() < 0.015
+    for ours, theirs in zip(frozen.earlier.reshape(-1, 48), bundled.earlier[:taps].reshape(-1, 48), strict=True):
+        assert np.corrcoef(ours, theirs)[0, 1] > 0.998, "each tap is turned back one more step"
 
 
-def test_sequences_are_the_papers_targets_each_tap_turned_back_one_more_step(sequences):
-    assert sequences.surfaces.tolist() == ["O"] * 4 + ["small circle"] * 4
-    turns_deg = [[newest, newest - 5, newest - 10] for newest in (0, 30, 60, 90)] * 2
-    assert sequences.poses[..., 2] == pytest.approx(np.array(turns_deg), abs=2.01)
-    assert sequences.poses[..., :2] == pytest.approx(np.full((8, 3, 2), PLACES_MM["test"]), abs=0.401)
-
-
-def test_frames_rise_to_the_set_force_and_share_their_earlier_taps(frozen):
-    assert len(frozen) == 2 * 4 * FRAMES and frozen.newest.shape[1:] == (3, 4, 4) and frozen.earlier.shape[:2] == (8, 2)
+def test_frames_rise_to_the_set_force(frozen):
+    assert len(frozen) == 2 * 4 * FRAMES and frozen.earlier.shape[:2] == (8, MAX_TAPS - 1)
     force, depth = frozen.force_n.reshape(8, FRAMES), frozen.indentation_mm.reshape(8, FRAMES)
     assert np.all(np.diff(force) > 0) and np.allclose(np.diff(depth, n=2), 0, atol=1e-6)
     assert np.allclose(depth[:, 0] / depth[:, -1], 7 / 22)
@@ -78,7 +77,7 @@ def test_the_demo_is_made_as_the_bundled_one(tmp_path):
 
 
 @pytest.mark.night
-def test_the_command_makes_all_files_but_the_frozen_set_that_models_name(tmp_path):
+def test_the_command_keeps_a_frozen_set_that_is_there(tmp_path):
     shutil.copy(BUNDLE_DIR / "frozen.npz", tmp_path)
     make_press_set(600).save(tmp_path / "seen.npz")
     before = (tmp_path / "frozen.npz").stat()
@@ -93,7 +92,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path):
         main([str(tmp_path), "--data", str(tmp_path / "absent.npz")])
 
 
-def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
+def test_kinds_of_contact_are_separated_at_any_scale():
     rng = np.random.default_rng(0)
     shapes = rng.uniform(100, 1000, (2, 48)) * [[1], [0.2]]
     shapes[1, :40] = 0
@@ -109,7 +108,7 @@ def test_kinds_of_contact_are_told_apart_in_readings_whatever_their_scale():
 
 @pytest.fixture(scope="module")
 def presses():
-    figures = {"O": 1.0, "small circle": 1.0}
+    figures = dict.fromkeys(SURFACES[:2], 1.0)
     return solve_pad(World(count=64, per_pad=64, families=figures, spread=0.0, seed=9), 0)
 
 
@@ -130,5 +129,5 @@ def test_taxels_covary_as_their_readings_do(presses):
     # The press is mostly in z, since some are dragged, and of one strength in all of them.
     traces = np.trace(covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, 48, rtol=0.01)
-    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) > 0.45 * traces).all()
+    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) / traces).mean() > 0.6
     np.testing.assert_array_equal(covariances, fit_taxels(presses, windows=400)["covariances"])

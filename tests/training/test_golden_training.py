@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from train.data.paper_taps import paper_taps, windows
 from train.data.press_batches import PosedBatches, PressBatches, read_presses, stated_poses
 from train.data.presses import join_presses
 from train.data.world import World, solve_pad
@@ -27,7 +26,7 @@ WITHIN = 3e-4  # mean difference over the largest value: processors round differ
 
 
 def made():
-    """Two presses of every family on three pads, their readings, two batches of them, and taps of the paper."""
+    """Two presses of every family on three pads, their readings, and three batches of them."""
     presses = join_presses([solve_pad(WORLD, number) for number in range(WORLD.chunks)])
     arrays = {name: getattr(presses, name) for name in ("constants", "counts", "poses", "angle_deg", "force_n")}
     arrays |= {name: getattr(presses, name) for name in ("twist_nmm", "indentation_mm")}
@@ -48,9 +47,6 @@ def made():
         arrays |= {f"{name} window": batch.window.numpy(), f"{name} pad": batch.pad.numpy()}
         if batch.poses is not None:
             arrays[f"{name} poses"] = batch.poses.numpy()
-    sequences = paper_taps("test", ("S",), taps=2)
-    arrays["paper"], truth = windows(sequences, np.arange(4), 2.0, Nuisances(), 9)
-    arrays["paper truth"] = resample(truth, 20, 2)
     begun = solve_pad(BEGUN, 0)
     return arrays | {"begun": begun.counts, "begun constants": begun.constants, "domes": begun.family == "dome"}
 

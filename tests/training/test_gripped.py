@@ -55,7 +55,7 @@ def press(pad, heights_mm, depth_mm=0.2, slide_mm=(0.0, 0.0), twist_rad=0.0, fri
     )
 
 
-def test_under_a_flat_face_pressure_is_even_inside_and_rises_towards_the_edge(pad):
+def test_under_a_flat_face_pressure_rises_towards_the_edge(pad):
     done = press(pad, face(pad))
     inside = done.traction_kpa[0, 2, 2:-2, 2:-2]
     assert np.ptp(inside) < 0.05 * inside.mean()  # measured .04
@@ -80,15 +80,6 @@ def test_traction_adds_up_to_force_and_twist(pad, slide_mm, twist_rad):
     assert np.abs(done.force_n[0, :2]).max() > 0.1 or abs(done.twist_nmm[0]) > 1, "it is dragged"
 
 
-def test_what_is_dragged_holds_with_the_pressure_times_friction_at_most(pad):
-    dragged = press(pad, figure(pad), 0.3, slide_mm=(2.0, 0.0), friction=0.4)
-    assert dragged.force_n[0, 0] == pytest.approx(0.4 * dragged.force_n[0, 2], rel=0.01)
-    assert dragged.force_n[0, 2] == pytest.approx(press(pad, figure(pad), 0.3).force_n[0, 2], rel=1e-5)
-    left = press(pad, figure(pad), 0.3, slide_mm=(-2.0, 0.0), friction=0.4)
-    assert left.force_n[0, 0] == pytest.approx(-dragged.force_n[0, 0], rel=1e-3)
-    assert np.abs(dragged.counts - left.counts).max() > 50, "the readings tell which way"
-
-
 @pytest.mark.parametrize("name", ["C", "O"])
 def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
     pose = Pose(1.0, -0.5, 30.0)
@@ -109,7 +100,7 @@ def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
     assert fine.patterns.shape == tap.unit_patterns.shape and np.array_equal(fine.touching, tap.touching)
 
 
-def test_a_soft_object_presses_less_and_a_cloth_spreads_what_it_carries(pad):
+def test_a_soft_object_presses_less_and_a_cloth_spreads(pad):
     bare = press(pad, figure(pad), 0.3)
     soft, softer = (press(pad, figure(pad), 0.3, cover=Cover(soft_mpa=mpa)) for mpa in (1.0, 0.1))
     assert softer.force_n[0, 2] < 0.6 * soft.force_n[0, 2] < 0.6 * bare.force_n[0, 2]

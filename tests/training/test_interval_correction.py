@@ -62,14 +62,12 @@ def laplace():
     return truth, truth + rng.laplace(0, deviation / math.sqrt(2)), deviation
 
 
-def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_wrong_ones_back():
-    levels = [0.1, 0.5, 0.8, 0.9, 0.99]
+def test_a_factor_makes_intervals_cover_what_they_state():
     truth, pattern, deviation = laplace()
-    assert [interval_coverage(truth, pattern, deviation, one) for one in levels] == pytest.approx(levels, abs=0.005)
-    for level in (0.5, 0.9):
-        factor = calibrate(truth, pattern, 7 * deviation, level)
-        assert factor == pytest.approx(1 / 7, rel=0.02)
-        assert interval_coverage(truth, pattern, factor * 7 * deviation, level) == pytest.approx(level, abs=1e-4)
+    assert interval_coverage(truth, pattern, deviation) == pytest.approx(0.9, abs=0.005)
+    factor = calibrate(truth, pattern, 7 * deviation)
+    assert factor == pytest.approx(1 / 7, rel=0.02)
+    assert interval_coverage(truth, pattern, factor * 7 * deviation) == pytest.approx(0.9, abs=1e-4)
     uniform = np.random.default_rng(1).uniform(-0.03, 0.03, truth.shape)
     factor = calibrate(truth, truth + uniform, deviation)
     covered = interval_coverage(truth, truth + uniform, factor * deviation)
@@ -78,7 +76,7 @@ def test_intervals_of_a_laplace_density_cover_what_they_say_and_a_factor_brings_
         calibrate(truth, pattern, 0 * deviation)
 
 
-def test_the_correction_changes_deviations_alone_and_only_in_use():
+def test_the_correction_changes_deviations_in_use_alone():
     net = make_net()
     before = net(windows())
     corrected(net)
@@ -102,16 +100,6 @@ def test_its_masks_are_the_regions_of_the_runtime():
     assert len(np.unique(region[0])) == len(REGIONS)
 
 
-def test_a_turned_pad_has_turned_deviations():
-    net = make_net(taps=1)
-    corrected(net)
-    window = windows(taps=1)
-    turned = torch.rot90(window, 1, dims=(-2, -1)).clone()
-    turned[:, 0], turned[:, 1] = turned[:, 1].clone(), -turned[:, 0].clone()
-    expected = torch.rot90(net(window)[1], 1, dims=(-2, -1))
-    assert torch.allclose(net(turned)[1], expected, rtol=1e-4)
-
-
 def test_factors_are_bounded_whatever_the_weights():
     net = make_net()
     corrected(net, weights=1e3)
@@ -121,7 +109,7 @@ def test_factors_are_bounded_whatever_the_weights():
         assert torch.isfinite(factor).all() and low * 0.999 < factor.min() and factor.max() < high * 1.001
 
 
-def test_conformal_intervals_hold_in_every_region_for_every_number_of_taps():
+def test_conformal_intervals_hold_in_every_region():
     """Errors are ten times as large at the edge, and twice as large of one tap."""
     net = make_net()
     correction = corrected(net)
@@ -159,8 +147,3 @@ def test_a_fitted_correction_tells_windows_apart():
     plain = run(make_net(taps=1))(readings.with_taps(1), readings.pads)[1]
     held = [np.mean(np.abs(pattern - readings.truth) <= half_width_mm(of)).item() for of in (plain, deviation)]
     assert abs(held[1] - 0.9) < 0.07 < abs(held[0] - 0.9)
-
-
-def test_a_network_without_a_correction_is_refused():
-    with pytest.raises(ValueError, match="no correction of intervals"):
-        conform(make_net(), run(make_net()), readings_of_presses(make_press_set(), 2, times=1))

@@ -11,12 +11,11 @@ import torch
 from edge_samples import ROOT
 
 from train.data.press_batches import Batch
+from train.errors import CheckpointError
 from train.learning.training_loop import (
     DivergedError,
-    NotResumableError,
     Recipe,
     drawn_ahead,
-    gains_by_bf16,
     learning_rate_share,
     train,
 )
@@ -95,9 +94,9 @@ def test_a_run_that_was_killed_goes_on_as_if_it_were_not(tmp_path, killed_at):
 
 
 @pytest.mark.parametrize(("steps", "identity"), [(13, "these data"), (12, "others")])
-def test_a_run_with_another_recipe_or_on_other_data_is_not_gone_on_with(tmp_path, steps, identity):
+def test_a_run_of_another_recipe_is_not_continued(tmp_path, steps, identity):
     trained(tmp_path, identity="these data", keep_every_s=-1.0)
-    with pytest.raises(NotResumableError, match="delete it"):
+    with pytest.raises(CheckpointError, match="delete it"):
         trained(tmp_path, replace(RECIPE, steps=steps), identity=identity)
 
 
@@ -105,11 +104,6 @@ def test_a_run_with_another_recipe_or_on_other_data_is_not_gone_on_with(tmp_path
 def test_recipes_that_cannot_be_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*, expected more than 0"):
         replace(RECIPE, **wrong)
-
-
-def test_bfloat16_is_for_devices_that_have_it(tmp_path):
-    fine, asked = trained(tmp_path), trained(tmp_path / "asked", replace(RECIPE, bf16=True))
-    assert torch.equal(weights(fine), weights(asked)) is not gains_by_bf16(torch.device("cpu"))
 
 
 def test_a_loss_that_is_no_number_ends_the_run_before_its_step(tmp_path):

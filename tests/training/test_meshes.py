@@ -62,12 +62,6 @@ def test_every_format_comes_to_rest_under_the_sensor(tmp_path, name):
     assert mesh.volume == pytest.approx(10 * 8 * 3)
 
 
-@pytest.mark.parametrize(("unit_mm", "scale"), [(25.4, 1 / 25.4), (1000, 1e-3), (0.001, 1e3)])
-def test_a_file_in_another_unit(tmp_path, unit_mm, scale):
-    path = saved(tmp_path, "part.stl", binary_stl(box().triangles * scale))
-    assert load_mesh(path, unit_mm).bounds.ravel() == pytest.approx(AT_REST, rel=1e-5, abs=1e-5)
-
-
 def test_a_file_of_several_bodies_is_one_surface(tmp_path):
     left, right = box(at=(0, 0, 0)), box(at=(30, 0, -1))
     both = obj(left, "o left\n") + b"o right\n"
@@ -82,7 +76,7 @@ def test_a_file_of_several_bodies_is_one_surface(tmp_path):
     assert load_mesh(saved(tmp_path, "touching.stl", binary_stl(along_an_edge))).volume == pytest.approx(2 * 10 * 8 * 3)
 
 
-def test_names_in_an_old_encoding_and_materials_beside_the_file_are_no_fault(tmp_path, caplog):
+def test_old_encodings_and_absent_materials_are_no_fault(tmp_path, caplog):
     for name, content in (
         ("part.stl", ascii_stl(box(), "Prüfkörper")),
         ("part.obj", obj(box(), "o Prüfkörper\nmtllib absent.mtl\nusemtl gold\n")),
@@ -92,7 +86,7 @@ def test_names_in_an_old_encoding_and_materials_beside_the_file_are_no_fault(tmp
     assert not caplog.records
 
 
-def test_what_is_no_file_of_triangles_in_a_known_format_and_unit_is_refused(tmp_path):
+def test_what_is_no_file_of_triangles_is_refused(tmp_path):
     refused(tmp_path / "absent.stl", "cannot be read: No such file")
     (tmp_path / "folder.stl").mkdir()
     refused(tmp_path / "folder.stl", "cannot be read")
@@ -104,16 +98,6 @@ def test_what_is_no_file_of_triangles_in_a_known_format_and_unit_is_refused(tmp_
     cloud = box()
     cloud.update_faces(np.zeros(12, dtype=bool))
     refused(saved(tmp_path, "cloud.ply", ply(trimesh.PointCloud(cloud.vertices))), "8 points but no triangles")
-
-
-@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"A letter to the editor, not a mesh.\n" * 9, bytes(range(256)) * 4, b"v 1 2\nf 1 2"],
-    ids=["zero-byte", "prose", "all bytes", "half a line"],
-)
-def test_garbage_in_any_format(tmp_path, suffix, content):
-    refused(saved(tmp_path, f"garbage{suffix}", content), "no triangles|cut short or broken")
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -139,17 +123,10 @@ def test_bytes_changed_at_random_never_raise_anything_else(tmp_path, name):
             assert mesh.bounds[1, 2] == 0 and np.isfinite(mesh.bounds).all()
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_corners_that_are_no_number(tmp_path, bad):
+def test_corners_that_are_no_numbers_or_not_there(tmp_path):
     corners = box().triangles.copy()
-    corners[3, 1, 2] = bad
+    corners[3, 1, 2] = np.nan
     refused(saved(tmp_path, "nan.stl", binary_stl(corners)), "1 of 12 triangles.*not finite numbers")
-    sick = box()
-    sick.vertices[0, 0] = bad
-    refused(saved(tmp_path, "nan.ply", ply(sick)), "not finite numbers")
-
-
-def test_triangles_that_name_absent_corners(tmp_path):
     for corner in (8, -1):
         sick = box()
         sick.faces[5, 0] = corner
@@ -160,9 +137,6 @@ def test_an_open_box_counts_its_open_edges(tmp_path):
     lidless = box()
     lidless.update_faces(lidless.face_normals[:, 2] < 0.5)
     refused(saved(tmp_path, "open.stl", binary_stl(lidless.triangles)), "open, 4 of its edges.*fill_holes")
-    holed = box()
-    holed.update_faces(np.arange(12) != 4)
-    refused(saved(tmp_path, "holed.ply", ply(holed)), "open, 3 of its edges")
 
 
 def test_a_sheet_is_flat_however_it_stands(tmp_path):
@@ -193,10 +167,3 @@ def test_a_huge_grid_is_refused_for_its_triangles(tmp_path):
     head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     content = head.encode() + np.eye(3, dtype="<f4").tobytes() + faces.tobytes()
     refused(saved(tmp_path, "huge.ply", content), "2000001 triangles; at most 2000000")
-
-
-def test_a_file_too_long_to_read_is_not_read(tmp_path):
-    path = tmp_path / "long.obj"
-    with path.open("wb") as file:
-        file.truncate(400_000_001)  # a hole in the file: takes no room on the disk
-    refused(path, "400 MB; at most 400 MB")

@@ -3,7 +3,7 @@ import torch
 
 from train.data.press_batches import Batch
 from train.networks.blocks import relative_rms_error
-from train.networks.compact import TRACTION_SCALE, CompactNet, HeteroscedasticError, heteroscedastic_loss
+from train.networks.compact import CompactNet, HeteroscedasticError, heteroscedastic_loss
 
 
 @pytest.fixture(scope="module")
@@ -18,15 +18,6 @@ def window(count=3, taps=4, seed=0):
 
 def truth_like(pattern, seed=5):
     return 0.3 * torch.rand(pattern.shape, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize(("taps", "scale"), [(1, 4), (7, 6), (4, 8), (4, 10), (2, 20)])
-def test_shapes_follow_taps_and_scale(taps, scale):
-    small = CompactNet(taps, scale, 16, 1)
-    pattern, deviation, traction = small(window(taps=taps))
-    assert pattern.shape == deviation.shape == (3, 4 * scale, 4 * scale)
-    assert traction.shape == (3, 3, 4 * TRACTION_SCALE, 4 * TRACTION_SCALE)
-    assert (small.taps, small.scale) == (taps, scale)
 
 
 @pytest.mark.parametrize(("taps", "channels", "said"), [(0, 16, "at least 1"), (1, 6, "multiple of the 4 symmetries")])
@@ -45,7 +36,7 @@ def test_absent_taps_are_the_same_as_fewer_taps(net):
 
 
 @pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])
-def test_another_width_or_other_inputs_of_the_pad_are_not_taken_over(other):
+def test_another_width_is_not_taken_over(other):
     start = CompactNet(1, 4, **{"channels": 16, "blocks": 1, **other})
     with pytest.raises(ValueError, match="its width and inputs of the pad are"):
         CompactNet(2, 4, 16, 1).take_over(start)
@@ -55,15 +46,6 @@ def test_patterns_are_cut_at_zero_in_use_alone(net):
     assert net(window())[0].min() == 0
     assert net.train()(window())[0].min() < 0
     net.eval()
-
-
-@pytest.mark.parametrize("factor", [0.0, 1e-40, 1e-6, 1e3, 1e6])
-def test_extreme_windows_give_finite_patterns_and_deviations_above_zero(net, factor):
-    pattern, deviation, traction = net(factor * window())
-    assert torch.isfinite(pattern).all()
-    assert torch.isfinite(deviation).all()
-    assert torch.isfinite(traction).all()
-    assert (deviation > 0).all()
 
 
 def test_the_pattern_learns_as_if_there_were_no_deviation():
@@ -83,15 +65,7 @@ def test_the_pattern_learns_as_if_there_were_no_deviation():
             assert torch.equal(both, one)
 
 
-def test_light_contacts_count_as_much_as_firm_ones():
-    truth = truth_like(torch.zeros(4, 6, 6))
-    pattern, deviation = truth + 0.01, torch.full_like(truth, 0.02)
-    firm = heteroscedastic_loss(pattern, deviation, truth)
-    light = heteroscedastic_loss(0.05 * pattern, 0.05 * deviation, 0.05 * truth)
-    assert float(firm) == pytest.approx(float(light), rel=1e-5)
-
-
-def test_what_is_known_of_the_pad_changes_the_outputs_and_nothing_known_is_zeros():
+def test_what_is_known_of_the_pad_changes_the_outputs():
     torch.manual_seed(0)
     net = CompactNet(1, 4, channels=16, blocks=1, known=3).eval()
     unknown, zeros = net(window(taps=1)), net(window(taps=1), torch.zeros(3, 3))
@@ -99,7 +73,7 @@ def test_what_is_known_of_the_pad_changes_the_outputs_and_nothing_known_is_zeros
     assert not torch.allclose(unknown[0], net(window(taps=1), torch.ones(3, 3))[0])
 
 
-def test_traction_is_learned_where_it_is_known_and_light_pulls_count_as_firm_ones():
+def test_light_pulls_count_as_much_as_firm_ones():
     torch.manual_seed(0)
     net = CompactNet(1, 4, channels=16, blocks=1)
     pattern, _, traction = net(window(taps=1))

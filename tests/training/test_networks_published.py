@@ -3,10 +3,9 @@ import copy
 import pytest
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from train.data.press_batches import Batch
-from train.experiments.workbench import macs
-from train.networks.blocks import relative_error
 from train.networks.published import SrganObjective
 from train.networks.registry import build, grown
 from train.networks.symmetric import write_out
@@ -32,21 +31,9 @@ def test_parameters_and_macs_are_the_published_ones(name):
     net = build(name, 10)
     digits = 2 if name.startswith("sr") else 3
     assert round(sum(one.numel() for one in net.parameters()) / 1e6, digits) == millions
-    assert macs(net) / 1e9 == pytest.approx(giga_macs, abs=0.007)
-
-
-@pytest.mark.parametrize("name", ["mtsr2", "srcnn", "compact-stsr"])
-def test_every_network_learns_in_low_precision(name):
-    torch.manual_seed(2)
-    net = build(name, 2).train()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        output = net(window(net.taps, 3))
-        patterns = output[0] if isinstance(output, tuple) else output
-        assert patterns.dtype == torch.float32
-        (patterns - 0.1).abs().mean().backward()
-    # The deviation of a compact network teaches nothing else, and neither it nor the traction was asked for.
-    gradients = [value.grad for key, value in net.named_parameters() if not key.startswith(("uncertainty", "traction"))]
-    assert all(gradient is not None and torch.isfinite(gradient).all() for gradient in gradients)
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        net.eval()(window(net.taps, 1))
+    assert counter.get_total_flops() / 2e9 == pytest.approx(giga_macs, abs=0.007)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +65,7 @@ def test_a_network_grown_from_another_computes_the_same(start, name, scale):
     assert next(old.parameters()).abs().max() > 0
 
 
-def test_at_another_scale_a_compact_network_keeps_all_but_what_makes_pixels():
+def test_at_another_scale_a_compact_network_keeps_its_trunk():
     torch.manual_seed(6)
     old = build("compact-mtsr2", 4, channels=16, blocks=1)
     net = grown(old, "compact-mtsr2", 10, channels=16, blocks=1)
@@ -126,16 +113,6 @@ def test_the_penalty_is_that_of_a_linear_critic():
     false, true = patterns(seed=1), patterns(seed=2)
     expected = 0.5 * (false - true).sum(dim=(1, 2)).mean() + 10 * (4.0 - 1) ** 2
     assert torch.allclose(objective.critic_loss(false, true), expected, rtol=1e-4)
-
-
-def test_the_loss_is_the_error_less_a_share_of_the_critics_view():
-    truth, window, net = patterns(), torch.zeros(6, 3, 4, 4), Plain()
-    plain = SrganObjective(share=0.0).loss(net, Batch(window, truth))
-    assert torch.allclose(plain, relative_error(net(window), truth))
-    objective = SrganObjective(share=0.5)
-    size = truth.square().mean(dim=(1, 2), keepdim=True).sqrt()
-    expected = plain - 0.5 * objective.critic(net(window) / size).mean()
-    assert torch.allclose(objective.loss(net, Batch(window, truth)), expected)
 
 
 def test_network_and_critic_keep_out_of_each_others_weights():

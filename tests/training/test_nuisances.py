@@ -58,11 +58,8 @@ def test_the_seed_alone_decides():
     def read(seed):
         return apply_nuisances(presses(), STRONG, seed)
 
-    assert np.array_equal(read(4), read(np.random.SeedSequence(4)))
-    assert (read(4) != read(5)).any()
-    first, second = np.random.SeedSequence(4).spawn(2)
-    assert (read(first) != read(second)).any()
-    assert (read(first) != read(4)).any()
+    assert np.array_equal(read(4), read(4))
+    assert (read(4) != read(5)).any() and (read(4) != read([4, 1])).any()
 
 
 def test_all_off_only_rounds_and_leaves_its_input_alone():
@@ -95,11 +92,7 @@ def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
     rng = np.random.default_rng(0)
     frames, step_s, share = 16, 0.07, 0.3
     press = rng.normal(size=(frames, 5))
-    moments = np.array([0.0, 0.25, 1.0, 1.5, 7.0, 15.9, 16.0])
-    weights = frame_weights(
-        moments[None, None], frames, np.array([[step_s]]), np.array([share]), np.array([relaxation])
-    )
-    times = np.union1d(np.arange(frames + 1.0), moments)
-    course = np.stack([np.interp(times, np.arange(frames + 1), np.concatenate([[0], p])) for p in press.T], axis=1)
-    stepped = maxwell(course, times * step_s, share, relaxation)
-    assert np.allclose(weights[0, 0] @ press, stepped[np.searchsorted(times, moments)], atol=1e-5)
+    weights = frame_weights(frames, np.array([[step_s]]), np.array([share]), np.array([relaxation]))
+    course = np.concatenate([np.zeros((1, 5)), press])
+    stepped = maxwell(course, np.arange(frames + 1) * step_s, share, relaxation)
+    assert np.allclose(weights[0, 0] @ press, stepped[1:], atol=1e-5)

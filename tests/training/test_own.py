@@ -71,14 +71,6 @@ def test_its_network_is_told_of_it_in_most_windows():
     assert relative.std() == pytest.approx(0.2 * 0.075, rel=0.1)
 
 
-def test_what_its_model_is_made_for_is_what_is_known():
-    made_for = knowledge_of(FILE, "4").sensor().made_for
-    assert set(made_for) == {"thickness_mm", "shear_modulus_mpa", "counts_per_newton", "gains_certainty"}
-    contract = make_contract(made_for={name: [*ends] for name, ends in made_for.items()})
-    same = Pad(thickness_mm=5.05, shear_modulus_mpa=0.12, counts_per_newton=1100, gains=(1.0,) * GAINS)
-    assert not contract.is_outside(same)
-
-
 def test_what_is_worse_is_not_handed_over(tmp_path):
     """In place of an own model: a tiny one that knows nothing, and then the bundled one against itself."""
     sets = {name: solve_pad(World(count=12, per_pad=12, seed=seed), 0) for seed, name in enumerate(("figures", UNLIKE))}
@@ -101,15 +93,21 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     assert objection is not None and UNLIKE not in objection, "no worse there"
 
 
-def test_bad_input_is_one_line(tmp_path, capsys):
-    assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "mine")]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
-    save_sensor_file(tmp_path / "s.toml", SensorFile(sensors={"4": SensorEntry()}))
-    assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine")]) == 1
-    assert capsys.readouterr().err.startswith("train.own: nothing is known of this sensor, ")
-    save_sensor_file(tmp_path / "s.toml", FILE)
-    assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--mesh", str(tmp_path / "none.stl")]) == 1
-    assert capsys.readouterr().err.startswith("train.own: ")
+@pytest.mark.parametrize(
+    ("held", "options", "told"),
+    [
+        (None, [], "sensor.toml"),
+        (SensorFile(sensors={"4": SensorEntry()}), [], "nothing is known of this sensor, "),
+        (FILE, ["--mesh", "none.stl"], "none.stl: cannot be read"),
+        (FILE, ["--recordings", "."], "no recordings of real sensors"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, monkeypatch, held, options, told):
+    monkeypatch.chdir(tmp_path)
+    if held is not None:
+        save_sensor_file(tmp_path / "sensor.toml", held)
+    with pytest.raises(SystemExit, match=rf"^train\.own: [^\n]*{told}[^\n]*$"):
+        main(["sensor.toml", "--out", "mine", *options])
 
 
 @pytest.mark.night
@@ -118,7 +116,8 @@ def test_from_a_sensor_file_to_a_model(tmp_path, capsys, limits):
     limits(own, TRIED=48, COMPARED=24)
     save_sensor_file(tmp_path / "s.toml", FILE)
     for _ in range(2):
-        assert main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01"]) == 1
+        with pytest.raises(SystemExit, match=r"^1$"):
+            main([str(tmp_path / "s.toml"), "--out", str(tmp_path / "mine"), "--minutes", "0.01"])
         assert "not handed over: " in capsys.readouterr().out
     assert not (tmp_path / "mine/mine.onnx").exists()
     contract = ModelSession(tmp_path / "mine/work/mine-int8.onnx").contract

@@ -10,9 +10,9 @@ from edge import api
 from export.to_onnx import export
 from firmware_bridge.pad_geometry import USPA44, USPA46
 from train.data.frozen_presses import freeze_presses
-from train.data.paper_taps import tap
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
+from train.families.catalogue import tap
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet
@@ -28,7 +28,7 @@ TRAINING = Training("pad46", "compact-stsr", Recipe(steps=30, batch=12, learning
 WORLD = World(count=24, per_pad=24, families={"large square": 1.0, "C": 1.0}, spread=0.0, scale=SCALE, pad="uSPa46")
 
 
-def test_a_network_of_another_pad_learns_and_is_refused_by_the_usual_one(tmp_path):
+def test_a_network_of_another_pad_learns_and_is_refused_here(tmp_path):
     presses = solve_pad(WORLD, 0)
     seen = freeze_presses(presses, 1).as_frozen_set()
     begun = replace(TRAINING, name="begun", recipe=replace(TRAINING.recipe, steps=6))
@@ -44,7 +44,7 @@ def test_a_network_of_another_pad_learns_and_is_refused_by_the_usual_one(tmp_pat
     assert "uSPa46 of 4 x 6 taxels, the sensor is a uSPa44 of 4 x 4" in str(refused.value)
 
 
-def test_nothing_touches_beyond_the_pad_and_a_half_turn_is_a_half_turn():
+def test_nothing_touches_beyond_a_rectangular_pad():
     pad = GrippedPad(replace(NOMINAL, model="uSPa46"))
     poses = (Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 180.0))
     taps = tap(pad, ["large square"] * 2, poses, 2.0)
@@ -57,7 +57,7 @@ def test_nothing_touches_beyond_the_pad_and_a_half_turn_is_a_half_turn():
     assert on_pad(USPA44, 42, 0.47).all()
 
 
-def test_a_network_with_half_turns_keeps_them_on_a_pad_that_is_not_square():
+def test_a_network_keeps_half_turns_on_a_rectangular_pad():
     torch.manual_seed(0)
     net = CompactNet(1, SCALE, channels=16, blocks=1, group="p2").eval()
     window = torch.randn(3, 3, 4, 6)

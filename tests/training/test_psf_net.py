@@ -39,19 +39,7 @@ def test_degradation_is_equations_7_and_8():
     assert np.allclose(degrade(pattern, torch.tensor(gamma).double())[0], expected, rtol=1e-6)
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("value", [1e-3, 1.0, 1e3])
-def test_extreme_numbers_stay_finite_with_their_gradients(value):
-    depth = torch.cat([rectangles(1), torch.zeros(1, 40, 40), torch.ones(1, 40, 40)])
-    given = [torch.full(shape, value, requires_grad=True) for shape in ((3,), (3,), ())]
-    alpha, beta, gamma = given
-    reading = degrade(tpsf(depth, alpha, beta, PIXEL_MM), gamma)
-    reading.sum().backward()
-    assert torch.isfinite(reading).all() and (reading >= 0).all() and not reading[1].any() and (reading[2] > 0).all()
-    assert all(torch.isfinite(one.grad).all() for one in given)
-
-
-def test_training_finds_the_patterns_of_a_sensor_that_is_the_model():
+def test_training_finds_patterns_of_a_sensor_like_the_model():
     counts, depth, press = synthetic(192)
     net, again = PsfNet(), PsfNet()
     losses = fit_psf_net(net, counts, depth, press, epochs=60)

@@ -7,8 +7,6 @@ import pytest
 from press_samples import make_press_set
 
 from train.data.presses import PressSet, load_presses
-from train.data.world import World
-from train.errors import DatasetError
 from train.surfaces.poses import (
     HALF_PITCH_MM,
     HELD_OUT_RADIUS_MM,
@@ -24,7 +22,7 @@ from train.surfaces.poses import (
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
-def test_every_schedule_begins_at_the_newest_tap_and_stays_within_reach(name):
+def test_every_schedule_stays_within_reach(name):
     for seed in range(30):
         poses = SCHEDULES[name](np.random.default_rng(seed), MAX_TAPS)
         assert poses.shape == (MAX_TAPS, 3) and not poses[0].any()
@@ -40,24 +38,14 @@ def test_half_pitch_taps_make_the_grid_twice_as_fine_first():
         assert four == {(0, 0), (1, 0), (0, 1), (1, 1)}
 
 
-def test_turns_are_the_papers_and_near_poses_are_within_their_bounds():
+def test_turns_are_the_papers_and_near_poses_are_near():
     assert np.allclose(SCHEDULES["turns"](np.random.default_rng(0), 3), [[0, 0, 0], [0, 0, 5], [0, 0, 10]])
     poses = np.concatenate([SCHEDULES["near"](np.random.default_rng(seed), MAX_TAPS) for seed in range(40)])
     assert 0.9 * NEAR_MM < np.hypot(*poses[:, :2].T).max() <= NEAR_MM
     assert 0.9 * NEAR_DEG < np.abs(poses[:, 2]).max() <= NEAR_DEG
 
 
-def test_a_slide_goes_one_way_in_even_steps():
-    steps = np.diff(SCHEDULES["slide"](np.random.default_rng(3), 5), axis=0)
-    assert np.allclose(steps, steps[0]) and np.hypot(*steps[0, :2]) > 0.1
-
-
-def test_an_unknown_schedule_is_refused():
-    with pytest.raises(DatasetError, match="no schedule 'spiral': expected one of turns, half-pitch"):
-        World(schedule="spiral")
-
-
-def test_a_file_of_version_2_has_the_poses_of_its_turns_and_its_hash(tmp_path):
+def test_a_file_of_version_2_has_the_poses_of_its_turns(tmp_path):
     made = make_press_set(taps=3)
     made.save(tmp_path / "new.npz")
     with np.load(tmp_path / "new.npz") as new:
@@ -70,13 +58,10 @@ def test_a_file_of_version_2_has_the_poses_of_its_turns_and_its_hash(tmp_path):
     assert shifted.sha256() != made.sha256() != replace(shifted, poses=2 * shifted.poses).sha256()
 
 
-def test_random_poses_are_seeded_wide_and_away_from_the_held_out_positions():
-    drawn = random_poses(np.random.default_rng(1), 3000)
-    x_mm, y_mm, angle_deg = np.array([(p.x_mm, p.y_mm, p.angle_deg) for p in drawn]).T
+def test_random_poses_keep_away_from_held_out_positions():
+    drawn = np.array(random_poses(np.random.default_rng(1), 3000))
     for place_mm in PLACES_MM.values():
-        distance_mm = np.hypot(x_mm - place_mm[0], y_mm - place_mm[1])
+        distance_mm = np.hypot(*(drawn[:, :2] - place_mm).T)
         assert HELD_OUT_RADIUS_MM < distance_mm.min() < HELD_OUT_RADIUS_MM + 0.1
-    for along in (x_mm, y_mm):
-        assert 0.97 * SURFACE_REACH_MM < np.abs(along).max() <= SURFACE_REACH_MM
-    assert np.allclose(np.histogram(angle_deg, 12, (0, 360))[0], 250, atol=70)
-    assert random_poses(np.random.default_rng(1), 3000) == drawn != random_poses(np.random.default_rng(2), 3000)
+    assert (np.abs(drawn[:, :2]).max(axis=0) > 0.97 * SURFACE_REACH_MM).all() and np.ptp(drawn[:, 2]) > 350
+    assert np.abs(drawn[:, :2]).max() <= SURFACE_REACH_MM

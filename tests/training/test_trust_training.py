@@ -46,71 +46,60 @@ def path(presses, tmp_path_factory) -> Path:
     return folder / "trust.json"
 
 
-class TestForward:
-    def test_a_linear_world_is_found_again(self, presses):
-        """Readings that are a linear map of pattern and drag leave nothing."""
-        rng = np.random.default_rng(0)
-        many = make_press_set(count=600, taps=1)
-        patterns = rng.uniform(0, 0.5, (600, 8, 8)).repeat(5, axis=1).repeat(5, axis=2)
-        drag = rng.normal(0, 20, (600, 3, 4, 4)).repeat(2, axis=2).repeat(2, axis=3)
-        many = replace(many, patterns=patterns.astype(np.float16), traction_kpa=drag.astype(np.float16))
-        cells = np.concatenate(
-            [many.patterns[:, ::5, ::5].reshape(600, -1), many.traction_kpa[:, :2, ::2, ::2].reshape(600, -1) / 30],
-            axis=1,
-        )
-        counts = (cells.astype(np.float32) @ rng.normal(0, 200, (cells.shape[1], 48))).reshape(600, 1, 3, 4, 4)
-        found = fit_forward_model(replace(many, counts=counts.astype(np.float32)))
-        assert found.model_error.max() < 0.05
-        assert found.operator.shape == (1 + len(INPUTS), 48, 96)
-
-
-class TestFile:
-    def test_it_comes_back(self, path, presses, tmp_path):
-        fitted = json.loads(path.read_text())
-        assert set(fitted) == {"forward", "contact", "tap", "data_sha256"}
-        assert fitted["data_sha256"] == presses.sha256()
-        loaded = load_trust(path, presses)
-        assert loaded.contact.network.to_json() == fitted["contact"] and loaded.forward.to_json() == fitted["forward"]
-        model = write_model(
-            tmp_path / "checks.onnx", make_trusted_contract(trust=loaded.to_json(), pad_inputs=tuple(input_scale()))
-        )
-        assert load_trust(model).to_json() == loaded.to_json()
-        with pytest.raises(CheckpointError, match="its limits are set by presses: give --validation"):
-            load_trust(path)
-        assert fit_trust(presses, 1, *STEPS) == fitted
-
-    @pytest.mark.parametrize(
-        "damage",
-        [
-            lambda one: json.dumps({**one, "contact": []}),
-            lambda one: json.dumps({name: value for name, value in one.items() if name != "tap"}),
-            lambda one: "{",
-            lambda one: None,
-        ],
+def test_a_linear_world_is_found_again(presses):
+    """Readings that are a linear map of pattern and drag leave nothing."""
+    rng = np.random.default_rng(0)
+    many = make_press_set(count=600, taps=1)
+    patterns = rng.uniform(0, 0.5, (600, 8, 8)).repeat(5, axis=1).repeat(5, axis=2)
+    drag = rng.normal(0, 20, (600, 3, 4, 4)).repeat(2, axis=2).repeat(2, axis=3)
+    many = replace(many, patterns=patterns.astype(np.float16), traction_kpa=drag.astype(np.float16))
+    cells = np.concatenate(
+        [many.patterns[:, ::5, ::5].reshape(600, -1), many.traction_kpa[:, :2, ::2, ::2].reshape(600, -1) / 30],
+        axis=1,
     )
-    def test_none_and_a_damaged_one_are_named(self, path, presses, tmp_path, damage):
-        if (content := damage(json.loads(path.read_text()))) is not None:
-            (tmp_path / "bad.json").write_text(content)
-        with pytest.raises(CheckpointError, match=r"bad\.json: .*make it with 'python -m train.trust"):
-            load_trust(tmp_path / "bad.json", presses)
-
-    def test_what_cannot_be_fitted_ends_in_a_line(self, tmp_path):
-        make_press_set(taps=1).save(tmp_path / "one.npz")
-        for name, told in (("none.npz", r"none\.npz"), ("one.npz", "no sequences of several taps")):
-            with pytest.raises(SystemExit, match=rf"trust: .*{told}"):
-                trust.main([str(tmp_path / "trust.json"), "--data", str(tmp_path / name)])
-        assert not (tmp_path / "trust.json").exists()
+    counts = (cells.astype(np.float32) @ rng.normal(0, 200, (cells.shape[1], 48))).reshape(600, 1, 3, 4, 4)
+    found = fit_forward_model(replace(many, counts=counts.astype(np.float32)))
+    assert found.model_error.max() < 0.05
+    assert found.operator.shape == (1 + len(INPUTS), 48, 96)
 
 
-class TestLimits:
-    def test_contacts_exceed_theirs_by_the_share(self, path, presses):
-        share = 0.2
-        network = small_network(json.loads(path.read_text())["contact"])
-        check = contact_check(network, presses, share, seed=5)
-        counts, pads = drawn_readings(presses, 5)
-        met = in_contact(counts)
-        scores = np.array(network(features_of(counts[met], pads[met])))
-        assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share
+def test_it_comes_back(path, presses, tmp_path):
+    fitted = json.loads(path.read_text())
+    assert set(fitted) == {"forward", "contact", "tap", "data_sha256"}
+    assert fitted["data_sha256"] == presses.sha256()
+    loaded = load_trust(path, presses)
+    assert loaded.contact.network.to_json() == fitted["contact"] and loaded.forward.to_json() == fitted["forward"]
+    model = write_model(
+        tmp_path / "checks.onnx", make_trusted_contract(trust=loaded.to_json(), pad_inputs=tuple(input_scale()))
+    )
+    assert load_trust(model).to_json() == loaded.to_json()
+    with pytest.raises(CheckpointError, match="its limits are set by presses: give --validation"):
+        load_trust(path)
+    assert fit_trust(presses, 1, *STEPS) == fitted
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda one: json.dumps({**one, "contact": []}),
+        lambda one: json.dumps({name: value for name, value in one.items() if name != "tap"}),
+        lambda one: "{",
+        lambda one: None,
+    ],
+)
+def test_none_and_a_damaged_one_are_named(path, presses, tmp_path, damage):
+    if (content := damage(json.loads(path.read_text()))) is not None:
+        (tmp_path / "bad.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"bad\.json: .*make it with 'python -m train.trust"):
+        load_trust(tmp_path / "bad.json", presses)
+
+
+def test_what_cannot_be_fitted_ends_in_a_line(tmp_path):
+    make_press_set(taps=1).save(tmp_path / "one.npz")
+    for name, told in (("none.npz", r"none\.npz"), ("one.npz", "no sequences of several taps")):
+        with pytest.raises(SystemExit, match=rf"trust: .*{told}"):
+            trust.main([str(tmp_path / "trust.json"), "--data", str(tmp_path / name)])
+    assert not (tmp_path / "trust.json").exists()
 
 
 TAPS = 4
@@ -169,3 +158,12 @@ def test_right_taps_are_seldom_dropped_and_wrong_ones_mostly(network):
     assert shares_caught(network, presses, off_by(5.0, 0.0)) > 0.5
     foreign = shares_caught(network, presses, lambda pair, stated: (np.stack([pair[:, 0], pair[::-1, 1]], 1), stated))
     assert foreign > 0.5
+
+
+def test_contacts_exceed_their_limit_by_the_share(path, presses):
+    share, network = 0.2, small_network(json.loads(path.read_text())["contact"])
+    check = contact_check(network, presses, share, seed=5)
+    counts, pads = drawn_readings(presses, 5)
+    met = in_contact(counts)
+    scores = np.array(network(features_of(counts[met], pads[met])))
+    assert len(scores) > 10 and share - 2 / len(scores) <= (scores > check.limit).mean() <= share

@@ -16,7 +16,7 @@ from edge.evaluation.test_set import FrozenSet
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.press_batches import read_presses
 from train.data.presses import SEED, PressSet, load_presses
-from train.errors import TrainError
+from train.errors import ended_by_errors
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.physics.pad_draws import input_scale, known_numbers
 from train.physics.sensor_noise import NAMES, Nuisances
@@ -118,11 +118,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="file of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     options = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("frozen_presses"):
         frozen = freeze_presses(load_presses(options.presses), SEED)
         frozen.presses.save(options.out, compressed=True)
-    except TrainError as error:
-        sys.exit(f"frozen_presses: {error}")
     sys.stdout.write(f"{options.out}: {len(frozen)} sequences, sha256 {frozen.presses.sha256()}\n")
 
 

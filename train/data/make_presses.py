@@ -26,7 +26,7 @@ from edge.terminal.progress_bar import progress
 from firmware_bridge.pad_geometry import PADS, USPA44
 from train.data.presses import PressSet, join_presses, load_presses
 from train.data.world import LEAST_FORCE_N, World, solve_pad
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, ended_by_errors
 from train.families.catalogue import SHARES
 from train.surfaces.meshes import MESH, mesh_name, size_of
 from train.surfaces.poses import SCHEDULES
@@ -97,12 +97,12 @@ def _begin_quietly() -> None:
     warnings.filterwarnings("ignore", category=RuntimeWarning, module="shapely")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when done, 1 on an error of the user, 130 when interrupted."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     options = _parser().parse_args(arguments)
     os.environ["PYTHONWARNINGS"] = "ignore:resource_tracker:UserWarning"
     started_s = time.monotonic()
-    try:
+    with ended_by_errors("train.data.make_presses"):
         world = _world(options)
         for name in world.families:
             if name.startswith(MESH):
@@ -110,18 +110,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # before the simulation, which takes long
         with quiet_workers() if world.chunks > 1 else nullcontext():
             made = make_presses(world, options.out)
-    except TrainError as error:
-        sys.stderr.write(f"train.data.make_presses: {error}\n")
-        return 1
-    except KeyboardInterrupt:
-        sys.stderr.write("train.data.make_presses: interrupted; the same command continues\n")
-        return 130
     rate = len(made) * made.taps / (time.monotonic() - started_s)
     sys.stdout.write(f"{options.out}: {len(made)} sequences, {rate:.0f} presses/s, sha256 {made.sha256()}\n")
     if len(made) < world.count:
         why = f"lighter than {LEAST_FORCE_N} N, or off the pattern"
         sys.stdout.write(f"{world.count - len(made)} of {world.count} presses left out: {why}\n")
-    return 0
 
 
 def _world(options: argparse.Namespace) -> World:
@@ -161,4 +154,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

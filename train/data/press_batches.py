@@ -16,7 +16,7 @@ from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.data.presses import PressSet
 from train.errors import DatasetError
 from train.physics.pad_draws import known_numbers
-from train.physics.sensor_noise import Nuisances, log_uniform, read_windows
+from train.physics.sensor_noise import Nuisances, apply_nuisances, log_uniform
 
 COUNTS_PER_UNIT: Final = (500.0, 500.0, 1000.0)  # counts of x, y, z that make one unit of network input
 _MIRRORED = torch.tensor([-1.0, 1.0, -1.0, 1.0, 1.0])  # signs of a pose's x, y, turn and errors in a mirror image
@@ -209,7 +209,7 @@ def _rows_of_batch(number: int, rows: NDArray[np.int64], count: int, seed: list[
 
 def read_presses(presses: PressSet, nuisances: Nuisances, seed: int) -> NDArray[np.float32]:
     """Return windows (n, K, 3, rows, cols) in whole zeroed counts at the ends of presses; absent taps stay 0."""
-    readings = read_windows(presses.counts[:, :, None], 1.0, nuisances, seed, angle_deg=presses.angle_deg)
+    readings = apply_nuisances(presses.counts[:, :, None], nuisances, seed, angle_deg=presses.angle_deg)[:, :, 0]
     absent = ~presses.counts.any(axis=(2, 3, 4))
     readings[absent] = 0
     return readings

@@ -52,7 +52,7 @@ class Found(NamedTuple):
 
 
 def families(bench: Workbench, report: Report) -> None:
-    """Evaluate all methods on the wide test set."""
+    """Evaluate the shipped model and its intervals on every family, next to baselines."""
     wide = bench.wide_test()
     model = bench.model()
     fitted = fitted_methods(bench.use(BUNDLE_DIR / "classical.npz"), SCALE)
@@ -186,7 +186,7 @@ NONE_OFF: Final = OffPad("thickness_mm", 0)
 
 
 def pads(bench: Workbench, report: Report) -> None:
-    """Make the presses, and evaluate the model on them."""
+    """Evaluate the shipped model on pads that are off the nominal one."""
     percent, count = (PERCENT[-1:], 4) if bench.quick else (PERCENT, 40)
     names = CONSTANTS[:2] if bench.quick else CONSTANTS
     off = [OffPad(name, sign * part) for name in names for part in percent for sign in (-1, 1)]

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from firmware_bridge.pad_geometry import USPA44
-from train.data.paper_taps import tap
 from train.experiments.workbench import Workbench
+from train.families.catalogue import tap
 from train.networks.tactile_psf import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.gripped import FINE_SCALE, FRAMES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL
@@ -30,7 +30,7 @@ _BINS: Final = 8
 
 
 def fig5(bench: Workbench, report: Report) -> None:
-    """Tap, train, and compare alpha and beta with the force."""
+    """Compare alpha and beta of the tactile PSF with the force: the paper's Fig. 5."""
     poses, epochs = (6, 5) if bench.quick else (60, 120)
     names, pad = [*SURFACES] * poses, GrippedPad(NOMINAL)
     places = random_poses(np.random.default_rng(5), len(names))

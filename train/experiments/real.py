@@ -35,7 +35,8 @@ from train.data.real_grips import (
 )
 from train.data.world import World, solve_pad
 from train.experiments.workbench import Workbench
-from train.freeze import SCALE, drawn
+from train.freeze import drawn
+from train.physics.gripped import SCALE
 from train.report import Report, Row, bootstrap_interval
 
 _TAXELS: Final = USPA44.taxel_count

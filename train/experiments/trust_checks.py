@@ -35,7 +35,7 @@ _MODELS: Final = ("stsr", "mtsr", "stsr-small")
 
 
 def trust_checks(bench: Workbench, report: Report) -> None:
-    """Judge the verdicts on right and wrong patterns; CheckpointError if a shipped model has no checks."""
+    """Count patterns not believed and taps dropped, rightly and wrongly; CheckpointError if a model has no checks."""
     model = bench.model()
     models = [bench.model(f"{name}{INT8_SUFFIX}") for name in (_MODELS[:2] if bench.quick else _MODELS)]
     for one in models:

@@ -1,6 +1,6 @@
 """All families of shapes by name, their frequencies, and the drawing of one shape under the pad."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from train.errors import MeshError, SurfaceError
 from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
 from train.physics.contact import BARE, Cover
-from train.physics.gripped import SAMPLES, GrippedPad
+from train.physics.gripped import SAMPLES, GrippedPad, Taps
 from train.surfaces.depth_image import Pose, depth_image
 from train.surfaces.meshes import MESH
 from train.surfaces.named_surfaces import SURFACES, relief
@@ -155,3 +155,9 @@ def _draw_figure(rng: np.random.Generator, family: str, pad: GrippedPad, poses: 
 def heights_of(surface: str, pose: Pose, pad: GrippedPad) -> NDArray[np.float32]:
     """Return the heights (m, m) of a surface at the places of a pad at a pose over it."""
     return -depth_image(relief(surface), pose, pad.size * SAMPLES, pad.cell_mm / SAMPLES)
+
+
+def tap(pad: GrippedPad, surfaces: Sequence[str], poses: Sequence[Pose], force_n: float) -> Taps:
+    """Return whole taps of flat surfaces, each from a pose over it."""
+    heights_mm = [heights_of(surface, pose, pad) for surface, pose in zip(surfaces, poses, strict=True)]
+    return pad.tap(np.stack(heights_mm), force_n)

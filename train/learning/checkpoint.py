@@ -65,9 +65,9 @@ class Training:
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep < 1:
-            raise ValueError(f"keep is {self.keep}, expected a share from 0 to below 1")
+            raise CheckpointError(f"keep is {self.keep}, expected a share from 0 to below 1")
         if self.keep and self.start is None:
-            raise ValueError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
+            raise CheckpointError(f"keep is {self.keep}, but there are no weights to start from: give --start-from")
 
     def sha256(self, data_sha256: str) -> str:
         """Return the hash of the configuration and the data, as written in the models' contract."""
@@ -185,10 +185,9 @@ def load_network(path: Path) -> tuple[PatternNet, dict[str, Any]]:
         net = build(report["network"], report["scale"], **report["options"])
         net.load_state_dict(torch.load(path, weights_only=True))
     except DAMAGES as error:
-        said = reason(error)
-        if path.suffix == _GRAPH:
-            raise CheckpointError(f"{path} is no model to start from: {said}") from error
-        raise CheckpointError(f"{path} and {path.stem}.json are not a checkpoint of train.fit: {said}") from error
+        graph = path.suffix == _GRAPH
+        what = "no model to start from" if graph else f"no checkpoint of train.fit with {path.stem}.json"
+        raise CheckpointError(f"{path} is {what}: {reason(error)}") from error
     return net.eval(), report
 
 

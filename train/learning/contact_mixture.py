@@ -24,10 +24,10 @@ from firmware_bridge.scans.pad_constants import LEVEL_90
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.presses import PressSet, load_presses
 from train.data.world import World
-from train.errors import DatasetError, TrainError
+from train.errors import DatasetError, ended_by_errors
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import RANGES, Pad, draw_pad
-from train.physics.sensor_noise import Nuisances, neighbours, read_windows
+from train.physics.sensor_noise import Nuisances, apply_nuisances, neighbours
 
 CALIBRATION: Final = World(count=4800, per_pad=200, seed=9014)
 """Sensors by which bias and intervals of learned gains are set."""
@@ -109,7 +109,7 @@ def even_contacts(presses: PressSet, seed: int) -> tuple[NDArray[np.float64], ND
     shown = Nuisances().cross_talk * cross[:, None, None]
     flat = flat + shown * (flat @ neighbours(USPA44.rows, USPA44.cols))
     clean = flat.reshape(len(flat), 1, 1, *USPA44.scan_shape).astype(np.float32)
-    read = read_windows(clean, 1.0, nuisances, seed).reshape(flat.shape).astype(np.float64)
+    read = apply_nuisances(clean, nuisances, seed).reshape(flat.shape).astype(np.float64)
     # Joined sets number their pads with gaps, in the order in which they were drawn.
     numbers, of_pad = np.unique(presses.pad, return_inverse=True)
     pads = [draw_pad(np.random.default_rng([presses.config["seed"], number])) for number in range(len(numbers))]
@@ -155,7 +155,7 @@ def sensors_of(presses: PressSet, world: World) -> list[Sensor]:
         true = np.log(chips) + np.log(_even_z(GrippedPad(pad)) / _even_z(GrippedPad(replace(pad, seed=None))))
         true -= true[AXES.index("z")].mean()
         clean = presses.pick(presses.pad == pad_number).counts[:, 0] * chips.astype(np.float32)
-        contacts = read_windows(clean[None, :, None], 1.0, read_by, [world.seed, number])[0]
+        contacts = apply_nuisances(clean[None, :, None], read_by, [world.seed, number])[0, :, 0]
         found.append((contacts, true.ravel(), scaled_constants(pad)))
     return found
 
@@ -253,24 +253,20 @@ def _given_constants(
     return softmax(np.stack(log_densities, axis=1) + np.log(mixture.share), axis=1)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 when done, 1 on an error of the user."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m train.learning.contact_mixture", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("presses", type=Path, metavar="PRESSES.npz", help="of train.data.make_presses")
     parser.add_argument("out", type=Path, metavar="OUT.npz")
     options = parser.parse_args(arguments)
-    try:
+    with ended_by_errors("train.learning.contact_mixture"):
         mixture = fit_mixture(load_presses(options.presses))
         with quiet_workers():
             presses = make_presses(CALIBRATION, options.presses.with_name("calibration.npz"))
         write_model(options.out, mixture, calibrated(mixture, sensors_of(presses, CALIBRATION)))
-    except TrainError as error:
-        sys.stderr.write(f"train.learning.contact_mixture: {error}\n")
-        return 1
     sys.stdout.write(f"{options.out}: {len(mixture.share)} components\n")
-    return 0
 
 
 def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> None:
@@ -292,4 +288,4 @@ def write_model(path: Path, mixture: ContactMixture, model: ContactModel) -> Non
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -40,22 +40,22 @@ Run = Callable[
 """Function from windows in network units, pads and poses to patterns and deviations, in [mm]."""
 
 
-def half_width_mm(deviation_mm: ArrayLike, level: float = LEVEL) -> NDArray[np.floating]:
-    """Return half the width of the interval that holds a share `level` in 0..1 of a Laplace density, in [mm]."""
-    return np.asarray(deviation_mm) * (-log(1 - level) / sqrt(2))
+def half_width_mm(deviation_mm: ArrayLike) -> NDArray[np.floating]:
+    """Return half the width of the interval that holds a share LEVEL of a Laplace density, in [mm]."""
+    return np.asarray(deviation_mm) * (-log(1 - LEVEL) / sqrt(2))
 
 
-def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
+def interval_coverage(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike) -> float:
     """Return the share of pixels whose truth lies within their interval; arrays of one shape, in [mm]."""
-    return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation, level)).mean())
+    return float(metrics.interval_coverage(pattern, truth, half_width_mm(deviation)).mean())
 
 
-def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike, level: float = LEVEL) -> float:
-    """Return the factor on the deviations with which their intervals cover a share `level` of these pixels."""
-    widths = half_width_mm(deviation, level)
+def calibrate(truth: ArrayLike, pattern: ArrayLike, deviation: ArrayLike) -> float:
+    """Return the factor on the deviations with which their intervals cover a share LEVEL of these pixels."""
+    widths = half_width_mm(deviation)
     if not np.all(widths > 0):
         raise ValueError("a deviation is not above zero: nothing can be scaled to cover its error")
-    return float(np.quantile(np.abs(np.asarray(truth) - np.asarray(pattern)) / widths, level, method="higher"))
+    return float(np.quantile(np.abs(np.asarray(truth) - np.asarray(pattern)) / widths, LEVEL, method="higher"))
 
 
 @dataclass(frozen=True, slots=True)

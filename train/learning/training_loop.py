@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass
 from math import cos, isfinite, pi
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import torch
 from torch import distributed, nn
@@ -29,7 +29,7 @@ from torch.utils.tensorboard import SummaryWriter
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from train.data.press_batches import Batch
-from train.errors import TrainError
+from train.errors import CheckpointError, TrainError
 from train.networks.blocks import Objective, PatternNet
 
 Batches = Callable[[int], Batch]  # function from a number to its batch; the same number always gives the same batch
@@ -46,10 +46,6 @@ DAMAGES: Final = (OSError, ValueError, KeyError, TypeError, RuntimeError, EOFErr
 def reason(error: BaseException) -> str:
     """Return the first line of an error."""
     return next(iter(str(error).splitlines()), type(error).__name__)
-
-
-class NotResumableError(TrainError, ValueError):
-    """State of an interrupted run that had another configuration."""
 
 
 class DivergedError(TrainError, ArithmeticError):
@@ -71,7 +67,7 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "learning_rate"):
             if not (value := getattr(self, name)) > 0:
-                raise ValueError(f"{name} is {value}, expected more than 0")
+                raise CheckpointError(f"{name} is {value}, expected more than 0")
 
 
 def rank_and_world() -> tuple[int, int]:
@@ -144,12 +140,14 @@ def train(
     """Train a network in place, leave it in evaluation mode, and return the seconds that all parts of the run took.
 
     An interrupted run resumes when this is called again with the same `identity`, of network and data, from the state
-    in `resume_path`, which the caller deletes when the result is safe. ValueError if a batch cannot be shared evenly by
-    the processes, DivergedError if the loss is not finite; the network is then as before that step.
+    in `resume_path`, which the caller deletes when the result is safe. CheckpointError if a batch cannot be shared
+    evenly by the processes, DivergedError if the loss is not finite; the network is then as before that step.
     """
     rank, world = rank_and_world()
     if recipe.batch % world:
-        raise ValueError(f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each")
+        raise CheckpointError(
+            f"a batch of {recipe.batch} windows is shared by {world} processes: expected as many for each"
+        )
     device = device_of_rank(rank)
     _place(net, device).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
@@ -187,10 +185,7 @@ def train(
     return time.monotonic() - started_s
 
 
-Drawn = TypeVar("Drawn")
-
-
-def drawn_ahead(batches: Callable[[int], Drawn], first: int, end: int) -> Generator[Drawn, None, None]:
+def drawn_ahead(batches: Batches, first: int, end: int) -> Generator[Batch, None, None]:
     """Yield the batches from number `first` to before `end`, each drawn in a thread while the one before is used."""
     with ThreadPoolExecutor(1, "batches") as thread:
         coming = thread.submit(batches, first)
@@ -237,9 +232,9 @@ def _restored(path: Path, parts: Mapping[str, Any], recipe_sha256: str, device: 
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except DAMAGES as error:
-        raise NotResumableError(f"{path} is not a run's state ({reason(error)}): delete it to start again") from error
+        raise CheckpointError(f"{path} is not a run's state ({reason(error)}): delete it to start again") from error
     if not isinstance(state, dict) or state.get("recipe") != recipe_sha256:
-        raise NotResumableError(f"{path} is of a run with another recipe or on other data: delete it to start again")
+        raise CheckpointError(f"{path} is of a run with another recipe or on other data: delete it to start again")
     for name, part in parts.items():
         part.load_state_dict(state[name])
     return state

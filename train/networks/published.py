@@ -8,6 +8,10 @@ TactileSRGAN is TactileSRCNN trained against a discriminator. From the authors' 
 penalty 10, two steps of the discriminator to one of the generator, 0.001 of the adversarial loss added to the error.
 Chosen here: the discriminator's layers, which score patches and take any scale, without batch normalisation; and its
 input, patterns relative to their truth's size.
+
+The paper's own pad and schedule make the presses to train them on:
+
+    python -m train.data.make_presses data/paper.npz --families paper --schedule turns --spread 0 --taps 7
 """
 
 from typing import Any, Final

@@ -12,6 +12,7 @@ The bundled models are these, at scale 10:
 from collections.abc import Callable
 from typing import Any, Final
 
+from train.errors import CheckpointError
 from train.networks.blocks import PatternNet
 from train.networks.compact import CompactNet
 from train.networks.fusion import FusionNet
@@ -32,15 +33,15 @@ NETWORKS: Final[dict[str, tuple[Callable[..., PatternNet], dict[str, int]]]] = {
 
 
 def build(name: str, scale: int, **options: Any) -> PatternNet:
-    """Build a new network; ValueError if there is none of that name, or an option is out of range."""
+    """Build a new network; CheckpointError if there is none of that name, or an option is out of range."""
     if name not in NETWORKS:
-        raise ValueError(f"no network {name!r}, expected one of {', '.join(NETWORKS)}")
+        raise CheckpointError(f"no network {name!r}, expected one of {', '.join(NETWORKS)}")
     make, says = NETWORKS[name]
     return make(scale=scale, **says | options)
 
 
 def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNet:
-    """Build a new network that starts from copies of another's weights; ValueError if the weights do not fit.
+    """Build a new network that starts from copies of another's weights; CheckpointError if the weights do not fit.
 
     An MTSR-K can start from an STSR, a compact network from one of any taps, and any from its own kind. At
     another scale a compact network keeps its trunk, and its output layers are initialised again.
@@ -50,5 +51,5 @@ def grown(start: PatternNet, name: str, scale: int, **options: Any) -> PatternNe
         net.take_over(start)
     except (ValueError, RuntimeError) as error:
         kind = f"a {type(start).__name__} of {start.taps} taps at scale {start.scale}"
-        raise ValueError(f"{name} at scale {scale} cannot start from {kind}: {error}") from error
+        raise CheckpointError(f"{name} at scale {scale} cannot start from {kind}: {error}") from error
     return net

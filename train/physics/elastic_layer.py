@@ -238,61 +238,45 @@ _WIDTH_MM: Final = 20.0
 _GIVES: Final = ((0.959, 0.3415, 0.2247), (0.0255, 1.590, 0.6034))  # terms (a, b, c) of the surface's compliance
 
 
-@dataclass(frozen=True, slots=True)
-class FreeSides:
-    """Four free sides of a square pad; amplitude 1 is as in the finite elements, 0 an infinite layer."""
+def side_movement(
+    amplitude: float, layer: Layer, cells_mm: NDArray[np.floating], magnets_mm: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return the MOVEMENT of the magnets that four free sides add, (taxels, 5, size, size) in [mm/N] and [1/N].
 
-    amplitude: float = 1.0
+    Amplitude 1 is as in the finite elements, 0 an infinite layer. Loaded cells are at places (size,) from the centre
+    along x as along y, magnets at x and y (taxels, 2).
+    """
+    scale, thickness_mm = amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
 
-    def profiles(self, layer: Layer, cells_mm: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return shares of the added compliance across and along a pair of sides, for cells (size,) from the centre.
+    # Factor, decay lengths to magnet and load, width along the side; unit; signs at lower and upper side.
+    parts = (
+        ((0.1703, 1.117, 0.592, 0.593), scale, (-1.0, 1.0)),  # their way to the side
+        ((0.0404, 0.690, 1.147, 0.420), scale, (1.0, 1.0)),  # down
+        ((1.000, 0.431, 0.317, 0.463), scale / thickness_mm, (-1.0, 1.0)),  # their axes, tops towards the side
+    )
 
-        They are across (terms, 2, size), lower side first, and along (terms, size, size) in [mm/N]: a force at (x', y')
-        adds across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
-        """
-        scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
-        apart_mm = cells_mm[:, None] - cells_mm
-        across = [_fall(cells_mm, reach * thickness_mm) for _, reach, _ in _GIVES]
-        along = [scale * factor * _bell(apart_mm, spread * thickness_mm) for factor, _, spread in _GIVES]
-        return np.stack(across), np.stack(along)
+    def by_sides(at_mm: NDArray[np.floating], beside_mm: NDArray[np.floating]) -> list[NDArray[np.float64]]:
+        """Return the parts of the two sides at the ends of one axis; magnets are at `at_mm` along it."""
+        added = []
+        for (factor, *lengths), unit, signs in parts:
+            inward_mm, reach_mm, spread_mm = (thicknesses * thickness_mm for thicknesses in lengths)
+            falls = _fall(at_mm, inward_mm), _fall(cells_mm, reach_mm)
+            bell = _bell(beside_mm[:, None] - cells_mm, spread_mm)
+            added.append(unit * factor * np.einsum("s,st,sc,tr->trc", signs, *falls, bell))
+        return added
 
-    def movement(
-        self, layer: Layer, cells_mm: NDArray[np.floating], magnets_mm: NDArray[np.floating]
-    ) -> NDArray[np.float64]:
-        """Return the MOVEMENT of the magnets that the sides add, (taxels, 5, size, size) in [mm/N] and [1/N].
-
-        Loaded cells are at places (size,) from the centre along x as along y, magnets at x and y (taxels, 2).
-        """
-        scale, thickness_mm = self.amplitude / (layer.shear_modulus_mpa * layer.thickness_mm), layer.thickness_mm
-
-        # Factor, decay lengths to magnet and load, width along the side; unit; signs at lower and upper side.
-        parts = (
-            ((0.1703, 1.117, 0.592, 0.593), scale, (-1.0, 1.0)),  # their way to the side
-            ((0.0404, 0.690, 1.147, 0.420), scale, (1.0, 1.0)),  # down
-            ((1.000, 0.431, 0.317, 0.463), scale / thickness_mm, (-1.0, 1.0)),  # their axes, tops towards the side
-        )
-
-        def by_sides(at_mm: NDArray[np.floating], beside_mm: NDArray[np.floating]) -> list[NDArray[np.float64]]:
-            """Return the parts of the two sides at the ends of one axis; magnets are at `at_mm` along it."""
-            added = []
-            for (factor, *lengths), unit, signs in parts:
-                inward_mm, reach_mm, spread_mm = (thicknesses * thickness_mm for thicknesses in lengths)
-                falls = _fall(at_mm, inward_mm), _fall(cells_mm, reach_mm)
-                bell = _bell(beside_mm[:, None] - cells_mm, spread_mm)
-                added.append(unit * factor * np.einsum("s,st,sc,tr->trc", signs, *falls, bell))
-            return added
-
-        x_mm, y_mm = magnets_mm.T
-        right, down_by_x, lean_x = by_sides(x_mm, y_mm)
-        back, down_by_y, lean_y = (part.swapaxes(1, 2) for part in by_sides(y_mm, x_mm))
-        return np.stack([right, back, down_by_x + down_by_y, lean_x, lean_y], axis=1)
+    x_mm, y_mm = magnets_mm.T
+    right, down_by_x, lean_x = by_sides(x_mm, y_mm)
+    back, down_by_y, lean_y = (part.swapaxes(1, 2) for part in by_sides(y_mm, x_mm))
+    return np.stack([right, back, down_by_x + down_by_y, lean_x, lean_y], axis=1)
 
 
 class SideGive:
-    """Compliance of the surface on boxes of a grid: a few small matrix products in a step of the contact solver.
+    """Compliance that free sides add on boxes of a grid: a few small matrix products in a step of the contact solver.
 
-    The profiles of `FreeSides` are (n, terms, 2, width) and (n, terms, 2, height) across at the boxes' columns and
-    rows, (terms, height, height) and (terms, width, width) along, in [mm/MPa].
+    A force at (x', y') adds across(x) across(x') along(y, y') to the displacement at (x, y), for each side and term.
+    Profiles across are (n, terms, 2, width) and (n, terms, 2, height) at the boxes' columns and rows, lower side first,
+    those along (terms, height, height) and (terms, width, width) in [mm/MPa].
     """
 
     def __init__(self, across: tuple[torch.Tensor, torch.Tensor], along: tuple[torch.Tensor, torch.Tensor]) -> None:
@@ -300,11 +284,12 @@ class SideGive:
         self._along = along
 
     @classmethod
-    def of(
-        cls, sides: FreeSides, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype = torch.float32
-    ) -> "SideGive":
+    def of(cls, amplitude: float, layer: Layer, size: int, cell_mm: float, dtype: torch.dtype) -> "SideGive":
         """Return the compliance of the whole grid."""
-        across, along = sides.profiles(layer, (np.arange(size) - (size - 1) / 2) * cell_mm)
+        cells_mm, thickness_mm = (np.arange(size) - (size - 1) / 2) * cell_mm, layer.thickness_mm
+        scale, apart_mm = amplitude / (layer.shear_modulus_mpa * thickness_mm), cells_mm[:, None] - cells_mm
+        across = np.stack([_fall(cells_mm, reach * thickness_mm) for _, reach, _ in _GIVES])
+        along = np.stack([scale * factor * _bell(apart_mm, spread * thickness_mm) for factor, _, spread in _GIVES])
         falls, bells = torch.as_tensor(across[None], dtype=dtype), torch.as_tensor(along * cell_mm**2, dtype=dtype)
         return cls((falls, falls), (bells, bells))
 

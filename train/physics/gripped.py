@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import SurfaceError
-from train.physics.contact import BARE, REACH, ContactSolver, Cover
-from train.physics.friction import FrictionSolver
+from train.physics.contact import BARE, REACH, ContactSolver, Cover, FrictionSolver
 from train.physics.pad_draws import Pad
 from train.physics.taxel_response import Skin, on_pad
 from train.physics.tpsf import heights_pattern, resample, resample_touching
@@ -56,6 +55,13 @@ class Taps:
     indentation_mm: NDArray[np.float32]  # (n, FRAMES)
     unit_patterns: NDArray[np.float32]  # (n, H, W) at FINE_SCALE, deformation per indentation
     touching: NDArray[np.bool_]  # (n, H, W) at FINE_SCALE, contact area on the pad
+
+
+def between_frames(frames: NDArray[np.float32], share: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Return values (b, m, ...) at shares (b, m) of presses, between frames (b, FRAMES, ...) and 0 at the start."""
+    away = np.abs(share[..., None] * FRAMES - np.arange(1, FRAMES + 1))
+    weights = np.maximum(1 - away, 0).astype(np.float32)
+    return (weights @ frames.reshape(*frames.shape[:2], -1)).reshape(*share.shape, *frames.shape[2:])
 
 
 class GrippedPad:
@@ -185,7 +191,7 @@ class GrippedPad:
         pressure = np.empty_like(cells_mm)
         open_ = np.arange(len(cells_mm))
         for _ in range(_MOST_TRIES):
-            pressure[open_] = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_]).pressure_mpa
+            pressure[open_], _ = solver.solve(cells_mm[open_], indentation_mm[open_], covered=share[open_])
             force_n = pressure[open_].sum(axis=(1, 2)) * self.cell_mm**2
             over = force_n > most_force_n
             if not over.any():
@@ -248,7 +254,7 @@ class GrippedPad:
     def _solver(self, cover: Cover) -> ContactSolver:
         if cover not in self._solvers:
             pad = self.pad
-            self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.sides)
+            self._solvers[cover] = ContactSolver(pad.layer, self.size, self.cell_mm, cover=cover, sides=pad.free_sides)
         return self._solvers[cover]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import PADS, USPA44, SensorGeometry
-from train.physics.elastic_layer import FreeSides, Layer
+from train.physics.elastic_layer import Layer
 from train.physics.magnets import Magnet
 
 NEWTONS_PER_COUNT_Z: Final = 0.00085  # by the data sheet, for the sum of z
@@ -51,11 +51,6 @@ class Pad:
     def layer(self) -> Layer:
         """Soft layer of the pad."""
         return Layer(self.thickness_mm, self.shear_modulus_mpa, self.poisson)
-
-    @property
-    def sides(self) -> FreeSides | None:
-        """Free sides of the pad, None for an infinite layer."""
-        return FreeSides(self.free_sides) if self.free_sides else None
 
     @property
     def magnet(self) -> Magnet:

@@ -21,7 +21,7 @@ from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD
 from train.surfaces.depth_image import Pose
 
-Seed = int | Sequence[int] | np.random.SeedSequence
+Seed = int | Sequence[int]
 
 LARGEST_COUNTS: Final = (1400.0, 1400.0, 13500.0)
 """Largest readings: the data sheet's range of x and y, and z observed in a grasp."""
@@ -77,9 +77,8 @@ def apply_nuisances(
     seed: Seed,
     tap_s: ArrayLike | None = None,
     angle_deg: ArrayLike = 0.0,
-    frame: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
-    """Return the readings of n sensors in their K taps, (n, K, m, 3, rows, cols) in whole zeroed counts.
+    """Return the readings of n sensors in their K taps, (n, K, F, 3, rows, cols) in whole zeroed counts.
 
     Args:
         clean: (n, K, F, 3, rows, cols) zeroed counts, newest tap first; frames evenly spaced in time, the first one
@@ -88,16 +87,11 @@ def apply_nuisances(
         seed: every nuisance draws from an independent stream of it, so switching one off changes no other.
         tap_s: durations, broadcast to (n, K), above 0, in [s]; None draws them between the bounds of TAP_S.
         angle_deg: the pad's turn in each tap, broadcast to (n, K), in [deg], as in train.surfaces.depth_image.Pose.
-        frame: moments (n, K, m) of the readings, in frames since the pad was free; None for every frame.
     """
-    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     n, taps, frames, *scan = clean.shape
-    if frame is None:
-        frame = np.broadcast_to(np.arange(1.0, frames + 1), (n, taps, frames))
 
     def stream(name: str) -> np.random.Generator:
-        key = (*root.spawn_key, crc32(name.encode()))
-        return np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=key))
+        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(crc32(name.encode()),)))
 
     lag = np.zeros((2, n))
     if nuisances.hysteresis:
@@ -105,7 +99,7 @@ def apply_nuisances(
         lag[0] = rng.uniform(min(0.01, nuisances.hysteresis), nuisances.hysteresis, n)
         lag[1] = log_uniform(rng, 0.2, 5.0, (n,))
     duration_s = log_uniform(stream("tap_s"), *TAP_S, (n, taps)) if tap_s is None else np.asarray(tap_s)
-    weights = frame_weights(frame, frames, np.broadcast_to(duration_s, (n, taps)) / frames, *lag)
+    weights = frame_weights(frames, np.broadcast_to(duration_s, (n, taps)) / frames, *lag)
     flat = clean.reshape(n, taps, frames, -1).astype(np.float32, copy=False)
     counts = (weights @ flat).reshape(n, taps, -1, *scan)
 
@@ -123,7 +117,7 @@ def apply_nuisances(
         earth = nuisances.earth_field_counts * _draw_earth(stream("earth_field_counts"), turn)
         counts += earth[:, :, None, :, None, None]
     if nuisances.noise_counts:
-        noise = stream("noise_counts").standard_normal((*frame.shape, *scan), dtype=np.float32)
+        noise = stream("noise_counts").standard_normal(clean.shape, dtype=np.float32)
         counts += np.float32(nuisances.noise_counts) * noise
     limit = np.array(nuisances.saturation_counts, dtype=np.float32)[:, None, None]
     np.clip(counts, -limit, limit, out=counts)
@@ -133,27 +127,11 @@ def apply_nuisances(
     return np.rint(counts)
 
 
-def read_windows(
-    clean: NDArray[np.float32],
-    share: ArrayLike,
-    nuisances: Nuisances,
-    seed: Seed,
-    tap_s: ArrayLike | None = None,
-    angle_deg: ArrayLike = 0.0,
-) -> NDArray[np.float32]:
-    """Return the readings (n, K, 3, rows, cols) of n sensors in one scan of each of their K taps.
-
-    `share`, broadcast to (n, K), is the completed share of each press, 0 to 1; readings are interpolated linearly
-    between frames. The other arguments are those of `apply_nuisances`.
-    """
-    frame = np.broadcast_to(np.asarray(share, dtype=np.float64), clean.shape[:2])[..., None] * clean.shape[2]
-    return apply_nuisances(clean, nuisances, seed, tap_s, angle_deg, frame)[:, :, 0]
-
-
-def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose], nuisances: Nuisances) -> list[Pose]:
+def jitter_poses(rng: np.random.Generator, poses: Sequence[Pose]) -> list[Pose]:
     """Return the true poses of a sensor that was commanded to these poses."""
+    usual = Nuisances()
     off = _cut_normal(rng, (len(poses), 3))
-    off *= (nuisances.pose_error_mm, nuisances.pose_error_mm, nuisances.pose_error_deg)
+    off *= (usual.pose_error_mm, usual.pose_error_mm, usual.pose_error_deg)
     return [Pose(*true) for true in (np.array(poses) + off).tolist()]
 
 
@@ -180,22 +158,22 @@ def _draw_earth(rng: np.random.Generator, turn: NDArray[np.float64]) -> NDArray[
 
 
 def frame_weights(
-    frame: NDArray[np.float64],
     frames: int,
     step_s: NDArray[np.float64],
     share: NDArray[np.float64],
     relaxation_s: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return the weight (n, K, m, frames) of each frame of a press in readings at moments `frame`, in closed form.
+    """Return the weight (n, K, frames, frames) of each frame of a press in the reading at every frame, in closed form.
 
-    Moments (n, K, m) are in frames since the pad was free, one step of `step_s` (n, K) before the first frame. Readings
-    are linear between frames: a sum of ramps that start at the frames, so a frame's weight is the second difference of
-    the responses to ramps, and that of the lagging share (n,) is t - tau (1 - exp(-t / tau)), tau the relaxation (n,).
+    Frames are one step of `step_s` (n, K) apart, the first one a step after the pad was free. Readings are linear
+    between frames: a sum of ramps that start at the frames, so a frame's weight is the second difference of the
+    responses to ramps, and that of the lagging share (n,) is t - tau (1 - exp(-t / tau)), tau the relaxation (n,).
     """
-    ramp = np.maximum(frame[..., None] - np.arange(frames + 2), 0)
+    ramp = np.maximum(np.arange(1.0, frames + 1)[:, None] - np.arange(frames + 2), 0)
+    ramp = np.broadcast_to(ramp, (*step_s.shape, *ramp.shape))
     if share.any():
         rate = (step_s / relaxation_s[:, None])[..., None, None]
-        ramp += share[:, None, None, None] * np.expm1(-rate * ramp) / rate
+        ramp = ramp + share[:, None, None, None] * np.expm1(-rate * ramp) / rate
     return np.diff(ramp, n=2).astype(np.float32)
 
 

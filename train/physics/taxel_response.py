@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.pad_geometry import SensorGeometry
-from train.physics.elastic_layer import Layer, inner_displacement, inner_tangential
+from train.physics.elastic_layer import Layer, inner_displacement, inner_tangential, side_movement
 from train.physics.magnets import MOVEMENT, Magnet, MagnetArray
 from train.physics.pad_draws import Pad
 
@@ -44,9 +44,9 @@ class Skin:
         taxels = geometry.taxel_count
         self._magnets = MagnetArray(geometry, magnet, pad.rest(taxels), pad.moments(taxels))
         response = pressure_response(*self._grid)
-        if pad.sides is not None:
+        if pad.free_sides:
             cells_mm = (np.arange(size) - (size - 1) / 2) * cell_mm
-            added = pad.sides.movement(layer, cells_mm, geometry.taxel_centres_mm())
+            added = side_movement(pad.free_sides, layer, cells_mm, geometry.taxel_centres_mm())
             response += added.reshape(response.shape) * cell_mm**2
         response[:, :2] *= pad.in_plane_share
         self._response = response.astype(np.float32)

@@ -1,0 +1,215 @@
+"""The elastic pad against closed forms and finite elements: layer, contact, friction, magnets, and the tactile PSF."""
+
+from typing import NamedTuple
+
+import magpylib
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from firmware_bridge.pad_geometry import USPA44
+from train.physics.contact import ContactSolver, FrictionSolver
+from train.physics.elastic_layer import (
+    Layer,
+    inner_displacement,
+    inner_tangential,
+    surface_compliance,
+    surface_tangential_compliance,
+)
+from train.physics.magnets import Magnet, MagnetArray
+from train.physics.pad_draws import Pad
+from train.physics.taxel_response import Skin
+from train.surfaces.depth_image import NOTHING_MM
+
+SIZE, CELL_MM = 42, 0.47
+WAVES = np.concatenate([[0.0], np.logspace(-9, 4, 60), [1e6]])
+"""q h, from even loads to overflow."""
+
+
+def cells_mm(size=SIZE, cell_mm=CELL_MM):
+    return (np.arange(size) - (size - 1) / 2) * cell_mm
+
+
+def radius_mm(size=SIZE, cell_mm=CELL_MM, centre_mm=(0.0, 0.0)):
+    along = cells_mm(size, cell_mm)
+    return np.hypot(along - centre_mm[0], along[:, None] - centre_mm[1])
+
+
+def punch(radius, centre_mm=(0.0, 0.0), size=SIZE, cell_mm=CELL_MM):
+    return np.where(radius_mm(size, cell_mm, centre_mm) <= radius, 0.0, NOTHING_MM).astype(np.float32)[None]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.4999])
+@pytest.mark.parametrize("thickness_mm", [0.1, 4.5, 50.0])
+def test_closed_forms_and_boundary_conditions_agree(poisson, thickness_mm):
+    layer, q = Layer(thickness_mm, 0.12, poisson), WAVES / thickness_mm
+    compliance, (down, sideways) = surface_compliance(layer, q), inner_displacement(layer, q, thickness_mm)
+    assert np.isfinite(compliance).all() and (compliance > 0).all() and np.isfinite(sideways).all()
+    # Near nu = 0.5 the long waves' compliance is a small difference of large numbers: 4e-6 is what doubles leave.
+    assert np.allclose(down, compliance, rtol=1e-5, atol=1e-12)
+    along, across = surface_tangential_compliance(layer, q)
+    top, board = (inner_tangential(layer, q, height_mm) for height_mm in (thickness_mm, 0.0))
+    assert np.allclose(top.along[:-1], along[:-1], rtol=1e-9) and np.allclose(top.across, across, rtol=1e-12)
+    assert np.allclose([board.along, board.across, board.sunk], 0, atol=1e-9 * along[0])
+
+
+def test_the_compliance_is_the_formula_of_its_docstring():
+    layer, q = Layer(), np.array([0.2, 0.7, 1.5])
+    nu, a = layer.poisson, q * layer.thickness_mm
+    kappa = 3 - 4 * nu
+    share = (kappa * np.sinh(2 * a) - 2 * a) / (kappa * np.cosh(2 * a) + 2 * a**2 + 5 - 12 * nu + 8 * nu**2)
+    assert np.allclose(surface_compliance(layer, q), (1 - nu) / (layer.shear_modulus_mpa * q) * share)
+
+
+@pytest.mark.parametrize("settings", [{"poisson": 0.5}, {"poisson": -0.1}, {"thickness_mm": 0.0}])
+def test_impossible_layers_are_refused(settings):
+    with pytest.raises(ValueError, match=r"poisson|positive"):
+        Layer(**settings)
+
+
+# By finite elements of the whole pad (docs/decisions.md): stiffness in N/mm, pressure over its mean at .235, 7.05 and
+# 9.635 mm from the centre along x, and per mm of indentation the inner, edge and corner magnets' way down and outwards.
+ELEMENTS = {
+    0.45: (46.97, (1.33, 1.09, 0.60), (0.450, 0.438, 0.438), (0.189, 0.674, 0.535)),
+    0.495: (56.8, (1.48, 1.11, 0.48), (0.385, 0.382, 0.389), (0.290, 0.973, 0.734)),
+}
+
+
+@pytest.mark.parametrize("poisson", ELEMENTS)
+def test_a_flat_face_presses_as_the_finite_elements_have_it(poisson):
+    layer, (stiffness, shape, down, out) = Layer(poisson=poisson), ELEMENTS[poisson]
+    flat = np.zeros((1, SIZE, SIZE), dtype=np.float32)
+    bare, pressure = (
+        ContactSolver(layer, SIZE, CELL_MM, torch.float64, sides=sides).solve(flat, 1.0, 1e-4)[0][0].astype(float)
+        for sides in (0.0, 1.0)
+    )
+    assert bare.sum() * CELL_MM**2 > 1.6 * stiffness  # so much is at stake
+    assert pressure.sum() * CELL_MM**2 == pytest.approx(stiffness, rel=0.09)
+    found = np.interp([0.235, 7.05, 9.635], cells_mm(), pressure[SIZE // 2]) / pressure.mean()
+    assert np.abs(found - shape).max() < 0.09
+    skin = Skin(Pad(poisson=poisson, in_plane_share=1.0, free_sides=1.0), SIZE, CELL_MM)
+    quarter = skin.movement(pressure).reshape(4, 4, 5)[2:, 2:].reshape(4, 5)[[0, 1, 3]]
+    assert quarter[:, 2] == pytest.approx(down, rel=0.2)
+    assert quarter[:, 0] == pytest.approx(out, rel=0.12)
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.49, 0.4999])
+def test_no_pull_no_overlap_and_one_of_them_zero(poisson):
+    solver = ContactSolver(Layer(poisson=poisson), SIZE, CELL_MM, torch.float64)
+    ball = (30 - np.sqrt(900 - radius_mm() ** 2)).astype(np.float32)[None]
+    depth = np.concatenate([punch(6.0), ball, punch(4.0, (9.0, 9.0))])
+    pressure, residual = solver.solve(depth, indentation_mm=0.3, tolerance=1e-6)
+    gap = solver.displacement_mm(pressure) - (0.3 - depth)
+    assert (pressure >= 0).all() and gap.min() > -1e-5
+    assert np.abs(gap[pressure > 0]).max() < 1e-5 and residual.max() < 1e-6
+
+
+@pytest.mark.parametrize("layer", [Layer(poisson=0.4999), Layer(thickness_mm=0.1), Layer(thickness_mm=50.0)])
+def test_stiff_layers_are_solved_alike_in_both_precisions(layer):
+    found = [
+        ContactSolver(layer, SIZE, CELL_MM, kind).solve(punch(4.0), 0.3) for kind in (torch.float32, torch.float64)
+    ]
+    assert max(float(residual[0]) for _, residual in found) < 1e-3
+    single_n, double_n = (pressure.sum(dtype=float) for pressure, _ in found)
+    assert single_n == pytest.approx(double_n, rel=1e-4)
+
+
+def test_a_punch_on_a_thick_layer_is_boussinesqs_and_mindlins():
+    layer, size, cell_mm = Layer(thickness_mm=8.0, poisson=0.3), 128, 0.1
+    shape = punch(0.4, size=size, cell_mm=cell_mm)
+    radius = np.sqrt((shape == 0).sum() * cell_mm**2 / np.pi)
+    pressure, _ = ContactSolver(layer, size, cell_mm, torch.float64).solve(shape, indentation_mm=0.1, tolerance=1e-6)
+    # Measured 0.8 % above: cells, and a layer 20 radii thick instead of a half-space.
+    expected_n = 4 * layer.shear_modulus_mpa * radius * 0.1 / (1 - layer.poisson)
+    assert pressure.sum(dtype=float) * cell_mm**2 == pytest.approx(expected_n, rel=0.02)
+    pushed = push(
+        FrictionSolver(layer, size, cell_mm, torch.float64), (shape[0] == 0) * 1.0, (0.1, 0.0), 0.0, 1e6, 1e-4
+    )
+    expected_n = 8 * radius * layer.shear_modulus_mpa / (2 - layer.poisson) * 0.1
+    assert pushed.force_n == pytest.approx((expected_n, 0), rel=0.03, abs=1e-4 * expected_n)
+
+
+def test_a_cell_carries_as_much_as_it_is_covered():
+    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
+    one, cover = np.full((3, SIZE, SIZE), NOTHING_MM, dtype=np.float32), np.zeros((3, SIZE, SIZE), dtype=np.float32)
+    one[:, 20, 20] = 0
+    cover[:, 20, 20] = 1, 0.5, 1 / 16
+    whole, half, corner = solver.solve(one, covered=cover, tolerance=1e-9)[0][:, 20, 20]
+    assert whole == pytest.approx(1 / solver.cell_compliance_mm_per_mpa)
+    assert (half / whole, corner / whole) == pytest.approx((0.5, 1 / 16))
+
+
+def test_presses_that_cannot_be_are_refused():
+    solver = ContactSolver(Layer(), SIZE, CELL_MM)
+    for depth_mm in (0.0, np.array([0.1, np.nan])):
+        with pytest.raises(ValueError, match="positive depth"):
+            solver.solve(np.concatenate([punch(2.0)] * 2), depth_mm)
+    out_of_reach = np.full((1, SIZE, SIZE), 0.4, dtype=np.float32)
+    with pytest.raises(ValueError, match=r"depth image 1 begins 0.4 mm down, pressed in by 0.3 mm: no cell"):
+        solver.solve(np.concatenate([punch(2.0), out_of_reach]), 0.3)
+
+
+class Pushed(NamedTuple):
+    traction_mpa: np.ndarray
+    stick: np.ndarray
+    force_n: np.ndarray
+
+
+def push(solver, pressure, slide_mm, twist_rad, friction, tolerance=1e-5):
+    """One pose."""
+    (traction,), (residual,) = solver.solve(
+        pressure[None], np.array([slide_mm]), np.array([twist_rad]), np.array([friction]), tolerance=tolerance
+    )
+    assert residual < 1.01 * tolerance
+    traction = traction.astype(float)
+    stick = (pressure > 0) & (np.hypot(*traction) < (1 - 1e-4) * friction * pressure)
+    return Pushed(traction, stick, traction.sum(axis=(1, 2)) * solver.cell_mm**2)
+
+
+def test_the_law_of_friction_holds():
+    rng = np.random.default_rng(2)
+    pressure = ContactSolver(Layer(), SIZE, CELL_MM).solve(punch(6.0, (-1.0, 3.0)), 0.2)[0][0]
+    solver, sticking = FrictionSolver(Layer(), SIZE, CELL_MM, torch.float64), 0
+    for _ in range(5):
+        slide, twist, friction = rng.normal(0, 0.1, 2), rng.normal(0, 0.02), rng.uniform(0.3, 0.8)
+        traction, stick, _ = push(solver, pressure, slide, twist, friction)
+        along, size = cells_mm(), np.hypot(*traction)
+        assert (size <= friction * pressure * (1 + 1e-5)).all()
+        # What a cell slips, the surface less the pad: none where it sticks, along its traction where it slips.
+        moved = np.stack(np.broadcast_arrays(slide[0] - twist * along[:, None], slide[1] + twist * along))
+        slip = moved - solver.displacement_mm(traction[None])[0]
+        scale = np.sqrt((moved**2).mean())
+        assert np.abs(slip[:, stick]).max(initial=0.0) < 2e-3 * scale
+        slipping = (pressure > 0) & ~stick
+        across = slip[0] * traction[1] - slip[1] * traction[0]
+        assert np.abs(across[slipping] / size[slipping]).max(initial=0.0) < 2e-3 * scale
+        assert ((slip * traction).sum(axis=0)[slipping] / size[slipping]).min(initial=0.0) > -2e-3 * scale
+        sticking += stick.sum()
+    assert 0 < sticking < 5 * (pressure > 0).sum()
+
+
+def test_the_whole_array_is_magpylibs_sum_over_all_magnets():
+    rng, magnet = np.random.default_rng(2), Magnet()
+    movement = rng.normal(size=(16, 5)) * [0.1, 0.1, 0.15, 0.3, 0.3]
+    source = magpylib.Collection()
+    for (x_mm, y_mm), (right, back, down, lean_x, lean_y) in zip(USPA44.taxel_centres_mm(), movement, strict=True):
+        place = np.array([x_mm + right, y_mm + back, 2.5 - down]) * 1e-3
+        upright, _ = Rotation.align_vectors([[lean_x, lean_y, 1.0]], [[0.0, 0.0, 1.0]])
+        moment = magnet.remanence_t * np.pi / 4 * 1e-3**2 * 0.5e-3 / magpylib.mu_0
+        source.add(magpylib.misc.Dipole(place, upright, moment=(0, 0, moment)))
+    chips = np.column_stack([USPA44.taxel_centres_mm(), np.full(16, 0.5)]) * 1e-3
+    assert np.allclose(MagnetArray(USPA44, magnet).flux_mt(movement), 1e3 * source.getB(chips), atol=1e-5)
+
+
+def test_a_magnet_near_its_chip_or_through_it_is_refused():
+    with pytest.raises(ValueError, match="mm into its chip"):
+        MagnetArray(USPA44, Magnet(chip_height_mm=2.3))
+    array, movement = MagnetArray(USPA44, Magnet()), np.zeros((16, 5))
+    assert np.isfinite(array.change_mt(movement)).all()
+    near = r"comes within .* mm of its chip, .* expected 0\.75 mm or more"
+    for down_mm, told in ((1.01, near), (1.74, near), (1.75, "mm into its chip"), (np.nan, "mm into its chip")):
+        movement[3, 2] = down_mm
+        with pytest.raises(ValueError, match=told):
+            array.change_mt(movement)
