@@ -2,10 +2,8 @@
 
 import math
 import shlex
-from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from operator import attrgetter
 from typing import Final
 
@@ -14,7 +12,6 @@ from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
-OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 COUNTED: Final = (
@@ -31,21 +28,23 @@ class Histogram:
     def __init__(self) -> None:
         self.count = 0
         self.max = 0.0
-        self._buckets = [0] * (OCTAVES * BUCKETS_PER_OCTAVE + 1)
+        self._buckets: dict[int, int] = {}
 
     def add(self, value: float) -> None:
         """Count a value; below 1 counts as 1."""
         self.count += 1
         self.max = max(self.max, value)
-        self._buckets[math.ceil(min(math.log2(max(value, 1.0)), OCTAVES) * BUCKETS_PER_OCTAVE)] += 1
+        bucket = math.ceil(math.log2(max(value, 1.0)) * BUCKETS_PER_OCTAVE)
+        self._buckets[bucket] = self._buckets.get(bucket, 0) + 1
 
     def quantile(self, share: float) -> float | None:
         """Return the upper edge of the bucket that holds the `share`-th value; None without values."""
-        if self.count == 0:
-            return None
-        wanted = max(1, math.ceil(share * self.count))
-        index = bisect_left(list(accumulate(self._buckets)), wanted)
-        return min(2.0 ** (index / BUCKETS_PER_OCTAVE), self.max)
+        left = max(1, math.ceil(share * self.count))
+        for bucket, count in sorted(self._buckets.items()):
+            left -= count
+            if left <= 0:
+                return min(2.0 ** (bucket / BUCKETS_PER_OCTAVE), self.max)
+        return None
 
 
 @dataclass(slots=True)

@@ -186,8 +186,14 @@ def rest(cadences, scans, state="idle", *, begin=0, period_ms=10, stamped=True):
     return cadences.pace
 
 
+def patient():
+    cadences = Cadences()
+    cadences.patience_s = 0.1
+    return cadences
+
+
 def test_rest_is_a_second_without_contact_of_stamped_sensors():
-    cadences = Cadences(patience_s=0.1)
+    cadences = patient()
     assert rest(cadences, 0) == rest(cadences, 50, "contact") == rest(cadences, 100, begin=50) == Pace()
     assert cadences.waited_ns <= 1490 * MS
     resting = rest(cadences, 2, begin=150)
@@ -204,6 +210,6 @@ def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
                 follow(cadences, scan(number, number * period_ms, f"{name}"), "contact")
         cadences.look()
         assert cadences.pace == pace
-    assert rest(Cadences(patience_s=0.1), 200, stamped=False) == Pace()
-    assert rest(Cadences(patience_s=0.1), 1000, period_ms=2) == Pace()
-    assert rest(Cadences(patience_s=0.1), 0) == Pace()
+    assert rest(patient(), 200, stamped=False) == Pace()
+    assert rest(patient(), 1000, period_ms=2) == Pace()
+    assert rest(patient(), 0) == Pace()

@@ -13,6 +13,7 @@ from runtime_samples import presses, pumped
 
 from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
 from edge.pipeline.cadence import Pace
+from edge.pipeline.scan_reader import CAPACITY_SCANS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.registry import open_source
@@ -111,15 +112,19 @@ class TestOne:
             assert source.take(0.01) == []
 
     @pytest.mark.parametrize(
-        ("at", "given"), [(1, ["told", 6, 7, 8]), (5, ["told", 5, 6, 7, 8]), (9, [5, 6, 7, "told", 8])]
+        ("at", "given"),
+        [
+            (0, ["told", *range(6, CAPACITY_SCANS + 5)]),
+            (CAPACITY_SCANS, [*range(5, CAPACITY_SCANS), "told", *range(CAPACITY_SCANS, CAPACITY_SCANS + 5)]),
+        ],
     )
     def test_a_notice_keeps_its_place_among_lost_scans(self, at, given):
         class Telling(FakeLink):
             def notices(self):
-                return [Notice(0, "lost", "told")] if self.reads == at else []
+                return [Notice(0, "lost", "told")] if self.reads == at + 1 else []
 
         through = threading.Event()
-        link = Telling([[scan] for scan in presses(range(9))])
+        link = Telling([[scan] for scan in presses(range(CAPACITY_SCANS + 5))])
         inner = link.read
 
         def read(timeout_s):
@@ -129,10 +134,10 @@ class TestOne:
             return scans
 
         link.read = read
-        with Source(link, capacity_scans=4) as source:
+        with Source(link) as source:
             assert through.wait(10)
             taken = take_all(source)
-        assert order(taken) == given and source.overruns + len(taken) - 1 == 9
+        assert order(taken) == given and source.overruns + len(taken) - 1 == CAPACITY_SCANS + 5
 
 
 class TestScripts:
