@@ -15,7 +15,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from edge.api import (
     DEFAULT_MODEL,
@@ -186,8 +186,6 @@ def run(
     `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
     into a map, which the live page shows; it is closed here. `looked_at` is set once somebody looks at that page.
     """
-    # glibc gives each thread a heap of its own, in which other threads' free memory is of no use: -8 is M_ARENA_MAX.
-    _of_glibc("mallopt", -8, 1)
     statistics = Statistics() if statistics is None else statistics
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
     loops = options.source == [DEMO_LOOP]
@@ -268,14 +266,9 @@ def run(
 
 
 def give_back_memory() -> None:
-    """Give free memory back to the system: a network takes more while it is loaded than afterwards."""
-    _of_glibc("malloc_trim", ctypes.c_size_t(0))
-
-
-def _of_glibc(name: str, *arguments: Any) -> None:
-    """Call a function of glibc's malloc; other C libraries have none of these, and stay as they are."""
-    if (function := getattr(ctypes.CDLL(None), name, None)) is not None:
-        function(*arguments)
+    """Give free memory back to the system, by glibc alone: a network takes more while it is loaded than afterwards."""
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(ctypes.c_size_t(0))
 
 
 def _open_view(

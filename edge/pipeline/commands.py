@@ -37,6 +37,13 @@ class Command:
     sensor: str | None = None
     force: bool = False
 
+    def carry_out(self, runtime: "Runtime") -> None:
+        """Ask it of a runtime."""
+        if self.name == "reset":
+            runtime.reset()
+        else:
+            runtime.zero(self.sensor, force=self.force)
+
 
 FORMS: Final = '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}'
 RESET: Final = Command("reset")
@@ -88,15 +95,6 @@ class Commands:
         while not self._waiting.empty():
             commands.append(self._waiting.get_nowait())
         return commands
-
-
-def carry_out(commands: Commands, runtime: "Runtime") -> None:
-    """Carry out the commands that were put since the last call."""
-    for command in commands.poll():
-        if command.name == "reset":
-            runtime.reset()
-        else:
-            runtime.zero(command.sensor, force=command.force)
 
 
 class CommandLines:

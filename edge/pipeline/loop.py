@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal
 
 from edge.errors import UsageError
@@ -12,9 +13,9 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences
-from edge.pipeline.commands import Commands, carry_out
+from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import PoseIntake
-from edge.pipeline.run_statistics import Statistics
+from edge.pipeline.run_statistics import COUNTED, Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
@@ -27,6 +28,8 @@ from firmware_bridge.schedule import NS_PER_S, POLL_S
 if TYPE_CHECKING:
     from edge.pipeline.gain_keeper import GainKeeper
 
+_UNWRITTEN: Final = attrgetter("unwritten")
+_TROUBLES: Final = attrgetter(*COUNTED)
 LinkState = Literal["up", "silent", "lost", "ended"]
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
 COUNTED_NS: Final = 250_000_000  # age of the counters of a record, at most, while all is well, in [ns] of scan time
@@ -92,14 +95,16 @@ class Loop:
         self._length_ns = math.inf if duration_s is None else duration_s * NS_PER_S
         self._begun_ns: int | None = None
         unused_by = None if any(sink.uses_poses for sink in self._sinks) else runtime.unposed
-        self._intake = PoseIntake(runtime, self._poses, recorded=source.patient, unused_by=unused_by)
+        why = "of another time than now: add --paced" if source.patient else "which has poses of its own"
+        refused = f"its scans are of a recording, {why}" if source.patient or source.states_poses else None
+        self._intake = PoseIntake(runtime, self._poses, refused=refused, unused_by=unused_by)
         self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
         self._first_ns: int | None = None
         self._now_ns = 0  # time of a patient source
         self._waited_ns = self._refused_ns = -math.inf
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
-        self._counted_ns, self._troubles, self._counters = 0, dict[str, int](), dict[str, int]()
+        self._counted_ns, self._troubles, self._counters = 0, (), dict[str, int]()
         self._keeper: GainKeeper | None = None
         if source.kind != "replay" and source.sensor_file.path is not None:
             from edge.pipeline import gain_keeper
@@ -182,7 +187,8 @@ class Loop:
         taken = source.take(wait_s)
         if taken is None or (source.patient and self._is_too_long(taken)):
             return False
-        carry_out(self._commands, runtime)
+        for command in self._commands.poll():
+            command.carry_out(runtime)
         if self._commands.reason is not None:
             self._tell_refusal(self._commands.reason)
         if self._poses.begun or source.states_poses:
@@ -283,10 +289,10 @@ class Loop:
         self._tally()
         if self._sinks:
             # Counters are read where they are due, and where something was lost: merging them took a tenth of a scan.
-            scan, troubles = result.scan, self.statistics.counters()
+            scan, troubles = result.scan, _TROUBLES(self.statistics)
             if not (0 <= scan.time_ns - self._counted_ns < COUNTED_NS and scan.whole and troubles == self._troubles):
                 self._counted_ns, self._troubles = scan.time_ns, troubles
-                self._counters = self._source.counters() | troubles
+                self._counters = self._source.counters() | self.statistics.counters()
             for sink in self._sinks:
                 sink.write(result, self._counters)
         name = result.scan.sensor
@@ -303,7 +309,7 @@ class Loop:
         statistics.poses_dropped = poses.dropped
         statistics.commands_refused = self._commands.refused
         if self._sinks:  # those of a closed stream have told theirs
-            statistics.unwritten = sum([sink.unwritten for sink in self._sinks])
+            statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
 
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""

@@ -170,16 +170,15 @@ class PoseIntake:
     """
 
     def __init__(
-        self, runtime: Runtime, queue: PoseQueue, *, recorded: bool = False, unused_by: str | None = None
+        self, runtime: Runtime, queue: PoseQueue, *, refused: str | None = None, unused_by: str | None = None
     ) -> None:
-        """Begin without a pose; to recorded scans no pose of now belongs.
+        """Begin without a pose; `refused` is why none but those of the source are taken.
 
         `unused_by` names the model where neither it nor any sink uses poses.
         """
         self.used = 0
         self._runtime, self._queue = runtime, queue
-        self._recorded, self._unused_by = recorded, unused_by
-        self._played: set[str | None] = set()
+        self._refused, self._unused_by = refused, unused_by
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
         self._events: list[Event] = []
@@ -197,9 +196,12 @@ class PoseIntake:
         returns why no sensor has a name.
         """
         waiting = self._queue.take()
-        self._played.update([one.sensor for one in recorded])
+        if self._refused is not None:
+            for _ in waiting:
+                self._queue.refuse(PoseError("recorded", self._refused))
+            waiting = []
         taken: list[TimedPose] = []
-        for timed in (*recorded, *[one for one in waiting if not self._refused_for_recording(one)]):
+        for timed in (*recorded, *waiting):
             if timed.sensor is not None and (why := no_sensor(timed.sensor)) is not None:
                 self._queue.refuse(PoseError("sensor", why))
             elif self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
@@ -232,16 +234,6 @@ class PoseIntake:
                 self._events.append(Event(now_ns, "poses_trouble", None, text))
         events, self._events = self._events, []
         return events
-
-    def _refused_for_recording(self, timed: TimedPose) -> bool:
-        if self._recorded:
-            why = "of another time than now: add --paced"
-        elif self._played & {timed.sensor, None}:
-            why = f"which has poses{_of(timed.sensor)} of its own"
-        else:
-            return False
-        self._queue.refuse(PoseError("recorded", f"its scans are of a recording, {why}"))
-        return True
 
     def _follow(self, timed: TimedPose, now_ns: int) -> None:
         before = self._courses.get(timed.sensor)

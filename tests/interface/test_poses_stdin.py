@@ -163,23 +163,12 @@ class TestIntake:
         intake.take([], None, 1)
         assert intake.look(10**15) == []
 
-    def test_poses_of_now_do_not_mix_with_those_of_a_recording_that_is_played_at_its_speed(self):
+    def test_where_poses_come_with_the_scans_those_of_now_are_refused(self):
         queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue)
-        queue.put(pose(3))
-        assert [one.time_ns for one in intake.take([], 4, 4)] == [3], "a recording may have none"
-        queue.put(pose(7))
-        assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
-        queue.put(pose(8, sensor="4"))
-        assert intake.take([], 9, 9) == []
-        assert queue.refused == 2 and "has poses of its own" in intake.look(9)[0].text
-
-    def test_poses_of_now_are_refused_for_scans_of_another_time(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue, recorded=True)
+        intake = PoseIntake(make_runtime(), queue, refused="its scans are of a recording")
         queue.put(pose(9))
         assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
-        assert queue.refused == 1 and "recording" in intake.look(6)[0].text
+        assert queue.refused == 1 and "a pose is refused: its scans are of a recording" in intake.look(6)[0].text
 
 
 class PoseSink(ListSink):
