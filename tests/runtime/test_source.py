@@ -181,7 +181,7 @@ def recording(scans, pressed):
     return Recording(Path("made.csv"), tracks, 100.0)
 
 
-@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace(0.003), Pace()])
+@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace()])
 def test_what_is_read_does_not_depend_on_when(pace):
     """Cycles of two sensors mix on each of two buses, and reads end within them."""
     played = recording(100, 60)
