@@ -21,24 +21,14 @@ class StagedLink(FakeLink):
     """Link whose batches come when the test lets them: one stage each, with notices in front of its scans."""
 
     def __init__(self, *stages, notices=None, **settings):
-        self.gates = [threading.Event() for _ in stages]
-        self.arrived = [threading.Event() for _ in stages]
-        batches = itertools.chain.from_iterable(zip(self.gates, stages, strict=True))
-        super().__init__(batches, **settings)
+        self.gates, self.arrived = ([threading.Event() for _ in stages] for _ in range(2))
+        parts = zip(self.gates, stages, [event.set for event in self.arrived], strict=True)
+        super().__init__(itertools.chain.from_iterable(parts), **settings)
         self._told = dict(notices or {})
-        self._stage = -1
-
-    def read(self, timeout_s):
-        if self._stage >= 0:
-            self.arrived[self._stage].set()
-            self._stage = -1
-        stage = self.reads // 2 if self.reads % 2 else -1
-        scans = super().read(timeout_s)
-        self._stage = stage if stage < len(self.gates) else -1
-        return scans
 
     def notices(self):
-        return self._told.pop(self._stage, []) if self._stage >= 0 else []
+        stage, part = divmod(self.reads - 1, 3)
+        return self._told.pop(stage, []) if part == 1 else []
 
     def let(self, stage):
         self.gates[stage].set()

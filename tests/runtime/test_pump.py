@@ -32,13 +32,10 @@ class TestOvertaking:
         names = [f"{number}" for number in range(6)]
         batches = [[make_scan(n, sensor=name, press_counts=3000 + 500 * n) for name in names] for n in range(3)]
         gates, read_on = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
-        link = FakeLink([batches[0], gates[0], batches[1], gates[1], batches[2]])
-        inner, calls = link.read, []
-
-        def read(timeout_s):
-            if link.reads in (3, 5):  # the batch before was handed over
-                read_on[link.reads // 2 - 1].set()
-            return inner(timeout_s)
+        link = FakeLink(
+            [batches[0], gates[0], batches[1], read_on[0].set, gates[1], batches[2], read_on[1].set],
+        )
+        calls = []
 
         class Slow(FakeModel):
             def run_together(self, windows, pads=None, poses=None):
@@ -48,7 +45,6 @@ class TestOvertaking:
                     assert read_on[len(calls) - 1].wait(10)
                 return super().run_together(windows, pads)
 
-        link.read = read
         baselines, sink = dict.fromkeys(names, BASELINE), ListSink()
         runtime = make_runtime(Slow(), baselines=baselines)
         statistics = pumped(link, sink, runtime=runtime, rate_hz=250)
@@ -76,18 +72,9 @@ class TestOvertaking:
     )
     def test_behind_scans_the_newest_of_each_sensor_wins(self, meanwhile, states, overruns):
         """One scan occupies the model, and all others arrive meanwhile."""
-        busy, arrived = threading.Event(), threading.Event()
+        busy = threading.Event()
         link, sink = FakeLink([presses([0]), busy, *meanwhile]), ListSink()
-        inner = link.read
-
-        def read(timeout_s):
-            got = inner(timeout_s)
-            if link.ended:
-                arrived.set()
-            return got
-
-        link.read = read
-        model = FakeModel(on_run=lambda: (busy.set(), arrived.wait(10)))
+        model = FakeModel(on_run=lambda: (busy.set(), link.through.wait(10)))
         statistics = pumped(link, sink, model=model)
         states_made = [one.state for one in sink.results]
         made = {(one.scan.sensor, one.scan.number): one.state for one in sink.results if one.pattern is not None}
@@ -98,15 +85,14 @@ class TestOvertaking:
 
 
 class TestEnds:
-    def test_a_lost_link_is_told_after_all_scans_before_it(self):
+    @pytest.mark.parametrize(
+        ("error", "words"), [(LinkLostError("gone"), "gone"), (ZeroDivisionError(), "unforeseen ZeroDivisionError")]
+    )
+    def test_a_lost_link_or_a_fault_in_it_is_told_after_all_scans_before(self, error, words):
         sink, statistics = ListSink(), Statistics()
-        with pytest.raises(LinkLostError, match="gone"):
-            pumped(FakeLink([presses([0, 1]), presses([2])], error=LinkLostError("gone")), sink, statistics=statistics)
+        with pytest.raises(LinkLostError, match=words):
+            pumped(FakeLink([presses([0, 1]), presses([2])], error=error), sink, statistics=statistics)
         assert numbers(sink) == [0, 1, 2] and statistics.scans == 3
-
-    def test_a_fault_in_the_reader_is_not_swallowed(self):
-        with pytest.raises(LinkLostError, match="unforeseen ZeroDivisionError"):
-            pumped(FakeLink([], error=ZeroDivisionError()), ListSink())
 
     def test_stop_and_duration_end_an_endless_source(self):
         stop = threading.Event()
@@ -118,17 +104,9 @@ class TestEnds:
         assert sink.waits > 0 and sink.results == []
 
     def test_scans_that_wait_at_the_end_have_their_results(self):
-        stop, busy, arrived = threading.Event(), threading.Event(), threading.Event()
+        stop, busy = threading.Event(), threading.Event()
         link = FakeLink([presses([0]), busy, presses([1, 2])], endless=True)
-        inner = link.read
-
-        def read(timeout_s):
-            if link.reads == 3:  # so all others were handed on
-                arrived.set()
-            return inner(timeout_s)
-
-        link.read = read
-        sink = ListSink(on_write=lambda result: (busy.set(), arrived.wait(10), stop.set()))
+        sink = ListSink(on_write=lambda result: (busy.set(), link.through.wait(10), stop.set()))
         pumped(link, sink, stop=stop)
         assert numbers(sink) == [0, 1, 2]
 

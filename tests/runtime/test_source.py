@@ -123,19 +123,9 @@ class TestOne:
             def notices(self):
                 return [Notice(0, "lost", "told")] if self.reads == at + 1 else []
 
-        through = threading.Event()
         link = Telling([[scan] for scan in presses(range(CAPACITY_SCANS + 5))])
-        inner = link.read
-
-        def read(timeout_s):
-            scans = inner(timeout_s)
-            if link.ended:
-                through.set()
-            return scans
-
-        link.read = read
         with Source(link) as source:
-            assert through.wait(10)
+            assert link.through.wait(10)
             taken = take_all(source)
         assert order(taken) == given and source.overruns + len(taken) - 1 == CAPACITY_SCANS + 5
 
