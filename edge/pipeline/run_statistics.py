@@ -2,6 +2,7 @@
 
 import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -226,21 +227,19 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
     doctor = f"edge-sr doctor{source} shows what is wrong"
-    arrived = counters()
-    frames, received, messages = (arrived.get(name, 0) for name in ("frames", "received_bytes", "messages"))
-    if messages:
-        why = max(_MESSAGES, key=lambda name: arrived.get(name, 0))
-        if arrived.get(why, 0):
-            return f"{messages} messages came from the server, and no reading in them: {_MESSAGES[why]}; {doctor}"
-        return f"{messages} messages came from the server, and no whole scan in them; {doctor}"
-    if frames:
-        came = "none of a taxel: another kind of pad (--id-map), or another bus"
-        if arrived.get("readings", 0):
-            came = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
-        return f"{frames} CAN frames came, and {came}; {doctor}"
-    bad, binary = arrived.get("bad_lines", 0), arrived.get("non_ascii_lines", 0)
+    arrived = Counter(counters())
+    received, bad, binary = arrived["received_bytes"], arrived["bad_lines"], arrived["non_ascii_lines"]
+    if arrived["messages"]:
+        why = max(_MESSAGES, key=arrived.__getitem__)
+        lack = f"no reading in them: {_MESSAGES[why]}" if arrived[why] else "no whole scan in them"
+        return f"{arrived['messages']} messages came from the server, and {lack}; {doctor}"
+    if arrived["frames"]:
+        lack = "none of a taxel: another kind of pad (--id-map), or another bus"
+        if arrived["readings"]:
+            lack = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
+        return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"
     # An adapter that was reset may send one line without a CAN frame; bytes of no line are those of four long ones.
-    if bad + binary >= 4 or arrived.get("skipped_bytes", 0) >= 120:
+    if bad + binary >= 4 or arrived["skipped_bytes"] >= 120:
         what = "text of another device (a modem, a GPS receiver)"
         if not bad + binary:
             what = "no line that ends as an adapter's: another device, such as one whose lines end with LF alone"
@@ -250,13 +249,12 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
             f"{received} bytes came, and no CAN frame in them: {what}; edge-sr devices lists what is plugged in, and "
             "@BAUD after the port sets a speed"
         )
-    errors = sum(arrived.get(name, 0) for name in ("error_frames", "fd_frames"))
-    if errors:
+    if errors := arrived["error_frames"] + arrived["fd_frames"]:
         return (
             f"{errors} error frames or frames of CAN FD came, and no reading: the bus runs at another bitrate than "
             f"1 Mbit/s, or lacks its termination; {doctor}"
         )
-    if arrived.get("refusals", 0):
+    if arrived["refusals"]:
         return f"the adapter refused {arrived['refusals']} commands, and sent no CAN frame; {doctor}"
     came = f"{received} bytes came, the adapter's answers alone" if received else "nothing came"
     return f"{came}: is the sensor powered and its cable in? {doctor}"

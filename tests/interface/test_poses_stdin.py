@@ -13,7 +13,7 @@ from cli_samples import base_options, files, records, run, start, write_recordin
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
-from edge.api import MapSink, ObjectMap, PadPose, Runtime, Source, Stream, TimedPose, open_recording, open_runtime, pump
+from edge.api import PadPose, Runtime, Source, TimedPose, pump
 from edge.mapping.map_files import check_npz
 from edge.pipeline.commands import RESET, CommandLines, Commands
 from edge.pipeline.pose_queue import (
@@ -253,30 +253,3 @@ def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
     assert done.returncode == 0 and list(tmp_path.iterdir()) == []
     assert "patterns came without a pose, so the map is empty: send poses of the pad" in done.stderr
     assert "without a pose; no file written" in done.stderr
-
-
-def test_a_recording_with_poses_becomes_a_map(files, tmp_path):
-    posed = tmp_path / "posed.mcap"
-    with start("record", posed, *base_options(files), "--source", f"replay:{files / 'taps.npz'}",
-               stdin=subprocess.PIPE) as process:  # fmt: skip
-        process.stdin.write(HELD)
-        process.stdin.flush()
-        assert process.wait() == 0, process.stderr.read()
-    out = tmp_path / "m.npz"
-    done = run("map", *base_options(files), "--source", f"replay:{posed}", "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert centre_of(out)[0] == [5, -3]
-
-
-def test_a_map_is_made_by_hand_and_from_a_stream(files):
-    with open_recording(files / "taps.npz") as source:
-        runtime = open_runtime(files / "tiny.onnx", source, baselines=files / "zero.json")
-        by_hand, sink = ObjectMap(), MapSink(ObjectMap())
-        for result in Stream(source, runtime, sinks=[sink]):
-            by_hand.add(result, PadPose(1.0, 2.0))
-            if result.scan.number == 9:  # after the first of four taps
-                runtime.pose(PadPose(3.0, 0.0), result.scan.time_ns + 1, "4", holds=True)
-    by_hand.finish()
-    sink.close()
-    assert by_hand.fused == 4 and np.isfinite(by_hand.layers().contact).any()
-    assert sink.without_pose == 5 and sink.whole.fused == 3, "a pose that the runtime was given itself counts"
