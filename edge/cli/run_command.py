@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -198,12 +199,14 @@ def run(
         if stop.is_set():
             return
         find_model(name)  # first, or a name with a slip would wait for links that are slow to open
-        source.begin()  # its links open while the model loads
-        model = load_model(name, stop=stop)
+        with ThreadPoolExecutor(1) as apart:
+            opening = apart.submit(source.open)  # its links open while the model loads
+            model = load_model(name, stop=stop)
+        opening.result()
         with (
             _open_view(options, model.contract, commands) as view,
             _summary(statistics, source),
-            source,
+            contextlib.closing(source),
             contextlib.ExitStack() as closing,
         ):
             hint = partial(silence_hint, options.source, source.counters)

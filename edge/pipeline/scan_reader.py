@@ -75,15 +75,15 @@ class Source:
         self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
         self._last_ns = 0
         self._opened = self._closed = False
-        self._opening: threading.Thread | None = None
-        self._open: ExitStack | None = None
+        self._open = ExitStack()
+        self._threads: list[threading.Thread] = []
         self._waiting: list[Scan | Notice | TimedPose] = []
         self._lock = threading.Lock()
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
         self._through = False
-        self._working = len(links)  # threads that may still put something
+        self._reading = len(links)
         self._failed: BaseException | None = None
         self._stream: Callable[[], Any] = lambda: None  # the one that takes; one that was dropped has ended
 
@@ -97,15 +97,6 @@ class Source:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def begin(self) -> None:
-        """Begin to open the links and to read, in a thread, for a caller that prepares something else meanwhile.
-
-        `open` waits for it and raises its error. `close` also ends what was begun and never opened.
-        """
-        if self._opening is None:
-            self._working += 1
-            self._opening = self._started("source-opening", self._open_links)
-
     def open(self) -> Self:
         """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
 
@@ -117,12 +108,16 @@ class Source:
         if self._opened or self._closed:
             state = "opened" if self._opened else "closed"
             raise UsageError(f"source {self.name} was {state} before: make another, with open_source")
-        if self._opening is None:
-            self._open_links()
-        else:
-            self._opening.join()
-        if self._open is None and self._failed is not None:
-            raise self._failed
+        with ExitStack() as opening:
+            for reader in self._readers:
+                opening.enter_context(reader)
+            kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
+            refuse_emulated(self.sensor_file, kind, self._force)
+            if not self.patient:
+                opening.callback(self._end_reading)
+                self._threads = [self._started(reader) for reader in self._readers]
+            self._open = opening.pop_all()
+        atexit.register(self.close)
         self._opened = True
         return self
 
@@ -132,11 +127,8 @@ class Source:
         stream = self._stream()
         if stream is not None:
             stream.close()
-        if self._opening is not None:
-            self._opening.join()
         atexit.unregister(self.close)
-        if self._open is not None:
-            self._open.close()
+        self._open.close()
 
     def reserve(self, stream: Any = None) -> None:
         """Let a `Stream` take the scans from now on; None only asks whether one could.
@@ -235,42 +227,30 @@ class Source:
         self._last_ns = scans[-1].time_ns if scans else self._last_ns
         return [*reader.notices(), *reader.link.poses(), *scans]
 
-    def _open_links(self) -> None:
-        with ExitStack() as opening:
-            for reader in self._readers:
-                opening.enter_context(reader)
-            kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
-            refuse_emulated(self.sensor_file, kind, self._force)
-            if not self.patient:
-                threads = [self._started("scan-reader", self._follow, reader) for reader in self._readers]
-                opening.callback(self._end_reading, threads)
-            self._open = opening.pop_all()
-        atexit.register(self.close)
-
-    def _started(self, name: str, run: Callable[..., None], *arguments: object) -> threading.Thread:
-        """Return a new thread that runs a function; its error ends all reading, and is raised where it is awaited.
+    def _started(self, reader: LinkReader) -> threading.Thread:
+        """Return a new thread that reads a link; its error ends all reading, and is raised by `take`.
 
         It is a daemon, or a program that forgets to close its source would wait for it for ever.
         """
 
-        def guarded() -> None:
+        def read() -> None:
             try:
-                run(*arguments)
-            except BaseException as error:  # noqa: BLE001 - raised by `open` or `take`
+                self._follow(reader)
+            except BaseException as error:  # noqa: BLE001 - raised by `take`
                 self._failed = self._failed or error
                 self._stop.set()
             with self._lock:
-                self._working -= 1
-                if not self._working:
+                self._reading -= 1
+                if not self._reading:
                     self._bell.put(None)
 
-        thread = threading.Thread(target=guarded, name=name, daemon=True)
+        thread = threading.Thread(target=read, name="scan-reader", daemon=True)
         thread.start()
         return thread
 
-    def _end_reading(self, threads: Sequence[threading.Thread]) -> None:
+    def _end_reading(self) -> None:
         self._stop.set()
-        for thread in threads:
+        for thread in self._threads:
             thread.join()
 
     def _follow(self, reader: LinkReader) -> None:

@@ -39,54 +39,29 @@ def order(taken):
     return [one.text if isinstance(one, Notice) else one.number for one in taken]
 
 
-class SlowLink(FakeLink):
-    """Link that opens when it may, and notes that it was closed."""
-
-    def __init__(self, error=None):
-        super().__init__([[make_scan(0)], [make_scan(1)]])
-        self.entering, self.may_open, self.closed = threading.Event(), threading.Event(), threading.Event()
-        self.opening_error = error
-
-    def __enter__(self):
-        self.entering.set()
-        assert self.may_open.wait(10)
-        if self.opening_error is not None:
-            raise self.opening_error
-        return self
-
-    def __exit__(self, *exc_info):
-        self.closed.set()
-
-
 class TestOpening:
-    def begun(self, error=None):
-        """Return a source that is being opened while this thread goes on, and its link, which opens in a moment."""
-        source = Source(link := SlowLink(error))
-        source.begin()
-        assert link.entering.wait(10)
-        with pytest.raises(UsageError, match="fake is not open"):
-            source.take(0)
-        threading.Timer(0.1, link.may_open.set).start()
-        return source, link
+    def test_an_error_leaves_all_links_closed_and_no_thread(self):
+        class Counted(FakeLink):
+            entered = 0
 
-    def test_it_waits_for_what_was_begun_and_loses_nothing(self):
-        source, link = self.begun()
-        with source:
-            assert link.may_open.is_set() and numbers(take_all(source)) == [0, 1]
-        assert link.closed.is_set()
+            def __enter__(self):
+                self.entered += 1
+                if self.name == "away":
+                    raise LinkLostError("no such port")
+                return self
 
-    def test_its_error_comes_where_it_is_awaited(self):
-        source, _ = self.begun(LinkLostError("no such port"))
+            def __exit__(self, *exc_info):
+                self.entered -= 1
+
+        links = Counted([[make_scan(0)]], prefix="a/"), Counted([], prefix="b/")
+        links[1].name = "away"
+        source = Source(*links)
         with pytest.raises(LinkLostError, match="no such port"), source:
             pass
         source.close()
-
-    def test_closing_ends_what_was_begun_and_never_opened(self):
-        source, link = self.begun()
-        source.close()
-        assert link.closed.is_set()
+        assert links[0].entered == 0
         assert not any(thread.name == "scan-reader" for thread in threading.enumerate())
-        with pytest.raises(UsageError, match="fake was closed before"):
+        with pytest.raises(UsageError, match="fake, away was closed before"):
             source.open()
 
     def test_emulated_and_real_links_are_not_mixed_whenever_it_shows(self):
