@@ -73,7 +73,7 @@ class Loop:
             clock_ns: clock of the scans, in [ns].
 
         Raises:
-            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
+            UsageError: the duration is out of range, or the source has another stream.
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)

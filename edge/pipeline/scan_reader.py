@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from queue import Empty, SimpleQueue
 from typing import Any, Final, Self
 
-from edge.errors import SourceTakenError, UsageError
+from edge.errors import UsageError
 from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
@@ -134,11 +134,11 @@ class Source:
         """Let a `Stream` take the scans from now on; None only asks whether one could.
 
         Raises:
-            SourceTakenError: another stream does.
+            UsageError: another stream does.
         """
         before = self._stream()
         if before is not None and not before.ended:
-            raise SourceTakenError(
+            raise UsageError(
                 f"source {self.name} has a stream already, and each would get a part of its scans: use that one, or "
                 "end it with close()"
             )

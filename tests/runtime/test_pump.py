@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-from dataclasses import replace
 
 import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
@@ -179,14 +178,3 @@ class TestDeadline:
         assert ["late" in [note.kind for note in result.notes] for result in sink.results] == [False] * 9 + [True]
         assert "this pattern was ready 0.29 s after its newest reading arrived" in (sink.results[9].note or "")
         assert statistics.late == 3 and statistics.latency_us.count == 10 and statistics.dropped == 0
-
-    def test_scans_that_lay_unread_set_no_pace(self):
-        """A dozen lay there and are read a millisecond apart; then they come every 10 ms, each result 4 ms behind."""
-        times_ms = [*range(500, 512), *range(520, 640, 10)]
-        read = [
-            replace(scan, time_ns=time_ms * MS, unread_ns=400 * MS * (time_ms < 520))
-            for scan, time_ms in zip(presses(range(24)), times_ms, strict=True)
-        ]
-        link, sink = answered(read)
-        statistics = pumped(link, sink, clock_ns=lambda: read[min(len(sink.results), 23)].time_ns + 4 * MS)
-        assert statistics.scans == 24 and statistics.late == 0
