@@ -44,6 +44,7 @@ from edge.cli.option_tables import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
 from edge.pipeline.run_statistics import silence_hint
+from edge.pipeline.sink import check_new
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
@@ -139,8 +140,7 @@ def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         raise UsageError(f"{path.suffix} cannot be recorded: edge-sr record {made}; {then}")
     if path.suffix != ".mcap":
         path = path.with_name(path.name + ".mcap")
-    if path.exists():  # checked before anything is begun
-        raise SinkError(f"{path} exists: give another name, or delete it first")
+    check_new(path)
     options.sink = [*options.sink, f"mcap:{path}"]
     check_apart(options.sink)
     statistics = Statistics()

@@ -51,7 +51,7 @@ class Cadence:
         self.period_ns = self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque(maxlen=31)
         self._hurried = 0
-        self._forget_pace()
+        self._forget_pace(None)
 
     @property
     def rate_hz(self) -> float | None:
@@ -86,9 +86,9 @@ class Cadence:
         if self._known_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
             self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
 
-    def _forget_pace(self) -> None:
+    def _forget_pace(self, scan: Scan | None) -> None:
         self._before_gap: Scan | None = None  # scan before a gap whose missing ones are not counted yet
-        self._paced_from: Scan | None = None
+        self._paced_from = scan
         self._gap_period_ns = 0.0
         self._lateness: list[float] = []  # of the scans after it, in periods
 
@@ -100,15 +100,13 @@ class Cadence:
                 self._before_gap, self._gap_period_ns = before, self._mean_period_ns(before, period_ns)
             self._lateness.clear()
         elif first is not None and period_ns > GAP_PERIODS * self._gap_period_ns:
-            self._forget_pace()  # a wrong pace only looked like a gap: scans read late come in bursts
-            self._paced_from = scan
+            self._forget_pace(scan)  # a wrong pace only looked like a gap: scans read late come in bursts
         elif first is not None and gap_ns >= self._gap_period_ns / 2:
             periods = (scan.on_bus_ns - first.on_bus_ns) / self._gap_period_ns
             self._lateness.append(periods - (scan.number - first.number))
             if len(self._lateness) == SETTLING_SCANS:
                 self.missed += max(round(min(self._lateness)), 0)
-                self._forget_pace()
-                self._paced_from = scan
+                self._forget_pace(scan)
 
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
         """Return the mean period over all scans since the last gap, if there were enough, else the median.
