@@ -24,6 +24,7 @@ GAP_PERIODS: Final = 1.5
 10 ms."""
 SETTLING_SCANS: Final = 5
 """Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
+FEWEST_TOGETHER: Final = 4  # fewest sensors that are read together a few times a period
 LONGEST_PERIOD_S: Final = 0.05  # period from which scans come too seldom to be read together, in [s]
 RESTLESS_NS: Final = NS_PER_S  # time after a contact, in [ns], during which every scan is still read at once
 
@@ -185,7 +186,9 @@ class Cadences:
 
         The link reports a silence of all of them.
         """
-        self._choose_pace()
+        rests = self._newest_ns - self._restless_ns > RESTLESS_NS
+        if rests or self.pace.every_s or len(self._sensors) >= FEWEST_TOGETHER:
+            self._choose_pace(rests=rests)
         if len(self._sensors) + len(self._expected) < 2 or self._first_ns is None:
             return []
         now_ns = self._newest_ns
@@ -208,16 +211,15 @@ class Cadences:
         silent_s = (self._newest_ns - since_ns) / NS_PER_S
         return Event(self._newest_ns, "silent", sensor, f"no scan from sensor {sensor} for {silent_s:.1f} s: {why}")
 
-    def _choose_pace(self) -> None:
+    def _choose_pace(self, *, rests: bool) -> None:
         """Choose the pace for the sensors so far, by the fastest of them."""
         period_s = math.inf
         for cadence in self._sensors.values():
             period_s = min(period_s, (cadence.period_ns or math.inf) / NS_PER_S)
         pace, before = Pace(), self.pace
-        rests = self._newest_ns - self._restless_ns > RESTLESS_NS
         if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self.patience_s / 2):  # faster ones never wait
             pace = Pace(period_s, int(self.patience_s / period_s))
-        elif len(self._sensors) >= 4 and period_s < LONGEST_PERIOD_S:
+        elif len(self._sensors) >= FEWEST_TOGETHER and period_s < LONGEST_PERIOD_S:
             pace = Pace(period_s / 4)
         if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < 0.1 * pace.every_s:
             return  # a measured period jitters
