@@ -40,9 +40,8 @@ from edge.perception.event import Event, Note
 from edge.perception.result import NextTap, Result, Wrench
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Command, Commands
-from edge.pipeline.latest import Latest
 from edge.pipeline.pose_queue import PoseQueue
-from edge.pipeline.result_stream import Stream, paired, pump
+from edge.pipeline.result_stream import Latest, Stream, paired, pump
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.runtime_setup import infer, load_model, open_runtime
 from edge.pipeline.scan_reader import Source
@@ -81,104 +80,36 @@ if TYPE_CHECKING:
 
 # Modules that only some callers need, above all onnxruntime, are imported on use, for start-up time and memory.
 _ON_USE: Final = {
-    "examine": "edge.doctor.examine",
-    "MapSink": "edge.mapping.sink",
-    "ObjectMap": "edge.mapping.sink",
-    "Patch": "edge.perception.patches",
-    "PatchEvent": "edge.perception.patches",
-    "PatchEvents": "edge.perception.patches",
-    "patches": "edge.perception.patches",
-    "take_baselines": "edge.pipeline.baseline_capture",
-    "open_recording": "edge.pipeline.replay_setup",
-    "PoseSource": "edge.pose_sources",
-    "open_poses": "edge.pose_sources",
-    "devices": "firmware_bridge.links.discovery",
+    "edge.doctor.examine": ["examine"],
+    "edge.mapping.sink": ["MapSink", "ObjectMap"],
+    "edge.perception.patches": ["Patch", "PatchEvent", "PatchEvents", "patches"],
+    "edge.pipeline.baseline_capture": ["take_baselines"],
+    "edge.pipeline.replay_setup": ["open_recording"],
+    "edge.pose_sources": ["PoseSource", "open_poses"],
+    "firmware_bridge.links.discovery": ["devices"],
 }
+# fmt: off
 __all__ = [
-    "DEFAULT_MODEL",
-    "DEMO_LOOP",
-    "ID_MAPS",
-    "POSED_MODEL",
-    "USPA44",
-    "USPA46",
-    "Baseline",
-    "BaselineRefusedError",
-    "BridgeError",
-    "Command",
-    "Commands",
-    "Contract",
-    "DeviceError",
-    "EdgeError",
-    "Event",
-    "Fan",
-    "Latest",
-    "LinkLostError",
-    "MapSink",
-    "MessageError",
-    "Model",
-    "ModelError",
-    "ModelMap",
-    "NextTap",
-    "NoDeviceError",
-    "NoResultError",
-    "Note",
-    "ObjectMap",
-    "Pad",
-    "PadPose",
-    "Patch",
-    "PatchEvent",
-    "PatchEvents",
-    "PoseQueue",
-    "PoseSource",
-    "RecordingError",
-    "Result",
-    "Runtime",
-    "Scan",
-    "SensorFile",
-    "SensorFileError",
-    "SensorGeometry",
-    "Sink",
-    "SinkClosedError",
-    "SinkError",
-    "Source",
-    "SourceError",
-    "SourceKind",
-    "Statistics",
-    "Stream",
-    "TimedPose",
-    "UsageError",
-    "WindowError",
-    "Wrench",
-    "bundled_models",
-    "demo_recording",
-    "devices",
-    "examine",
-    "example_recording",
-    "find_model",
-    "infer",
-    "layout_c",
-    "load_baselines",
-    "load_model",
-    "load_sensor_file",
-    "open_poses",
-    "open_recording",
-    "open_runtime",
-    "open_sink",
-    "open_source",
-    "paired",
-    "patches",
-    "pump",
-    "save_baselines",
-    "take_baselines",
-    "unfinished_load",
+    "DEFAULT_MODEL", "DEMO_LOOP", "ID_MAPS", "POSED_MODEL", "USPA44", "USPA46", "Baseline", "BaselineRefusedError",
+    "BridgeError", "Command", "Commands", "Contract", "DeviceError", "EdgeError", "Event", "Fan", "Latest",
+    "LinkLostError", "MapSink", "MessageError", "Model", "ModelError", "ModelMap", "NextTap", "NoDeviceError",
+    "NoResultError", "Note", "ObjectMap", "Pad", "PadPose", "Patch", "PatchEvent", "PatchEvents", "PoseQueue",
+    "PoseSource", "RecordingError", "Result", "Runtime", "Scan", "SensorFile", "SensorFileError", "SensorGeometry",
+    "Sink", "SinkClosedError", "SinkError", "Source", "SourceError", "SourceKind", "Statistics", "Stream",
+    "TimedPose", "UsageError", "WindowError", "Wrench", "bundled_models", "demo_recording", "devices", "examine",
+    "example_recording", "find_model", "infer", "layout_c", "load_baselines", "load_model", "load_sensor_file",
+    "open_poses", "open_recording", "open_runtime", "open_sink", "open_source", "paired", "patches", "pump",
+    "save_baselines", "take_baselines", "unfinished_load",
 ]
+# fmt: on
 
 
 def __getattr__(name: str) -> Any:
     """Return what is imported on use."""
-    if name not in _ON_USE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_ON_USE[name]), name)
+    for module, names in _ON_USE.items():
+        if name in names:
+            return getattr(importlib.import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def open_source(

@@ -4,7 +4,6 @@ EdgeError
 +-- ModelError (ValueError)   a model that is missing, unreadable or breaks the contract
 +-- WindowError (ValueError)  an input that cannot be inferred from: wrong shape or type, or not finite
 +-- UsageError (ValueError)   a request of the caller that cannot be met
-|   +-- SourceTakenError (RuntimeError)  another stream reads the source
 +-- MessageError (ValueError) bytes that are not a packed message
 +-- NoResultError (TimeoutError)  no new result in time
 +-- SinkError (OSError)       a sink that cannot be opened or written
@@ -31,10 +30,6 @@ class WindowError(EdgeError, ValueError):
 
 class UsageError(EdgeError, ValueError):
     """A request of the caller that cannot be met."""
-
-
-class SourceTakenError(UsageError, RuntimeError):
-    """A source that another stream reads: each would get a part of the scans."""
 
 
 class MessageError(EdgeError, ValueError):

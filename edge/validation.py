@@ -1,6 +1,6 @@
 """Checks of the arguments that a caller of the library passes; each raises a UsageError of one line."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -51,23 +51,14 @@ def check_baselines(baselines: Any, geometry: SensorGeometry) -> None:
 
 def check_pads(pads: Any, geometry: SensorGeometry) -> None:
     """Check that pads are one for all sensors, one by each sensor name, or None, with gains of one grid."""
-    if isinstance(pads, Mapping):
-        for name, pad in pads.items():
-            if not isinstance(pad, Pad):
-                raise UsageError(f"pad of sensor {name} is a {type(pad).__name__}, expected a Pad")
-            _check_gains(f"pad of sensor {name}", pad, geometry)
-    elif isinstance(pads, Pad):
-        _check_gains("pad", pads, geometry)
-    elif pads is not None:
-        raise UsageError(f"pad is a {type(pads).__name__}, expected a Pad, or each by its sensor's name")
-
-
-def _check_gains(name: str, pad: Pad, geometry: SensorGeometry) -> None:
-    expected = len(AXES) * geometry.taxel_count
-    if pad.gains is not None and len(pad.gains) != expected:
-        raise UsageError(
-            f"{name} has {len(pad.gains)} gains, expected {expected}, three for each taxel of a {geometry.name}"
-        )
+    gains = len(AXES) * geometry.taxel_count
+    for name, pad in _named("pad", pads):
+        if not isinstance(pad, Pad):
+            raise UsageError(f"{name} is a {type(pad).__name__}, expected a Pad, or each by its sensor's name")
+        if pad.gains is not None and len(pad.gains) != gains:
+            raise UsageError(
+                f"{name} has {len(pad.gains)} gains, expected {gains}, three for each taxel of a {geometry.name}"
+            )
 
 
 def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry) -> None:
@@ -80,8 +71,12 @@ def check_mountings(mountings: Mapping[str, Mounting], geometry: SensorGeometry)
 
 def check_counts_per_newton(counts: float | Mapping[str, float] | None) -> None:
     """Check that counts per newton, of all sensors or by name, are such as a pad may have."""
-    if isinstance(counts, Mapping):
-        for name, one in counts.items():
-            check_positive(f"counts_per_newton of sensor {name}", one, *PAD_RANGES["counts_per_newton"])
-    elif counts is not None:
-        check_positive("counts_per_newton", counts, *PAD_RANGES["counts_per_newton"])
+    for name, one in _named("counts_per_newton", counts):
+        check_positive(name, one, *PAD_RANGES["counts_per_newton"])
+
+
+def _named(what: str, setting: Any) -> Iterable[tuple[str, Any]]:
+    """Return the values of a setting with their names in a message: one for all sensors, one by each name, or none."""
+    if isinstance(setting, Mapping):
+        return [(f"{what} of sensor {sensor}", value) for sensor, value in setting.items()]
+    return [] if setting is None else [(what, setting)]

@@ -10,12 +10,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from edge.api import (
     DEFAULT_MODEL,
@@ -43,6 +44,7 @@ from edge.cli.option_tables import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
 from edge.pipeline.run_statistics import silence_hint
+from edge.pipeline.sink import check_new
 from edge.sinks.registry import check_apart
 from edge.sinks.status_line import MessageSink
 from edge.terminal.stop_signals import stop_on_signals
@@ -121,14 +123,8 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
 
 
 def _source(options: argparse.Namespace, give_up_s: float) -> Source:
-    return open_source(
-        *options.source,
-        sensor=options.sensor,
-        id_map=options.id_map,
-        rate_hz=options.rate_hz,
-        give_up_s=give_up_s,
-        force=options.force,
-    )
+    names = ("sensor", "id_map", "rate_hz", "force")
+    return open_source(*options.source, give_up_s=give_up_s, **{name: getattr(options, name) for name in names})
 
 
 def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
@@ -144,8 +140,7 @@ def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         raise UsageError(f"{path.suffix} cannot be recorded: edge-sr record {made}; {then}")
     if path.suffix != ".mcap":
         path = path.with_name(path.name + ".mcap")
-    if path.exists():  # checked before anything is begun
-        raise SinkError(f"{path} exists: give another name, or delete it first")
+    check_new(path)
     options.sink = [*options.sink, f"mcap:{path}"]
     check_apart(options.sink)
     statistics = Statistics()
@@ -192,55 +187,49 @@ def run(
     `statistics` are filled on the way, so that they are available however the run ends. `mapping` takes the results
     into a map, which the live page shows; it is closed here. `looked_at` is set once somebody looks at that page.
     """
-    stdout_taken = "jsonl:-" in options.sink
-    # glibc gives each thread a heap of its own, in which other threads' free memory is of no use: -8 is M_ARENA_MAX.
-    _of_glibc("mallopt", -8, 1)
+    statistics = Statistics() if statistics is None else statistics
     baselines = None if options.baseline is None else load_baselines(options.baseline, source.sensor_file.orders)
+    loops = options.source == [DEMO_LOOP]
+    is_demo = loops or options.source == ["demo"]
+    posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
+    name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
+    played: Demo | None = None
     # Both around everything: a signal to zero must not end a program that is still loading, or already closing.
     with stop_on_signals() as stop, user_commands() as commands, contextlib.closing(source):
-        loops = options.source == [DEMO_LOOP]
-        is_demo = loops or options.source == ["demo"]
-        posed = mapping is None and (source.states_poses or bool(options.poses))  # a map fuses taps itself
-        name = (POSED_MODEL if posed else DEFAULT_MODEL) if options.model is None else options.model
-        model = None
-        if not stop.is_set():
-            find_model(name)  # first, or a name with a slip would wait for links that are slow to open
-            source.begin()  # its links open while the model loads
-            model = load_model(name, stop=stop)
-        if model is None:
+        if stop.is_set():
             return
-        scores = sys.stderr if stdout_taken else sys.stdout
-        played: Demo | None = None
-        statistics = Statistics() if statistics is None else statistics
+        find_model(name)  # first, or a name with a slip would wait for links that are slow to open
+        with ThreadPoolExecutor(1) as apart:
+            opening = apart.submit(source.open)  # its links open while the model loads
+            model = load_model(name, stop=stop)
+        opening.result()
         with (
             _open_view(options, model.contract, commands) as view,
             _summary(statistics, source),
-            source,
+            contextlib.closing(source),
             contextlib.ExitStack() as closing,
         ):
             hint = partial(silence_hint, options.source, source.counters)
             unchecked = None if model.contract.trust else f"model {model.name} has no checks: act on no pattern of it"
             messages = MessageSink(hint=None if source.kind == "replay" else hint, first=unchecked)
-            given = {"contract": model.contract, "source": source, "fields": options.fields}
-            opener = partial(open_sink, **given, stop=stop, commands=commands)
             if view is not None:
                 view.begin(source, model.name, messages.say, looked_at)
                 print(f"live page: {' or '.join([view.url, *view.other_urls])}", file=sys.stderr, flush=True)
                 if looked_at is not None:
                     print("the recording begins when the page is opened", file=sys.stderr)
+            asked = runtime_options(options)
             if is_demo:
                 from edge.cli import demo
 
+                scores = sys.stderr if "jsonl:-" in options.sink else sys.stdout
                 watching = [messages, *(() if view is None else view.sinks)]
                 played = demo.Demo(model, source, scores, view, watching, commands, loops=loops, maps=mapping is None)
-            asked = runtime_options(options)
+                asked = replace(asked, every_scan=True)  # it shows the run time of every scan
             if loops:
                 # After 100 scans without contact it is at its first tap: 180 lie before it, 34 between taps.
                 asked = replace(asked, idle_reset_s=min(100 / (options.rate_hz or 100.0), asked.idle_reset_s))
-            if is_demo:  # it shows the run time of every scan
-                asked = replace(asked, every_scan=True)
-            per_newton = options.counts_per_newton
-            runtime = open_runtime(model, source, baselines=baselines, counts_per_newton=per_newton, **asdict(asked))
+            settings = {"baselines": baselines, "counts_per_newton": options.counts_per_newton}
+            runtime = open_runtime(model, source, **settings, **asdict(asked))
             give_back_memory()
             sinks: list[Sink] = []
             if played is not None:
@@ -250,9 +239,10 @@ def run(
             sinks.append(messages)
             wanted = _with_status(options.sink, source)
             if "status" in wanted and sys.stdin is not None and sys.stdin.isatty():
-                _tell("keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact")
+                keys = "keys: r forgets earlier taps, z zeroes the free pad, Z zeroes even in contact"
+                print(f"edge-sr: {keys}", file=sys.stderr)
             for text in wanted:
-                sink = opener(text)
+                sink = open_sink(text, model.contract, source, stop=stop, commands=commands, fields=options.fields)
                 if text == "status":
                     closing.callback(sink.close)
                     sinks.append(sink)
@@ -279,14 +269,9 @@ def run(
 
 
 def give_back_memory() -> None:
-    """Give free memory back to the system: a network takes more while it is loaded than afterwards."""
-    _of_glibc("malloc_trim", ctypes.c_size_t(0))
-
-
-def _of_glibc(name: str, *arguments: Any) -> None:
-    """Call a function of glibc's malloc; other C libraries have none of these, and stay as they are."""
-    if (function := getattr(ctypes.CDLL(None), name, None)) is not None:
-        function(*arguments)
+    """Give free memory back to the system, by glibc alone: a network takes more while it is loaded than afterwards."""
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(ctypes.c_size_t(0))
 
 
 def _open_view(
@@ -318,10 +303,6 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
                 if source.unix_offset_ns and statistics.scans:
                     made = time.localtime(source.unix_time_s())  # a pad wears, and its rest level moves
                     print(time.strftime("recorded on %Y-%m-%d at %H:%M", made), file=sys.stderr)
-
-
-def _tell(line: str) -> None:
-    print(f"edge-sr: {line}", file=sys.stderr)
 
 
 def _with_status(sinks: Sequence[str], source: Source) -> list[str]:

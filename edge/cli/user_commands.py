@@ -69,6 +69,6 @@ def _in_front(descriptor: int) -> bool:
 def user_commands() -> Iterator[Commands]:
     """Yield the queue of commands from lines on stdin, or from keys if it is a terminal, and from SIGUSR1."""
     commands = Commands()
-    zero_on_signal = handled(["SIGUSR1"], lambda *_: commands.signalled.add(ZERO))
+    zero_on_signal = handled(["SIGUSR1"], lambda *_: commands.put(ZERO))
     with zero_on_signal, read_stdin(commands), terminal_keys(commands):
         yield commands

@@ -34,7 +34,7 @@ def take_baselines(
         BaselineRefusedError: a pad moved or was loaded, or the source ended too soon.
         DeviceError: no scan arrived for a long time, or no whole new one of a sensor.
         LinkLostError: the link is lost.
-        UsageError: the number of scans is out of range; SourceTakenError if a stream reads the source.
+        UsageError: the number of scans is out of range, or a stream reads the source.
     """
     check_whole("scans", scans, FEWEST_RECORDED if source.kind == "replay" else FEWEST_SCANS)
     check_whole("skip", skip, 0)

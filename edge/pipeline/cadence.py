@@ -24,6 +24,7 @@ GAP_PERIODS: Final = 1.5
 10 ms."""
 SETTLING_SCANS: Final = 5
 """Scans at their pace after a gap before the missing ones are counted; the least late of them decides."""
+FEWEST_TOGETHER: Final = 4  # fewest sensors that are read together a few times a period
 LONGEST_PERIOD_S: Final = 0.05  # period from which scans come too seldom to be read together, in [s]
 RESTLESS_NS: Final = NS_PER_S  # time after a contact, in [ns], during which every scan is still read at once
 
@@ -40,17 +41,18 @@ class Cadence:
         period_ns: time between scans, in [ns], the median of the newest intervals, which neither jitter nor a gap
             moves; None as long as too few have arrived.
         silent: it was reported as silent.
+        since_ns: time before which its silence does not count, in [ns]: its link was away.
     """
 
     def __init__(self, rate_hz: float | None = None) -> None:
         """Begin without a scan; `rate_hz` is the sensor's rate in [Hz], None if unknown."""
         self.last: Scan | None = None
-        self.missed = 0
+        self.missed = self.since_ns = 0
         self.silent = False
         self.period_ns = self._known_ns = None if rate_hz is None else round(NS_PER_S / rate_hz)
         self._intervals: deque[int] = deque(maxlen=31)
         self._hurried = 0
-        self._forget_pace()
+        self._forget_pace(None)
 
     @property
     def rate_hz(self) -> float | None:
@@ -85,9 +87,9 @@ class Cadence:
         if self._known_ns is None and len(self._intervals) >= FEWEST_INTERVALS:
             self.period_ns = sorted(self._intervals)[len(self._intervals) // 2]
 
-    def _forget_pace(self) -> None:
+    def _forget_pace(self, scan: Scan | None) -> None:
         self._before_gap: Scan | None = None  # scan before a gap whose missing ones are not counted yet
-        self._paced_from: Scan | None = None
+        self._paced_from = scan
         self._gap_period_ns = 0.0
         self._lateness: list[float] = []  # of the scans after it, in periods
 
@@ -99,15 +101,13 @@ class Cadence:
                 self._before_gap, self._gap_period_ns = before, self._mean_period_ns(before, period_ns)
             self._lateness.clear()
         elif first is not None and period_ns > GAP_PERIODS * self._gap_period_ns:
-            self._forget_pace()  # a wrong pace only looked like a gap: scans read late come in bursts
-            self._paced_from = scan
+            self._forget_pace(scan)  # a wrong pace only looked like a gap: scans read late come in bursts
         elif first is not None and gap_ns >= self._gap_period_ns / 2:
             periods = (scan.on_bus_ns - first.on_bus_ns) / self._gap_period_ns
             self._lateness.append(periods - (scan.number - first.number))
             if len(self._lateness) == SETTLING_SCANS:
                 self.missed += max(round(min(self._lateness)), 0)
-                self._forget_pace()
-                self._paced_from = scan
+                self._forget_pace(scan)
 
     def _mean_period_ns(self, scan: Scan, period_ns: int) -> float:
         """Return the mean period over all scans since the last gap, if there were enough, else the median.
@@ -134,36 +134,28 @@ class Cadences:
     Attributes:
         missed: scans of all sensors that did not arrive, as far as gaps show.
         late: patterns that were ready later than one period after their scan.
+        patience_s: longest time for which results of sensors at rest may wait, in [s].
         pace: chosen by the newest results.
         waited_ns: a scan before it came late because of the pace, so that its pattern is no worse for being late.
     """
 
-    def __init__(
-        self,
-        expected: Iterable[str] = (),
-        *,
-        recorded: bool = False,
-        rate_hz: float | None = None,
-        patience_s: float = 0.0,
-    ) -> None:
-        """Begin without a scan, with the sensors that should be there; a recording has no cable to check.
-
-        Results of sensors at rest may wait for `patience_s` [s].
-        """
+    def __init__(self, expected: Iterable[str] = (), *, recorded: bool = False, rate_hz: float | None = None) -> None:
+        """Begin without a scan, with the sensors that should be there; a recording has no cable to check."""
         self.missed = self.late = 0
+        self.patience_s = self.waited_ns = 0.0
         self.pace = Pace()
-        self.waited_ns = 0.0
-        self._recorded, self._rate_hz, self._patience_s = recorded, rate_hz, patience_s
+        self._recorded, self._rate_hz = recorded, rate_hz
         self._expected = set(expected)
         self._sensors: dict[str, Cadence] = {}
         self._absent: set[str] = set()
         self._first_ns: int | None = None
         self._newest_ns = self._restless_ns = -RESTLESS_NS
-        self._since_ns: dict[str, int] = {}
 
     def begin_anew(self, time_ns: int, sensors: str = "") -> None:
         """Restart the silence of sensors whose names begin so at `time_ns` [ns], when their link came back."""
-        self._since_ns[sensors] = time_ns
+        for name, cadence in self._sensors.items():
+            if name.startswith(sensors):
+                cadence.since_ns = time_ns
 
     def follow(self, result: Result) -> Event | None:
         """Take the next result of a sensor; return an event if the sensor was silent."""
@@ -175,19 +167,18 @@ class Cadences:
             self._expected.discard(scan.sensor)
         if self._first_ns is None:
             self._first_ns = scan.time_ns
-        since_ns = self._first_ns if cadence.last is None else cadence.last.time_ns
-        missed = cadence.missed
+        last, missed = cadence.last, cadence.missed
         cadence.follow(scan)
         self.missed += cadence.missed - missed
         if result.latency_us is not None and cadence.period_ns is not None and scan.time_ns >= self.waited_ns:
             self.late += result.latency_us * 1e3 > cadence.period_ns
-        self._newest_ns = scan.time_ns
+        self._newest_ns = max(self._newest_ns, scan.time_ns)
         if result.state != "idle" or scan.device_ns is None:  # only time stamps show pauses that a late read hides
-            self._restless_ns = self._newest_ns
+            self._restless_ns = scan.time_ns
         if not cadence.silent:
             return None
         cadence.silent = False
-        away_s = (scan.time_ns - since_ns) / 1e9
+        away_s = (scan.time_ns - (self._first_ns if last is None else last.time_ns)) / NS_PER_S
         return Event(scan.time_ns, "back", scan.sensor, f"sensor {scan.sensor} is back after {away_s:.1f} s")
 
     def look(self) -> list[Event]:
@@ -195,48 +186,45 @@ class Cadences:
 
         The link reports a silence of all of them.
         """
-        self._choose_pace()
+        rests = self._newest_ns - self._restless_ns > RESTLESS_NS
+        if rests or self.pace.every_s or len(self._sensors) >= FEWEST_TOGETHER:
+            self._choose_pace(rests=rests)
         if len(self._sensors) + len(self._expected) < 2 or self._first_ns is None:
             return []
-        heard = {name: (one, one.last.time_ns) for name, one in self._sensors.items() if one.last is not None}
-        newest_ns = max((time_ns for _, time_ns in heard.values()), default=self._first_ns)
+        now_ns = self._newest_ns
         events: list[Event] = []
-        for sensor, (cadence, time_ns) in heard.items():
-            if newest_ns - self._received_ns(sensor, time_ns) > SENSOR_SILENT_NS and not cadence.silent:
-                cadence.silent = True
-                events.append(self._silence(sensor, newest_ns, time_ns, "the recording has none in that time"))
-        if self._expected and newest_ns - self._first_ns > SENSOR_SILENT_NS:
+        for sensor, cadence in self._sensors.items():
+            last = cadence.last
+            if last is None or cadence.silent or now_ns - max(last.time_ns, cadence.since_ns) <= SENSOR_SILENT_NS:
+                continue
+            cadence.silent = True
+            events.append(self._silence(sensor, last.time_ns, "the recording has none in that time"))
+        if self._expected and now_ns - self._first_ns > SENSOR_SILENT_NS:
             missing, self._expected = sorted(self._expected), set()
             self._absent.update(missing)
             why = "the recording has none of it, though there is a baseline or a force for it"
-            events += [self._silence(sensor, newest_ns, self._first_ns, why) for sensor in missing]
+            events += [self._silence(sensor, self._first_ns, why) for sensor in missing]
         return events
 
-    def _silence(self, sensor: str, now_ns: int, since_ns: int, why_recorded: str) -> Event:
+    def _silence(self, sensor: str, since_ns: int, why_recorded: str) -> Event:
         why = why_recorded if self._recorded else "check its cable and its controller, since other sensors continue"
-        return Event(
-            now_ns, "silent", sensor, f"no scan from sensor {sensor} for {(now_ns - since_ns) / 1e9:.1f} s: {why}"
-        )
+        silent_s = (self._newest_ns - since_ns) / NS_PER_S
+        return Event(self._newest_ns, "silent", sensor, f"no scan from sensor {sensor} for {silent_s:.1f} s: {why}")
 
-    def _received_ns(self, sensor: str, time_ns: int) -> int:
-        since_ns = [since_ns for sensors, since_ns in self._since_ns.items() if sensor.startswith(sensors)]
-        return max([time_ns, *since_ns])
-
-    def _choose_pace(self) -> None:
+    def _choose_pace(self, *, rests: bool) -> None:
         """Choose the pace for the sensors so far, by the fastest of them."""
         period_s = math.inf
         for cadence in self._sensors.values():
             period_s = min(period_s, (cadence.period_ns or math.inf) / NS_PER_S)
         pace, before = Pace(), self.pace
-        rests = self._newest_ns - self._restless_ns > RESTLESS_NS
-        if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self._patience_s / 2):  # faster ones never wait
-            pace = Pace(period_s, int(self._patience_s / period_s))
-        elif len(self._sensors) >= 4 and period_s < LONGEST_PERIOD_S:
+        if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self.patience_s / 2):  # faster ones never wait
+            pace = Pace(period_s, int(self.patience_s / period_s))
+        elif len(self._sensors) >= FEWEST_TOGETHER and period_s < LONGEST_PERIOD_S:
             pace = Pace(period_s / 4)
         if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < 0.1 * pace.every_s:
             return  # a measured period jitters
         if pace.reads > 1:
             self.waited_ns = math.inf
         elif before.reads > 1:
-            self.waited_ns = self._newest_ns + 2e9 * before.every_s
+            self.waited_ns = self._newest_ns + 2 * NS_PER_S * before.every_s
         self.pace = pace

@@ -37,6 +37,13 @@ class Command:
     sensor: str | None = None
     force: bool = False
 
+    def carry_out(self, runtime: "Runtime") -> None:
+        """Ask it of a runtime."""
+        if self.name == "reset":
+            runtime.reset()
+        else:
+            runtime.zero(self.sensor, force=self.force)
+
 
 FORMS: Final = '{"cmd": "zero"} with "sensor" and "force" as wanted, {"cmd": "reset"}'
 RESET: Final = Command("reset")
@@ -49,7 +56,6 @@ class Commands:
     Attributes:
         refused: messages that were no command, or came when too many waited.
         reason: why the first of them since the reason was taken was refused; None without.
-        signalled: asked for by a signal, which may come at any moment, also while another is put; twice is once.
         poses: poses of pads, which wait in a queue of their own: a stream of them must not hold up a command.
     """
 
@@ -57,7 +63,6 @@ class Commands:
         """Start empty, without a producer."""
         self.refused = 0
         self.reason: str | None = None
-        self.signalled: set[Command] = set()
         self.poses = PoseQueue()
         self._lock = threading.Lock()
         self._waiting: SimpleQueue[Command] = SimpleQueue()
@@ -69,7 +74,7 @@ class Commands:
         return self._waiting.qsize() >= WAITING
 
     def put(self, command: Command) -> None:
-        """Put a command into the queue."""
+        """Put a command into the queue; a handler of signals may call it, too, also while another is put."""
         self._waiting.put(command)
 
     def refuse(self, reason: str | None = None) -> None:
@@ -84,25 +89,12 @@ class Commands:
 
     def poll(self) -> list[Command]:
         """Return the commands since the last call; never waits."""
-        while self.signalled:
-            self.put(self.signalled.pop())
         for produce in self._producers:
             produce()
         commands: list[Command] = []
         while not self._waiting.empty():
             commands.append(self._waiting.get_nowait())
         return commands
-
-
-def carry_out(commands: Commands, runtime: "Runtime", may_come: Callable[[str], bool] = lambda name: False) -> None:
-    """Carry out the commands that were put since the last call; one for a sensor that `may_come` yet waits for it."""
-    for command in commands.poll():
-        if command.name == "reset":
-            runtime.reset()
-        elif command.sensor is not None and not commands.full and may_come(command.sensor):
-            commands.put(command)
-        else:
-            runtime.zero(command.sensor, force=command.force)
 
 
 class CommandLines:
@@ -112,8 +104,7 @@ class CommandLines:
     """
 
     def __init__(self, commands: Commands, descriptor: int) -> None:
-        self._commands = commands
-        self._descriptor = descriptor
+        self._commands, self._descriptor = commands, descriptor
         self._woken, self._waking = os.pipe()
         self._thread = threading.Thread(target=self._follow, name="command-lines", daemon=True)
         self._thread.start()

@@ -3,45 +3,37 @@
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.scans.pad_constants import Pad
 from firmware_bridge.sensor_file.model import SensorEntry, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 
-_AS_WIRED: Final = frozenset({"mounting"})
-
 
 class GainKeeper:
     """Keeper of the gains that the sensors of one file have learned.
 
     Attributes:
-        trouble: why the last ones could not be kept; None if they were.
+        trouble: why the last ones could not be kept, once it is closed; None if they were.
     """
 
     def __init__(self, path: Path, *, emulated: bool) -> None:
         """Prepare to keep gains in a sensor file; emulated sensors leave that of a real one alone."""
         self.trouble: str | None = None
-        self._path = path
-        self._emulated = emulated
+        self._path, self._emulated = path, emulated
         self._writer = ThreadPoolExecutor(1, "gain-keeper")
         self._written: Future[None] | None = None
 
     def keep(self, sensor: str, learned: Pad) -> None:
         """Begin to write the learned gains of a sensor, which must not wait."""
-        self._written = self._writer.submit(self._write, sensor, learned)
+        self._written = self._writer.submit(keep_learned, self._path, sensor, learned, emulated=self._emulated)
 
     def close(self) -> None:
         """Wait until all is written."""
         self._writer.shutdown()
-        if self._written is not None:
-            self._written.result()  # raises what is no trouble with the file
-
-    def _write(self, sensor: str, learned: Pad) -> None:
         try:
-            self.trouble = None
-            keep_learned(self._path, sensor, learned, emulated=self._emulated)
+            if self._written is not None:
+                self._written.result()
         except SensorFileError as error:
             self.trouble = str(error)
 
@@ -56,7 +48,7 @@ def keep_learned(path: Path, sensor: str, learned: Pad, *, emulated: bool = Fals
     """
     with changing(path):
         known = load_sensor_file(path)
-        entry = known.sensors.get(sensor, SensorEntry(assumed=_AS_WIRED))
+        entry = known.sensors.get(sensor, SensorEntry(assumed=frozenset({"mounting"})))
         before = entry.learned
         surer = before is not None and before.gains_certainty > learned.gains_certainty
         if surer or (emulated and not entry.emulated):

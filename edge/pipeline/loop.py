@@ -6,17 +6,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from operator import attrgetter
-from typing import Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from edge.errors import UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.cadence import Cadences
-from edge.pipeline.commands import Commands, carry_out
-from edge.pipeline.gain_keeper import GainKeeper
-from edge.pipeline.latest import NewestResults
-from edge.pipeline.pose_queue import PoseIntake, PoseQueue
+from edge.pipeline.commands import Commands
+from edge.pipeline.pose_queue import PoseIntake
 from edge.pipeline.run_statistics import COUNTED, Statistics
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
@@ -25,10 +23,14 @@ from firmware_bridge.errors import BridgeError
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.schedule import POLL_S
+from firmware_bridge.schedule import NS_PER_S, POLL_S
+
+if TYPE_CHECKING:
+    from edge.pipeline.gain_keeper import GainKeeper
 
 _UNWRITTEN: Final = attrgetter("unwritten")
 _TROUBLES: Final = attrgetter(*COUNTED)
+LinkState = Literal["up", "silent", "lost", "ended"]
 ALL_HEARD_SCANS: Final = 10  # scans of one sensor of a link after which all sensors of that link have sent some
 COUNTED_NS: Final = 250_000_000  # age of the counters of a record, at most, while all is well, in [ns] of scan time
 
@@ -53,8 +55,6 @@ class Loop:
         duration_s: float | None = None,
         commands: Commands | None = None,
         statistics: Statistics | None = None,
-        patience_s: float = 0.0,
-        clock_s: Callable[[], float] = time.monotonic,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Prepare to make results.
@@ -70,55 +70,57 @@ class Loop:
                 results are made, measured in the time of the recording.
             commands: polled between scans.
             statistics: filled on the way, so that they are available however the stream ends.
-            patience_s: longest time for which results may wait while all sensors are at rest, in [s].
-            clock_s: monotonic, in [s].
             clock_ns: clock of the scans, in [ns].
 
         Raises:
-            UsageError: the duration is out of range; SourceTakenError if the source has another stream.
+            UsageError: the duration is out of range, or the source has another stream.
         """
         if duration_s is not None:
             check_positive("duration_s", duration_s)
         self.statistics = Statistics() if statistics is None else statistics
-        self._source = source
-        self._runtime = runtime
+        self._source, self._runtime = source, runtime
         self._sinks = tuple(sinks)
         self._on_event = on_event
-        self._poses = PoseQueue() if commands is None else commands.poses
+        self._commands = Commands() if commands is None else commands
+        self._poses = self._commands.poses
         self._made: deque[Result | Event] = deque()  # in their order; whoever takes them calls `on_event`
-        self._newest = NewestResults()
-        # Patterns still to be made for scans that waited when one of several calls of inference began.
-        self._left = 0
+        self._newest: dict[str, Result] = {}  # of each sensor, in the order of their first ones
+        self._unseen: dict[str, int] = {}  # results of each sensor up to the newest that nothing returned yet
+        # State of what does not send, by a sensor's name, or by what the names of a link's sensors begin with.
+        self._down: dict[tuple[str, Literal["sensor", "link"]], LinkState] = {}
+        self._ended = False
         self._error: Exception | None = None
         self._turn = threading.RLock()
         self._stop = threading.Event() if stop is None else stop
-        self._length_s = math.inf if duration_s is None else duration_s
-        self._begun_s: float | None = None
-        self._first_ns: int | None = None
-        self._commands = commands
+        self._length_ns = math.inf if duration_s is None else duration_s * NS_PER_S
+        self._begun_ns: int | None = None
         unused_by = None if any(sink.uses_poses for sink in self._sinks) else runtime.unposed
-        self._intake = PoseIntake(runtime, self._poses, recorded=source.patient, unused_by=unused_by)
-        recorded, rate_hz = source.kind == "replay", source.rate_hz
-        self._cadences = Cadences(runtime.expected, recorded=recorded, rate_hz=rate_hz, patience_s=patience_s)
-        self._now_ns = 0
-        self._waited_s = self._refused_s = -math.inf
-        self._clock_s = clock_s
+        why = "of another time than now: add --paced" if source.patient else "which has poses of its own"
+        refused = f"its scans are of a recording, {why}" if source.patient or source.states_poses else None
+        self._intake = PoseIntake(runtime, self._poses, refused=refused, unused_by=unused_by)
+        self._cadences = Cadences(runtime.expected, recorded=source.kind == "replay", rate_hz=source.rate_hz)
+        self._first_ns: int | None = None
+        self._now_ns = 0  # time of a patient source
+        self._waited_ns = self._refused_ns = -math.inf
         self._clock_ns = clock_ns
         self._latency_clock = None if source.patient else clock_ns  # a recording's scans have another clock
-        self._counted: tuple[int, tuple[int, ...], dict[str, int]] = (0, (), {})
-        path = None if source.kind == "replay" else source.sensor_file.path
-        self._keeper = None if path is None else GainKeeper(path, emulated=source.kind == "emulated")
+        self._counted_ns, self._troubles, self._counters = 0, (), dict[str, int]()
+        self._keeper: GainKeeper | None = None
+        if source.kind != "replay" and source.sensor_file.path is not None:
+            from edge.pipeline import gain_keeper
+
+            self._keeper = gain_keeper.GainKeeper(source.sensor_file.path, emulated=source.kind == "emulated")
         source.reserve(self)
 
     @property
     def ended(self) -> bool:
         """True once there are no more results to make."""
-        return self._newest.ended or self._error is not None
+        return self._ended or self._error is not None
 
     @property
     def counters(self) -> dict[str, int]:
         """Counters of the source up to now, maybe ahead of the last result, and of the stream up to that result."""
-        self.statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
+        self._tally()
         return self._source.counters() | self.statistics.counters()
 
     def close(self) -> None:
@@ -156,25 +158,39 @@ class Loop:
 
     def _make(self, wait_s: float) -> None:
         """Take what waits, and make its results: the order of everything that happens in a turn."""
-        source, runtime = self._source, self._runtime
-        if self._begun_s is None:
-            self._begun_s = self._clock_s()
-        over = self._stop.is_set() or (not source.patient and self._clock_s() - self._begun_s >= self._length_s)
+        source, runtime, now_ns = self._source, self._runtime, self._clock_ns()
+        self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
+        over = self._stop.is_set() or (not source.patient and now_ns - self._begun_ns >= self._length_ns)
         try:
-            taken = source.take(0.0 if over or runtime.waiting else wait_s) if not (over and source.patient) else None
+            more = not (over and source.patient) and self._take(0.0 if over or runtime.waiting else wait_s)
+            due = len(runtime.waiting)
+            while more and due > 0:
+                due -= self._infer()
+                # Scans that come meanwhile join those that wait, but do not prolong what a caller waits for.
+                more = due <= 0 or over or self._take(0.0)
         except BridgeError:
             self._make_patterns()
             raise
-        self.statistics.overruns = source.overruns
-        if taken is None or (source.patient and self._is_too_long(taken)):
+        if over or not more or source.patient:
             self._make_patterns()
-            self._end()
+        if over or not more:
+            self._finish()
+            self._ended = True
             return
-        if (commands := self._commands) is not None:
-            carry_out(commands, runtime, self._may_come)
-            self.statistics.commands_refused = commands.refused
-            if commands.reason is not None:
-                self._tell_refusal(commands, commands.reason)
+        for event in self._cadences.look():
+            self._tell(event)
+        source.pace = self._cadences.pace
+
+    def _take(self, wait_s: float) -> bool:
+        """Pass on what waits: commands, poses, and scans that are to be followed; False where no more will come."""
+        source, runtime = self._source, self._runtime
+        taken = source.take(wait_s)
+        if taken is None or (source.patient and self._is_too_long(taken)):
+            return False
+        for command in self._commands.poll():
+            command.carry_out(runtime)
+        if self._commands.reason is not None:
+            self._tell_refusal(self._commands.reason)
         if self._poses.begun or source.states_poses:
             self._take_poses(taken)
         for one in taken:
@@ -186,43 +202,29 @@ class Loop:
             elif isinstance(one, Notice):
                 self._make_patterns()
                 self._take_notice(one)
-        # Scans that come while patterns are made join those that wait, but do not prolong what a caller waits for.
-        self._left = min(self._left or len(runtime.waiting), len(runtime.waiting))
-        self._left -= self._infer() if runtime.waiting else 0
-        if over or source.patient:
-            self._make_patterns()
-        elif self._left > 0:
-            return
-        if over:
-            self._end()
-            return
-        self._left = 0
-        for event in self._cadences.look():
-            self._tell(event)
-        source.pace = self._cadences.pace
         if not taken:
             self._rest(wait_s)
+        return True
 
     def _is_too_long(self, taken: Sequence[Scan | Notice | TimedPose]) -> bool:
         """Return whether the time of a patient source, which is that of its scans, is over."""
-        times_ns = [one.time_ns for one in taken if isinstance(one, Scan)]
-        if not times_ns:
-            return False
-        self._first_ns = times_ns[0] if self._first_ns is None else self._first_ns
-        return times_ns[-1] - self._first_ns >= self._length_s * 1e9
-
-    def _end(self) -> None:
-        self._finish()
-        self._newest.ended = True
+        for one in taken:
+            if isinstance(one, Scan):
+                self._now_ns = one.time_ns
+                self._first_ns = one.time_ns if self._first_ns is None else self._first_ns
+        return self._first_ns is not None and self._now_ns - self._first_ns >= self._length_ns
 
     def _finish(self) -> None:
         """Keep what was learned; there are no more results."""
-        self._left = 0
         if self._keeper is not None:
             keeper, self._keeper = self._keeper, None
             keeper.close()
             if keeper.trouble is not None:
                 self._tell(Event(self._clock_ns(), "note", None, f"learned gains are not kept: {keeper.trouble}"))
+        self._tally()
+        if self._sinks:
+            troubles = [sink.trouble for sink in self._sinks if sink.trouble is not None]
+            self.statistics.sink_trouble = "; ".join(troubles) or None
 
     def _no_sensor(self, name: str) -> str | None:
         """Return why no sensor has this name; None if one has, or if one that has it may still come.
@@ -238,20 +240,17 @@ class Loop:
         most = max((scans for other, scans in heard.items() if other.startswith(prefix)), default=0)
         return f"no sensor {name!r}: sensors are {', '.join(sorted(heard))}" if most >= ALL_HEARD_SCANS else None
 
-    def _may_come(self, name: str) -> bool:
-        return name not in self.statistics.scans_of_each() and self._no_sensor(name) is None
-
-    def _tell_refusal(self, commands: Commands, reason: str) -> None:
-        now_s = self._clock_s()
-        if now_s - self._refused_s >= 10:  # a stream of refused ones must not flood
-            self._refused_s, commands.reason = now_s, None
-            self._tell(Event(self._clock_ns(), "refused", None, reason))
+    def _tell_refusal(self, reason: str) -> None:
+        now_ns = self._clock_ns()
+        if now_ns - self._refused_ns >= 10 * NS_PER_S:  # a stream of refused ones must not flood
+            self._refused_ns, self._commands.reason = now_ns, None
+            self._tell(Event(now_ns, "refused", None, reason))
 
     def _rest(self, wait_s: float) -> None:
         """Let the sinks do what is due, four times a second while no scan comes."""
-        now_s = self._clock_s()
-        if wait_s or now_s - self._waited_s >= POLL_S:
-            self._waited_s = now_s
+        now_ns = self._clock_ns()
+        if wait_s or now_ns - self._waited_ns >= POLL_S * NS_PER_S:
+            self._waited_ns = now_ns
             for sink in self._sinks:
                 sink.wait()
 
@@ -259,17 +258,11 @@ class Loop:
         """Pass poses on to the runtime: those from outside, and those of the source."""
         recorded = [one for one in taken if isinstance(one, TimedPose)]
         first_ns = min((one.time_ns for one in taken if isinstance(one, Scan)), default=None)
-        if not self._source.patient:
-            self._now_ns = self._clock_ns()
-        elif first_ns is not None:
-            self._now_ns = first_ns
-        intake, statistics = self._intake, self.statistics
-        poses = intake.take(recorded, first_ns, self._now_ns, self._no_sensor)
-        statistics.poses, statistics.poses_refused = intake.used, self._poses.refused
-        statistics.poses_dropped = self._poses.dropped
+        now_ns = self._now_ns if self._source.patient else self._clock_ns()
+        poses = self._intake.take(recorded, first_ns, now_ns, self._no_sensor)
         for sink in self._sinks if poses else ():
             sink.pose(poses)
-        for event in intake.look(self._now_ns):
+        for event in self._intake.look(now_ns):
             self._tell(event)
 
     def _make_patterns(self) -> None:
@@ -289,28 +282,34 @@ class Loop:
 
     def _follow(self, result: Result) -> None:
         """Count a result, and hand it on."""
-        cadences, statistics = self._cadences, self.statistics
-        back = cadences.follow(result)
-        statistics.add(result)
-        statistics.late, statistics.missed = cadences.late, cadences.missed
+        back = self._cadences.follow(result)
+        self.statistics.add(result)
         if back is not None:
             self._tell(back)
+        self._tally()
         if self._sinks:
             # Counters are read where they are due, and where something was lost: merging them took a tenth of a scan.
-            statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
-            counted_ns, troubles, counters = self._counted
-            time_ns = result.scan.time_ns
-            if not (0 <= time_ns - counted_ns < COUNTED_NS and result.scan.whole and troubles == _TROUBLES(statistics)):
-                counters = self._count(time_ns)
+            scan, troubles = result.scan, _TROUBLES(self.statistics)
+            if not (0 <= scan.time_ns - self._counted_ns < COUNTED_NS and scan.whole and troubles == self._troubles):
+                self._counted_ns, self._troubles = scan.time_ns, troubles
+                self._counters = self._source.counters() | self.statistics.counters()
             for sink in self._sinks:
-                sink.write(result, counters)
-        self._newest.add(result)
+                sink.write(result, self._counters)
+        name = result.scan.sensor
+        self._newest[name] = result
+        self._unseen[name] = self._unseen.get(name, 0) + 1
         self._made.append(result)
 
-    def _count(self, time_ns: int) -> dict[str, int]:
-        counters = self.counters
-        self._counted = (time_ns, _TROUBLES(self.statistics), counters)
-        return counters
+    def _tally(self) -> None:
+        """Bring the statistics up to date with what is counted elsewhere."""
+        statistics, poses = self.statistics, self._poses
+        statistics.overruns = self._source.overruns
+        statistics.late, statistics.missed = self._cadences.late, self._cadences.missed
+        statistics.poses, statistics.poses_refused = self._intake.used, poses.refused
+        statistics.poses_dropped = poses.dropped
+        statistics.commands_refused = self._commands.refused
+        if self._sinks:  # those of a closed stream have told theirs
+            statistics.unwritten = sum(map(_UNWRITTEN, self._sinks))
 
     def _take_notice(self, notice: Notice) -> None:
         """Forget readings and taps from before an outage, and report the notice as an event."""
@@ -325,5 +324,9 @@ class Loop:
             counters = self.counters
             for sink in self._sinks:
                 sink.tell(event, counters)
-        self._newest.tell(event)
+        down = (event.sensors, "link") if event.sensor is None else (event.sensor, "sensor")
+        if event.kind in ("silent", "lost"):
+            self._down[down] = event.kind
+        elif event.kind == "back":
+            self._down.pop(down, None)
         self._made.append(event)

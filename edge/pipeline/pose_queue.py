@@ -17,10 +17,11 @@ from firmware_bridge.schedule import POSES_SILENT_NS
 
 FURTHEST_AHEAD_NS: Final = 1_000_000_000
 """Longest time that a pose may lie ahead of now, in [ns]: all others until then would come too late."""
-_FIELDS: Final = ("cmd", "x_mm", "y_mm", "turn_deg", "error_mm", "error_deg", "sensor", "time_ns", "holds")
-
-
 LONGEST_BYTES: Final = 4096  # bytes of one message: ten times those of a pose
+WAITING_POSES: Final = 1024
+"""Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""
+REPEATED_NS: Final = 10_000_000_000
+"""Time after which the same reason is reported again, in [ns]: a stream of bad poses must not flood."""
 
 
 def json_object(message: str | bytes) -> dict[str, Any] | None:
@@ -46,48 +47,38 @@ def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
     Raises:
         PoseError: a field is missing, unknown, of another kind or out of range.
     """
-    if fields.get("cmd", "pose") != "pose":
-        raise PoseError("cmd", f"cmd is {_shown(fields['cmd'])}, expected pose: only poses are taken here")
-    unknown = sorted(map(str, fields.keys() - set(_FIELDS)))
-    if unknown:
-        raise PoseError("unknown", f"it has {_shown(unknown[0])}, expected some of {', '.join(_FIELDS)}")
-    number = dict.fromkeys(("x_mm", "y_mm"), None) | {
-        "turn_deg": 0.0,
-        "error_mm": PLACE_ERROR_MM,
-        "error_deg": TURN_ERROR_DEG,
-    }
-    values = {name: _number(name, fields.get(name, default)) for name, default in number.items()}
-    sensor, holds, time_ns = fields.get("sensor"), fields.get("holds", False), fields.get("time_ns", now_ns)
-    if not (sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))):
-        raise PoseError("sensor", f"sensor is {_shown(sensor)}, expected the name of a sensor, or null")
-    if not isinstance(holds, bool):
-        raise PoseError("holds", f"holds is {_shown(holds)}, expected true or false")
-    if not isinstance(time_ns, int) or isinstance(time_ns, bool) or not 0 <= time_ns < 2**63:
-        raise PoseError("time_ns", f"time_ns is {_shown(time_ns)}, expected a whole number of nanoseconds")
+    errors = {"error_mm": PLACE_ERROR_MM, "error_deg": TURN_ERROR_DEG}
+    numbers = {"x_mm": None, "y_mm": None, "turn_deg": 0.0} | errors
+    known = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
+    given = {**known, **fields}
+    for name in given.keys() - known.keys():
+        raise PoseError("unknown", f"it has {_shown(name)}, expected some of {', '.join(known)}")
+    values: dict[str, Any] = {name: as_float(given[name]) for name in numbers}
+    sensor, time_ns, holds = given["sensor"], given["time_ns"], given["holds"]
+    is_name = sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))
+    is_time = isinstance(time_ns, int) and not isinstance(time_ns, bool) and 0 <= time_ns < 2**63
+    for name, fits, expected in (
+        ("cmd", given["cmd"] == "pose", "pose: only poses are taken here"),
+        *((name, value is not None, "a number") for name, value in values.items()),
+        ("sensor", is_name, "the name of a sensor, or null"),
+        ("holds", isinstance(holds, bool), "true or false"),
+        ("time_ns", is_time, "a whole number of nanoseconds"),
+    ):
+        if not fits:
+            got = "missing" if name in numbers and given[name] is None else _shown(given[name])
+            raise PoseError(name, f"{name} is {got}, expected {expected}")
     try:
         pose = PadPose(**values)
     except ValueError as error:
         raise PoseError("range", str(error)) from error
-    return in_time(TimedPose(pose, time_ns, sensor, holds), now_ns)
-
-
-def in_time(timed: TimedPose, now_ns: int) -> TimedPose:
-    """Return a pose that does not lie far ahead of now, or raise a PoseError."""
-    ahead_ns = timed.time_ns - now_ns
+    ahead_ns = time_ns - now_ns
     if ahead_ns > FURTHEST_AHEAD_NS:
         raise PoseError(
             "time_ns",
             f"time_ns is {ahead_ns / 1e9:.3g} s ahead of now, expected CLOCK_MONOTONIC of this machine, as in "
             "records: leave it out for the time of arrival",
         )
-    return timed
-
-
-def _number(name: str, value: object) -> float:
-    number = as_float(value)
-    if number is None:
-        raise PoseError(name, f"{name} is {'missing' if value is None else _shown(value)}, expected a number")
-    return number
+    return TimedPose(pose, time_ns, sensor, holds)
 
 
 def _shown(value: object) -> str:
@@ -96,10 +87,6 @@ def _shown(value: object) -> str:
         return ascii(value)[:40]
     except ValueError:
         return "a number of too many digits"
-
-
-WAITING_POSES: Final = 1024
-"""Poses that may wait, a second at 1000 poses/s: four times as long as the loop ever waits for a scan."""
 
 
 class PoseQueue:
@@ -113,8 +100,7 @@ class PoseQueue:
 
     def __init__(self) -> None:
         self.begun = False
-        self.refused = 0
-        self.dropped = 0
+        self.refused = self.dropped = 0
         self._lock = threading.Lock()
         self._waiting: deque[TimedPose] = deque()
         self._reasons: dict[str, str] = {}
@@ -140,43 +126,31 @@ class PoseQueue:
         parsed = json_object(text)
         if parsed is None:
             self.refuse(PoseError("json", f'{text[:40]!a} is not JSON such as {{"x_mm": 1.5, "y_mm": 0}}'))
-            return
-        if parsed.get("sensor") is None:
-            parsed["sensor"] = sensor
-        self.put_fields(parsed, now_ns)
+        else:
+            self.put_fields(parsed if parsed.get("sensor") is not None else parsed | {"sensor": sensor}, now_ns)
 
     def refuse(self, error: PoseError) -> None:
         """Count a pose that cannot be taken."""
-        with self._lock:
-            self.refused += 1
-            self.begun = True
-            self._reasons.setdefault(error.reason, f"a pose is refused: {error}")
+        self.warn(error.reason, f"a pose is refused: {error}", refused=1)
 
-    def warn(self, reason: str, text: str) -> None:
-        """Put a line on poses that are taken all the same; `reason` is a short name of it."""
+    def warn(self, reason: str, text: str, *, refused: int = 0) -> None:
+        """Put a line on poses, which may be taken all the same; `reason` is a short name of it."""
         with self._lock:
+            self.refused += refused
             self.begun = True
             self._reasons.setdefault(reason, text)
 
     def take(self) -> list[TimedPose]:
         """Return the poses that wait, in the order in which they came."""
-        if not self._waiting:
-            return []
         with self._lock:
             poses, self._waiting = list(self._waiting), deque()
         return poses
 
     def take_reasons(self) -> dict[str, str]:
         """Return a line for each reason since the last call, by its short name."""
-        if not self._reasons:
-            return {}
         with self._lock:
             reasons, self._reasons = self._reasons, {}
         return reasons
-
-
-REPEATED_NS: Final = 10_000_000_000
-"""Time after which the same reason is reported again, in [ns]: a stream of bad poses must not flood."""
 
 
 @dataclass(slots=True)
@@ -196,23 +170,15 @@ class PoseIntake:
     """
 
     def __init__(
-        self,
-        runtime: Runtime,
-        queue: PoseQueue,
-        *,
-        recorded: bool = False,
-        unused_by: str | None = None,
+        self, runtime: Runtime, queue: PoseQueue, *, refused: str | None = None, unused_by: str | None = None
     ) -> None:
-        """Begin without a pose; to recorded scans no pose of now belongs.
+        """Begin without a pose; `refused` is why none but those of the source are taken.
 
         `unused_by` names the model where neither it nor any sink uses poses.
         """
         self.used = 0
-        self._runtime = runtime
-        self._queue = queue
-        self._recorded = recorded
-        self._unused_by = unused_by
-        self._played: set[str | None] = set()
+        self._runtime, self._queue = runtime, queue
+        self._refused, self._unused_by = refused, unused_by
         self._courses: dict[str | None, _Course] = {}
         self._reported_ns: dict[str, int] = {}
         self._events: list[Event] = []
@@ -230,16 +196,17 @@ class PoseIntake:
         returns why no sensor has a name.
         """
         waiting = self._queue.take()
-        if recorded:
-            self._played.update(one.sensor for one in recorded)
-        if waiting and (self._recorded or self._played):
-            waiting = [one for one in waiting if not self._refused_for_recording(one)]
+        if self._refused is not None:
+            for _ in waiting:
+                self._queue.refuse(PoseError("recorded", self._refused))
+            waiting = []
         taken: list[TimedPose] = []
         for timed in (*recorded, *waiting):
             if timed.sensor is not None and (why := no_sensor(timed.sensor)) is not None:
                 self._queue.refuse(PoseError("sensor", why))
             elif self._runtime.pose(timed.pose, timed.time_ns, timed.sensor, holds=timed.holds):
                 taken.append(replace(timed, used_from_ns=now_ns if first_scan_ns is None else first_scan_ns))
+                self._follow(timed, now_ns)
             else:
                 earlier = f"that of the pose{_of(timed.sensor)} before"
                 text = f"its time, {timed.time_ns} ns, is not after {earlier}: send them in order"
@@ -248,8 +215,6 @@ class PoseIntake:
             text = f"poses come, but model {self._unused_by} takes none, so that each pattern is of one tap"
             self._queue.warn("model", f"{text}: give --model {POSED_MODEL} for more")
         self.used += len(taken)
-        for timed in taken:
-            self._follow(timed, now_ns)
         return taken
 
     def look(self, now_ns: int) -> list[Event]:
@@ -270,22 +235,11 @@ class PoseIntake:
         events, self._events = self._events, []
         return events
 
-    def _refused_for_recording(self, timed: TimedPose) -> bool:
-        if self._recorded:
-            why = "of another time than now: add --paced"
-        elif self._played & {timed.sensor, None}:
-            why = f"which has poses{_of(timed.sensor)} of its own"
-        else:
-            return False
-        self._queue.refuse(PoseError("recorded", f"its scans are of a recording, {why}"))
-        return True
-
     def _follow(self, timed: TimedPose, now_ns: int) -> None:
         before = self._courses.get(timed.sensor)
         self._courses[timed.sensor] = _Course(now_ns, timed.holds)
         if before is not None and before.silent:
-            away_s = (now_ns - before.last_ns) / 1e9
-            text = f"poses{_of(timed.sensor)} are back after {away_s:.1f} s"
+            text = f"poses{_of(timed.sensor)} are back after {(now_ns - before.last_ns) / 1e9:.1f} s"
             self._events.append(Event(now_ns, "poses_back", timed.sensor, text))
 
 

@@ -1,25 +1,46 @@
 """Stream of the results of a source: every one, the newest, or pairs of several sensors; and its loop into sinks."""
 
 import gc
+import math
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from edge.errors import NoResultError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.runtime import Runtime
-from edge.pipeline.latest import Latest
-from edge.pipeline.loop import ALL_HEARD_SCANS, Loop
+from edge.pipeline.loop import ALL_HEARD_SCANS, LinkState, Loop
 from edge.pipeline.pose_queue import PoseError, pose_of_fields
 from edge.pipeline.run_statistics import Statistics
 from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
 from edge.pipeline.sink import Sink
 from edge.validation import check_positive
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
-from firmware_bridge.schedule import POLL_S
+from firmware_bridge.schedule import NS_PER_S, POLL_S
+
+
+@dataclass(frozen=True, slots=True)
+class Latest:
+    """Newest result of a sensor, with all that decides whether it still holds.
+
+    Attributes:
+        result: None before the first.
+        age_s: time since its reading was taken, at most, in [s]; it grows until the next scan arrives, and is infinite
+            before the first result.
+        link: "up"; "silent", no scan arrives; "lost", the adapter is gone; "ended", no more will come.
+        new: False if an earlier call, or an iteration, returned this result.
+        skipped: results of the sensor that nothing returned, since the last one that was.
+    """
+
+    result: Result | None
+    age_s: float
+    link: LinkState
+    new: bool
+    skipped: int
 
 
 class Stream(Loop):
@@ -91,7 +112,7 @@ class Stream(Loop):
         """
         while True:
             yield from self._returned()
-            if self.ended and self._error is None:
+            if self._ended and self._error is None:
                 return
             self._step(POLL_S)
 
@@ -100,9 +121,9 @@ class Stream(Loop):
         while True:
             for result in self._returned():
                 yield result
-            if self.ended and self._error is None:
+            if self._ended and self._error is None:
                 return
-            await self._step_beside()
+            await self._step_beside(POLL_S)
 
     def latest(self, sensor: str | None = None) -> Latest:
         """Return the newest result of a sensor, with its age and the state of its link; never waits for a scan.
@@ -118,16 +139,14 @@ class Stream(Loop):
                 that is not paced.
             LinkLostError: and other errors, as `__iter__` does, now and at every later call.
         """
-        self._round(0.0)
+        self._step_live(0.0)
         self.check_sensor(sensor)
-        return self._taken_newest(sensor)
+        return self._take_newest(sensor)
 
     def latest_of_all(self) -> dict[str, Latest]:
         """Return the newest result of every sensor that has sent a scan, by name; otherwise as `latest`."""
-        self._round(0.0)
-        self._pass_over()
-        now_ns = self._clock_ns()
-        return {name: self._newest.take(name, now_ns) for name in self._newest.sensors}
+        self._step_live(0.0)
+        return {name: self._take_newest(name) for name in tuple(self._newest)}
 
     def read(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
         """Return the newest result of a sensor, after waiting for one that no earlier call returned.
@@ -140,17 +159,15 @@ class Stream(Loop):
             NoResultError: none came in time, or no more will come.
             UsageError: and other errors, as `latest` does.
         """
-        end_s = self._end_s(timeout_s)
-        while not self._newest.has_new(sensor):
-            self._round(min(POLL_S, self._left_s(end_s, sensor)))
-        return self._taken_newest(sensor)
+        for wait_s in self._waits_s(sensor, timeout_s):
+            self._step_live(wait_s)
+        return self._take_newest(sensor)
 
     async def read_async(self, sensor: str | None = None, *, timeout_s: float = 1.0) -> Latest:
         """Return what `read` does, beside other tasks; one of them may cancel it at any time."""
-        end_s = self._end_s(timeout_s)
-        while not self._newest.has_new(sensor):
-            await self._step_beside(min(POLL_S, self._left_s(end_s, sensor)))
-        return self._taken_newest(sensor)
+        for wait_s in self._waits_s(sensor, timeout_s):
+            await self._step_beside(wait_s)
+        return self._take_newest(sensor)
 
     def check_sensor(self, sensor: str | None) -> None:
         """Refuse the name of a sensor that does not exist.
@@ -164,26 +181,47 @@ class Stream(Loop):
         if why is not None:
             raise UsageError(why)
 
-    def _end_s(self, timeout_s: float) -> float:
+    def _waits_s(self, sensor: str | None, timeout_s: float) -> Iterator[float]:
+        """Yield how long to wait for a scan, in [s], again and again until a sensor has a new result."""
         check_positive("timeout_s", timeout_s)
-        return self._clock_s() + timeout_s
+        end_ns = self._clock_ns() + timeout_s * NS_PER_S
+        while not self._unseen.get(self._named(sensor), 0):
+            self.check_sensor(sensor)
+            left_s = (end_ns - self._clock_ns()) / NS_PER_S
+            if left_s <= 0 or self._ended:
+                of, heard = "" if sensor is None else f" of sensor {sensor}", ", ".join(sorted(self._newest)) or "none"
+                raise NoResultError(f"no new result{of}: link {self._link(sensor)}, sensors so far: {heard}")
+            yield min(POLL_S, left_s)
 
-    def _left_s(self, end_s: float, sensor: str | None) -> float:
-        self.check_sensor(sensor)
-        left_s = end_s - self._clock_s()
-        if left_s <= 0 or self._newest.ended:
-            name = "" if sensor is None else f" of sensor {sensor}"
-            raise NoResultError(f"no new result{name}: {self._newest.why_none(sensor)}")
-        return left_s
-
-    def _taken_newest(self, sensor: str | None) -> Latest:
-        latest = self._newest.take(sensor, self._clock_ns())
+    def _take_newest(self, sensor: str | None) -> Latest:
+        name, age_s = self._named(sensor), math.inf
+        result, unseen = self._newest.get(name), self._unseen.get(name, 0)
+        if result is not None:
+            age_s = max(self._clock_ns() - result.scan.not_before_ns, 0) / NS_PER_S
+            self._unseen[name] = 0
         self._pass_over()
-        return latest
+        return Latest(result, age_s, self._link(name or None), unseen > 0, max(unseen - 1, 0))
+
+    def _named(self, sensor: str | None) -> str:
+        """Return the name of a sensor; without one, that of the only sensor so far, or "" before its first result."""
+        if sensor is None and len(self._newest) > 1:
+            raise UsageError(f"there are sensors {', '.join(sorted(self._newest))}: name one of them")
+        return next(iter(self._newest), "") if sensor is None else sensor
+
+    def _link(self, sensor: str | None) -> LinkState:
+        """Return the state of a sensor's link, or the worst of all: an outage is of a sensor, or of all of a link."""
+        if self._ended:
+            return "ended"
+        down: set[LinkState] = set()
+        for (name, what), state in self._down.items():
+            if sensor is None or sensor == name or (what == "link" and sensor.startswith(name)):
+                down.add(state)
+        return "lost" if "lost" in down else "silent" if down else "up"
 
     def run(self) -> None:
-        """Make all results for the sinks alone; raises as `__iter__`."""
-        while self._error is not None or not self._newest.ended:
+        """Make all results for the sinks alone, as late as all of them allow at rest; raises as `__iter__`."""
+        self._cadences.patience_s = min((sink.patience_s for sink in self._sinks), default=0.0)
+        while self._error is not None or not self._ended:
             self._step(POLL_S)
             self._pass_over()
 
@@ -194,26 +232,23 @@ class Stream(Loop):
             if isinstance(made, Event):
                 self._on_event(made)
             else:
-                self._newest.see(made)
+                self._unseen[made.scan.sensor] -= 1
                 yield made
 
-    def _round(self, wait_s: float) -> None:
-        """Make the results of the scans that wait, after waiting at most `wait_s` for them."""
+    def _step_live(self, wait_s: float) -> None:
         if self._source.patient:
             raise UsageError(
                 f"{self._source.name} is a recording that is read as fast as its results are made, without a latest "
                 "one: iterate over the stream, or open it with paced=True"
             )
         self._step(wait_s)
-        while self._left:
-            self._step(0.0)
 
-    async def _step_beside(self, wait_s: float = POLL_S) -> None:
+    async def _step_beside(self, wait_s: float) -> None:
         """Make the next results in a thread, once scans wait; they stay here if the task is cancelled."""
         import asyncio
 
         def wait_and_step() -> None:
-            if not self._left:
+            if not self._runtime.waiting:
                 self._source.wait(wait_s)  # not within a step, which another task would have to wait for
             self._step(0.0)
 
@@ -311,12 +346,6 @@ def pump(source: Source, runtime: Runtime, sinks: Sequence[Sink], statistics: St
 
     Statistics are filled on the way, so that they are available however the run ends; errors are those of the stream.
     """
-    settings = {"patience_s": min((sink.patience_s for sink in sinks), default=0.0), **settings}
     stream = Stream(source, runtime, sinks=sinks, statistics=statistics, **settings)
     with uncollected():
-        try:
-            stream.run()
-        finally:
-            # What the last ones left out belongs to the run, too.
-            statistics.unwritten = sum(sink.unwritten for sink in sinks)
-            statistics.sink_trouble = "; ".join(sink.trouble for sink in sinks if sink.trouble is not None) or None
+        stream.run()

@@ -2,10 +2,9 @@
 
 import math
 import shlex
-from bisect import bisect_left
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from operator import attrgetter
 from typing import Final
 
@@ -14,7 +13,6 @@ from edge.perception.result import Result
 from firmware_bridge.zeroing.drift_tracker import Drift
 
 BUCKETS_PER_OCTAVE: Final = 32  # a quantile is at most 2.2 % too high
-OCTAVES: Final = 26  # that are resolved: up to about a minute in [us]; longer times count as this long
 STAGES: Final = ("zeroing", "incomplete", "idle", "baseline_in_doubt", "dropped", "contact")
 """Stages of a sensor's scans on their way to a pattern."""
 COUNTED: Final = (
@@ -31,21 +29,23 @@ class Histogram:
     def __init__(self) -> None:
         self.count = 0
         self.max = 0.0
-        self._buckets = [0] * (OCTAVES * BUCKETS_PER_OCTAVE + 1)
+        self._buckets: dict[int, int] = {}
 
     def add(self, value: float) -> None:
         """Count a value; below 1 counts as 1."""
         self.count += 1
         self.max = max(self.max, value)
-        self._buckets[math.ceil(min(math.log2(max(value, 1.0)), OCTAVES) * BUCKETS_PER_OCTAVE)] += 1
+        bucket = math.ceil(math.log2(max(value, 1.0)) * BUCKETS_PER_OCTAVE)
+        self._buckets[bucket] = self._buckets.get(bucket, 0) + 1
 
     def quantile(self, share: float) -> float | None:
         """Return the upper edge of the bucket that holds the `share`-th value; None without values."""
-        if self.count == 0:
-            return None
-        wanted = max(1, math.ceil(share * self.count))
-        index = bisect_left(list(accumulate(self._buckets)), wanted)
-        return min(2.0 ** (index / BUCKETS_PER_OCTAVE), self.max)
+        left = max(1, math.ceil(share * self.count))
+        for bucket, count in sorted(self._buckets.items()):
+            left -= count
+            if left <= 0:
+                return min(2.0 ** (bucket / BUCKETS_PER_OCTAVE), self.max)
+        return None
 
 
 @dataclass(slots=True)
@@ -227,21 +227,19 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
     """Return what came of the sources, as the user named them, what may be wrong, and what to do."""
     source = f" --source {shlex.quote(sources[0])}" if len(sources) == 1 else ""
     doctor = f"edge-sr doctor{source} shows what is wrong"
-    arrived = counters()
-    frames, received, messages = (arrived.get(name, 0) for name in ("frames", "received_bytes", "messages"))
-    if messages:
-        why = max(_MESSAGES, key=lambda name: arrived.get(name, 0))
-        if arrived.get(why, 0):
-            return f"{messages} messages came from the server, and no reading in them: {_MESSAGES[why]}; {doctor}"
-        return f"{messages} messages came from the server, and no whole scan in them; {doctor}"
-    if frames:
-        came = "none of a taxel: another kind of pad (--id-map), or another bus"
-        if arrived.get("readings", 0):
-            came = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
-        return f"{frames} CAN frames came, and {came}; {doctor}"
-    bad, binary = arrived.get("bad_lines", 0), arrived.get("non_ascii_lines", 0)
+    arrived = Counter(counters())
+    received, bad, binary = arrived["received_bytes"], arrived["bad_lines"], arrived["non_ascii_lines"]
+    if arrived["messages"]:
+        why = max(_MESSAGES, key=arrived.__getitem__)
+        lack = f"no reading in them: {_MESSAGES[why]}" if arrived[why] else "no whole scan in them"
+        return f"{arrived['messages']} messages came from the server, and {lack}; {doctor}"
+    if arrived["frames"]:
+        lack = "none of a taxel: another kind of pad (--id-map), or another bus"
+        if arrived["readings"]:
+            lack = "no whole scan: frames are lost, or this is another kind of pad (--id-map)"
+        return f"{arrived['frames']} CAN frames came, and {lack}; {doctor}"
     # An adapter that was reset may send one line without a CAN frame; bytes of no line are those of four long ones.
-    if bad + binary >= 4 or arrived.get("skipped_bytes", 0) >= 120:
+    if bad + binary >= 4 or arrived["skipped_bytes"] >= 120:
         what = "text of another device (a modem, a GPS receiver)"
         if not bad + binary:
             what = "no line that ends as an adapter's: another device, such as one whose lines end with LF alone"
@@ -251,13 +249,12 @@ def silence_hint(sources: Sequence[str], counters: Callable[[], Mapping[str, int
             f"{received} bytes came, and no CAN frame in them: {what}; edge-sr devices lists what is plugged in, and "
             "@BAUD after the port sets a speed"
         )
-    errors = sum(arrived.get(name, 0) for name in ("error_frames", "fd_frames"))
-    if errors:
+    if errors := arrived["error_frames"] + arrived["fd_frames"]:
         return (
             f"{errors} error frames or frames of CAN FD came, and no reading: the bus runs at another bitrate than "
             f"1 Mbit/s, or lacks its termination; {doctor}"
         )
-    if arrived.get("refusals", 0):
+    if arrived["refusals"]:
         return f"the adapter refused {arrived['refusals']} commands, and sent no CAN frame; {doctor}"
     came = f"{received} bytes came, the adapter's answers alone" if received else "nothing came"
     return f"{came}: is the sensor powered and its cable in? {doctor}"

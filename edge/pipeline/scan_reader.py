@@ -5,13 +5,11 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, wait
 from contextlib import ExitStack, suppress
-from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Final, Protocol, Self
+from typing import Any, Final, Self
 
-from edge.errors import SourceTakenError, UsageError
+from edge.errors import UsageError
 from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
@@ -24,19 +22,6 @@ from firmware_bridge.sensor_file.model import SensorFile
 
 CAPACITY_SCANS: Final = 1024
 """Scans that may wait, five seconds of two sensors at 100 Hz: only a sink that hangs lets so many wait."""
-
-
-class Reading(Protocol):
-    """Stream as seen by its source."""
-
-    @property
-    def ended(self) -> bool:
-        """True once it takes no more scans."""
-        ...
-
-    def close(self) -> None:
-        """End it."""
-        ...
 
 
 class Source:
@@ -62,7 +47,6 @@ class Source:
     def __init__(
         self,
         *links: Link,
-        capacity_scans: int = CAPACITY_SCANS,
         sensor_file: SensorFile | None = None,
         rate_hz: float | None = None,
         force: bool = False,
@@ -91,19 +75,17 @@ class Source:
         self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
         self._last_ns = 0
         self._opened = self._closed = False
-        self._opening: Future[None] | None = None
+        self._open = ExitStack()
+        self._threads: list[threading.Thread] = []
         self._waiting: list[Scan | Notice | TimedPose] = []
         self._lock = threading.Lock()
         # Holds one item while something waits, or no more will come. Unlike a Condition it wakes its reader without
         # running Python on either side: waking was half of the cost of a scan.
         self._bell: SimpleQueue[None] = SimpleQueue()
-        self._capacity_scans = capacity_scans
         self._through = False
-        self._threads: list[threading.Thread] = []
         self._reading = len(links)
-        self._failed: Future[None] | None = None
-        self._open = ExitStack()
-        self._stream: Callable[[], Reading | None] = lambda: None  # a stream that was dropped has ended
+        self._failed: BaseException | None = None
+        self._stream: Callable[[], Any] = lambda: None  # the one that takes; one that was dropped has ended
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else "open" if self._opened else "not open"
@@ -114,14 +96,6 @@ class Source:
 
     def __exit__(self, *exc_info: object) -> None:
         self.close()
-
-    def begin(self) -> None:
-        """Begin to open the links and to read, in a thread, for a caller that prepares something else meanwhile.
-
-        `open` waits for it and raises its error. `close` also ends what was begun and never opened.
-        """
-        if self._opening is None:
-            self._opening, _ = _started("source-opening", self._open_links)
 
     def open(self) -> Self:
         """Open the links and begin to read; `close` ends it, as does the end of a with statement or of the program.
@@ -134,10 +108,16 @@ class Source:
         if self._opened or self._closed:
             state = "opened" if self._opened else "closed"
             raise UsageError(f"source {self.name} was {state} before: make another, with open_source")
-        if self._opening is None:
-            self._open_links()
-        else:
-            self._opening.result()
+        with ExitStack() as opening:
+            for reader in self._readers:
+                opening.enter_context(reader)
+            kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
+            refuse_emulated(self.sensor_file, kind, self._force)
+            if not self.patient:
+                opening.callback(self._end_reading)
+                self._threads = [self._started(reader) for reader in self._readers]
+            self._open = opening.pop_all()
+        atexit.register(self.close)
         self._opened = True
         return self
 
@@ -147,20 +127,18 @@ class Source:
         stream = self._stream()
         if stream is not None:
             stream.close()
-        if self._opening is not None:
-            wait([self._opening])
         atexit.unregister(self.close)
         self._open.close()
 
-    def reserve(self, stream: "Reading | None" = None) -> None:
-        """Let a stream take the scans from now on; None only asks whether one could.
+    def reserve(self, stream: Any = None) -> None:
+        """Let a `Stream` take the scans from now on; None only asks whether one could.
 
         Raises:
-            SourceTakenError: another stream does.
+            UsageError: another stream does.
         """
         before = self._stream()
         if before is not None and not before.ended:
-            raise SourceTakenError(
+            raise UsageError(
                 f"source {self.name} has a stream already, and each would get a part of its scans: use that one, or "
                 "end it with close()"
             )
@@ -227,7 +205,7 @@ class Source:
                 return taken
             self._through = True
         if self._failed is not None:
-            self._failed.result()
+            raise self._failed
         return None
 
     def wait(self, timeout_s: float) -> None:
@@ -237,57 +215,6 @@ class Source:
         with suppress(Empty):
             self._bell.get(timeout=timeout_s)
             self._bell.put(None)
-
-    def _open_links(self) -> None:
-        with ExitStack() as opening:
-            for reader in self._readers:
-                opening.enter_context(reader)
-            kind = _one_kind([reader.link for reader in self._readers])  # some know their kind only now
-            refuse_emulated(self.sensor_file, kind, self._force)
-            if not self.patient:
-                self._begin_reading()
-                opening.callback(self._end_reading)
-            self._open = opening.pop_all()
-        atexit.register(self.close)
-
-    def _begin_reading(self) -> None:
-        # Until another pace is asked for, a model loads, and nobody needs the scans at once: reading several links by
-        # frames would slow that down until the kernel had no room for more.
-        if len(self._readers) > 1:
-            self.pace = Pace(0.01)
-        for reader in self._readers:
-            reading, thread = _started("scan-reader", partial(self._follow, reader))
-            self._threads.append(thread)
-            reading.add_done_callback(self._end)
-
-    def _end_reading(self) -> None:
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
-
-    def _follow(self, reader: LinkReader) -> None:
-        """Read a link until it has ended, is lost for good, or all reading ends."""
-        link = reader.link
-        while not (self._stop.is_set() or link.ended):
-            scans: Sequence[Scan] = ()
-            try:
-                self._await_pace(link)
-                scans = reader.read(POLL_S)
-            finally:  # its notices come also before its end
-                notices: list[Notice | TimedPose] = [*reader.notices()]
-                if link.kind != "device":  # recordings hold poses, and the demo's robot states some
-                    notices += link.poses()
-                if notices or scans:
-                    self._put(notices, scans)
-
-    def _await_pace(self, link: Link) -> None:
-        """Take what a link receives, at this source's pace where the link can wait, until it is made into scans."""
-        pace = self.pace
-        for _ in range(pace.reads if pace.every_s and link.fetches else 0):
-            time.sleep(pace.every_s - time.monotonic() % pace.every_s)  # at the same times for all links
-            link.fetch()
-            if self.pace is not pace:
-                break
 
     def _not_open(self) -> UsageError:
         return UsageError(f"source {self.name} is not open: use it in a with statement, or call open()")
@@ -300,25 +227,62 @@ class Source:
         self._last_ns = scans[-1].time_ns if scans else self._last_ns
         return [*reader.notices(), *reader.link.poses(), *scans]
 
+    def _started(self, reader: LinkReader) -> threading.Thread:
+        """Return a new thread that reads a link; its error ends all reading, and is raised by `take`.
+
+        It is a daemon, or a program that forgets to close its source would wait for it for ever.
+        """
+
+        def read() -> None:
+            try:
+                self._follow(reader)
+            except BaseException as error:  # noqa: BLE001 - raised by `take`
+                self._failed = self._failed or error
+                self._stop.set()
+            with self._lock:
+                self._reading -= 1
+                if not self._reading:
+                    self._bell.put(None)
+
+        thread = threading.Thread(target=read, name="scan-reader", daemon=True)
+        thread.start()
+        return thread
+
+    def _end_reading(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _follow(self, reader: LinkReader) -> None:
+        """Read a link until it has ended, is lost for good, or all reading ends."""
+        link = reader.link
+        while not (self._stop.is_set() or link.ended):
+            scans: Sequence[Scan] = ()
+            try:
+                # What it receives is taken at this source's pace, where it can wait, until it is made into scans.
+                pace = self.pace
+                for _ in range(pace.reads if pace.every_s and link.fetches else 0):
+                    time.sleep(pace.every_s - time.monotonic() % pace.every_s)  # at the same times for all links
+                    link.fetch()
+                    if self.pace is not pace:
+                        break
+                scans = reader.read(POLL_S)
+            finally:  # its notices come also before its end
+                notices: list[Notice | TimedPose] = [*reader.notices()]
+                if link.kind != "device":  # recordings hold poses, and the demo's robot states some
+                    notices += link.poses()
+                if notices or scans:
+                    self._put(notices, scans)
+
     def _put(self, notices: Sequence[Notice | TimedPose], scans: Sequence[Scan]) -> None:
         with self._lock:
             if not self._waiting:
                 self._bell.put(None)
             self._waiting += notices
             for scan in scans:
-                if len(self._waiting) >= self._capacity_scans:
+                if len(self._waiting) >= CAPACITY_SCANS:
                     self._make_room()
                 self._waiting.append(scan)
-
-    def _end(self, reading: Future[None]) -> None:
-        """Note that a link was read to its end; if it was lost, that ends the others."""
-        if reading.exception() is not None:
-            self._failed = self._failed or reading
-            self._stop.set()
-        with self._lock:
-            self._reading -= 1
-            if not self._reading:
-                self._bell.put(None)
 
     def _make_room(self) -> None:
         """Discard the oldest scan; notices keep their place, since they part the scans before from those after."""
@@ -335,23 +299,3 @@ def _one_kind(links: Sequence[Link]) -> SourceKind:
         listed = ", ".join(f"{link.name} is {link.kind}" for link in links)
         raise SourceError(f"sources are of several kinds ({listed}), expected one: run them apart")
     return kinds.pop()
-
-
-def _started(name: str, run: Callable[[], None]) -> tuple[Future[None], threading.Thread]:
-    """Return the end of a function that a new thread runs, and the thread.
-
-    It is a daemon, unlike one of an executor, for which a program that forgets to close its source would wait for ever.
-    """
-    end: Future[None] = Future()
-
-    def guarded() -> None:
-        try:
-            run()
-        except BaseException as error:  # noqa: BLE001 - raised again where the end is awaited
-            end.set_exception(error)
-        else:
-            end.set_result(None)
-
-    thread = threading.Thread(target=guarded, name=name, daemon=True)
-    thread.start()
-    return end, thread

@@ -95,20 +95,23 @@ def pairs_ms(results, *sensors, **settings):
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "expected"),
+    ("times_ms", "settings", "expected"),
     [
-        ([0, 10, 20], [3, 13, 23], [(0, 3), (10, 13), (20, 23)]),
-        ([0, 10, 20], [8, 18, 28], [(10, 8), (20, 18)]),  # the nearer neighbour, though it came first
-        ([0, 10, 20, 30], [21], [(20, 21)]),
-        ([0, 10, 20, 30, 40], [1, 41], [(0, 1), (40, 41)]),
-        ([0, 10], [40, 50], []),
-        ([0], [], []),
+        (([0, 10, 20], [3, 13, 23]), {}, [(0, 3), (10, 13), (20, 23)]),
+        (([0, 10, 20], [8, 18, 28]), {}, [(10, 8), (20, 18)]),  # the nearer neighbour, though it came first
+        (([0, 10, 20, 30], [21]), {}, [(20, 21)]),
+        (([0, 10, 20, 30, 40], [1, 41]), {}, [(0, 1), (40, 41)]),
+        (([0, 10], [40, 50]), {}, []),
+        (([0], []), {}, []),
+        (([0, 10, 20], [2, 12, 22], [9, 19, 29]), {}, [(10, 12, 9), (20, 22, 19)]),
+        (([0, 10, 20], [2, 12, 22], [9, 19, 29]), {"apart_s": 0.001}, []),
     ],
 )
-def test_results_are_paired_with_the_nearest(left, right, expected):
-    assert pairs_ms(results_at(left=left, right=right, other=[2]), "left", "right") == expected
-    swapped = [(b, a) for a, b in expected]
-    assert pairs_ms(results_at(left=left, right=right), "right", "left") == swapped
+def test_results_are_paired_with_the_nearest(times_ms, settings, expected):
+    fingers = dict(zip("abc", times_ms, strict=False))
+    assert pairs_ms(results_at(**fingers, other=[2]), *fingers, **settings) == expected
+    swapped = [times[::-1] for times in expected]
+    assert pairs_ms(results_at(**fingers), *reversed(fingers), **settings) == swapped
 
 
 @pytest.mark.parametrize("left", [[0, 10, 20], [0, 50]])
@@ -129,12 +132,6 @@ def test_results_that_come_late_in_one_lump_are_paired_all_the_same():
     left, right = range(0, 2000, 10), range(3, 2000, 10)
     results = [*results_at(left=left), *results_at(right=right)]
     assert pairs_ms(results, "left", "right") == list(zip(left, right, strict=True))
-
-
-def test_three_fingers_and_the_longest_time_apart():
-    results = results_at(a=[0, 10, 20], b=[2, 12, 22], c=[9, 19, 29])
-    assert pairs_ms(results, "a", "b", "c") == [(10, 12, 9), (20, 22, 19)]
-    assert pairs_ms(results, "a", "b", "c", apart_s=0.001) == []
 
 
 def test_a_silent_finger_lets_nothing_pile_up():

@@ -17,7 +17,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, ROOT, wait_for, write_model
 
 from edge.cli.user_commands import user_commands
-from edge.pipeline.commands import RESET, Command, CommandLines, Commands, carry_out, read_stdin
+from edge.pipeline.commands import RESET, Command, CommandLines, Commands, read_stdin
 from firmware_bridge.zeroing.baseline import save_baselines
 
 OPEN = []
@@ -125,7 +125,8 @@ def test_all_places_are_asked_and_obeyed_in_their_order(stdin, pipe):
             os.kill(os.getpid(), signal.SIGUSR1)
             deadline_s = time.monotonic() + 20
             while len(runtime.done) < 3 and time.monotonic() < deadline_s:  # a thread reads stdin
-                carry_out(everything, runtime)
+                for command in everything.poll():
+                    command.carry_out(runtime)
             assert everything.refused == 1
     runtime.done.remove((None, False))  # the signal's, which may come between those of stdin
     assert runtime.done == ["reset", ("4", True)]

@@ -9,9 +9,7 @@ import pytest
 from edge_samples import BASELINE, REST, FakeLink, FakeModel, ListSink, make_scan
 
 from edge.api import Baseline, LinkLostError, NoResultError, Stream, UsageError, open_runtime, paired, take_baselines
-from edge.perception.event import Event
 from edge.pipeline.commands import Command, Commands
-from edge.pipeline.latest import NewestResults
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.links.base import Notice
 from firmware_bridge.poses import PadPose, TimedPose
@@ -23,24 +21,14 @@ class StagedLink(FakeLink):
     """Link whose batches come when the test lets them: one stage each, with notices in front of its scans."""
 
     def __init__(self, *stages, notices=None, **settings):
-        self.gates = [threading.Event() for _ in stages]
-        self.arrived = [threading.Event() for _ in stages]
-        batches = itertools.chain.from_iterable(zip(self.gates, stages, strict=True))
-        super().__init__(batches, **settings)
+        self.gates, self.arrived = ([threading.Event() for _ in stages] for _ in range(2))
+        parts = zip(self.gates, stages, [event.set for event in self.arrived], strict=True)
+        super().__init__(itertools.chain.from_iterable(parts), **settings)
         self._told = dict(notices or {})
-        self._stage = -1
-
-    def read(self, timeout_s):
-        if self._stage >= 0:
-            self.arrived[self._stage].set()
-            self._stage = -1
-        stage = self.reads // 2 if self.reads % 2 else -1
-        scans = super().read(timeout_s)
-        self._stage = stage if stage < len(self.gates) else -1
-        return scans
 
     def notices(self):
-        return self._told.pop(self._stage, []) if self._stage >= 0 else []
+        stage, part = divmod(self.reads - 1, 3)
+        return self._told.pop(stage, []) if part == 1 else []
 
     def let(self, stage):
         self.gates[stage].set()
@@ -76,31 +64,20 @@ def test_it_is_the_newest_and_what_it_passed_over_is_counted_and_kept():
     assert [result.scan.number for result in sink.results] == [*range(8)] and waits_s == {0.0}
 
 
-def test_it_says_that_the_link_is_lost_and_that_it_is_back():
+def test_it_says_that_a_link_is_lost_and_that_it_is_back():
     told = {1: [Notice(0, "lost", "gone")], 2: [Notice(0, "back", "there")], 3: [Notice(0, "silent", "quiet")]}
-    link = StagedLink(scans(0), [], scans(1), [], endless=True, notices=told)
+    left = StagedLink(scans(0), [], scans(1), [], endless=True, notices=told, prefix="left/")
+    right = StagedLink(scans(0), endless=True, prefix="right/")
     states = []
-    with Source(link) as source:
+    with Source(left, right) as source:
         stream = stream_of(source)
+        right.let(0)
         for stage in range(4):
-            link.let(stage)
-            latest = stream.latest()
-            states.append((latest.link, latest.new, latest.result.scan.number))
+            left.let(stage)
+            both = stream.latest_of_all()
+            states.append((both["left/4"].link, both["left/4"].new, both["left/4"].result.scan.number))
+            assert both["right/4"].link == "up" and stream.latest("left/4").link == states[-1][0]
     assert states == [("up", True, 0), ("lost", False, 0), ("up", True, 1), ("silent", False, 1)]
-
-
-def test_a_link_or_a_sensor_that_is_down_is_so_for_its_own_sensors_alone():
-    newest = NewestResults()
-    for kind, sensor, sensors, states in (
-        ("lost", None, "left/", ["lost", "up", "up"]),
-        ("silent", "right/4", "", ["lost", "silent", "up"]),
-        ("back", None, "left/", ["up", "silent", "up"]),
-        ("trouble", None, "left/", ["up", "silent", "up"]),
-        ("back", "right/4", "", ["up", "up", "up"]),
-        ("silent", None, "", ["silent", "silent", "silent"]),
-    ):
-        newest.tell(Event(0, kind, sensor, "", sensors))
-        assert [newest.take(name, 0).link for name in ("left/4", "right/4", "right/41")] == states
 
 
 def test_a_link_that_is_lost_for_good_is_an_error_at_every_call():
@@ -115,17 +92,18 @@ def test_a_link_that_is_lost_for_good_is_an_error_at_every_call():
 
 def test_at_the_end_it_says_so():
     with Source(FakeLink([scans(0)])) as source:
-        stream = stream_of(source, clock_s=lambda: 0.0)
-        assert stream.read().new
+        stream = stream_of(source)
+        assert stream.read(timeout_s=10).new
         with pytest.raises(NoResultError, match=r"^no new result: link ended, sensors so far: 4$"):
-            stream.read()
+            stream.read(timeout_s=10)
         latest = stream.latest()
         assert (latest.link, latest.new, latest.result.scan.number) == ("ended", False, 0)
         assert list(stream) == []
 
 
 def test_of_two_fingers_each_has_its_own():
-    link = StagedLink(scans(0) + scans(0, sensor="6"), scans(1, 2, sensor="6"), endless=True)
+    """And its own silence."""
+    link = StagedLink(scans(0) + scans(0, sensor="6"), scans(*range(1, 70), sensor="6"), scans(70), endless=True)
     with Source(link) as source:
         stream = stream_of(source)
         link.let(0)
@@ -136,11 +114,13 @@ def test_of_two_fingers_each_has_its_own():
         both = stream.latest_of_all()
         assert list(both) == ["4", "6"] and not stream.latest("6").new
         other, mine = both["4"], both["6"]
-        assert (other.new, other.result.scan.number) == (False, 0)
-        assert (mine.new, mine.skipped, mine.result.scan.number) == (True, 1, 2)
-        assert stream.latest("left/4").age_s == math.inf
-        with pytest.raises(NoResultError, match="no new result of sensor 8: link up, sensors so far: 4, 6"):
-            stream.read("8", timeout_s=0.01)
+        assert (other.new, other.result.scan.number, mine.link) == (False, 0, "up")
+        assert (mine.new, mine.skipped, mine.result.scan.number) == (True, 68, 69)
+        assert stream.latest("4").link == "silent"
+        link.let(2)
+        assert stream.latest("4").link == stream.latest("6").link == "up"
+        with pytest.raises(NoResultError, match="no new result of sensor 4: link up, sensors so far: 4, 6"):
+            stream.read("4", timeout_s=0.01)
 
 
 def test_read_waits_for_a_result_that_is_new():
@@ -179,35 +159,30 @@ def test_a_loop_and_the_newest_share_one_stream():
     assert seen == [0, 1, 5, 6]
 
 
-def test_a_source_is_opened_and_closed_without_a_with_statement():
+def test_a_source_is_opened_once_and_has_one_stream_at_a_time():
     source = Source(FakeLink([scans(0)], endless=True))
     assert repr(source) == "<Source fake, not open>"
     assert source.open() is source and repr(source) == "<Source fake, open>"
-    stream = stream_of(source)
-    assert stream.read().new
+    first = stream_of(source)
+    assert first.read().new
+    for second in (lambda: stream_of(source), lambda: take_baselines(source)):
+        with pytest.raises(UsageError, match=r"^source fake has a stream already, .* close\(\)$"):
+            second()
+    first.close()
+    with pytest.raises(UsageError, match="is closed"):
+        first.latest()
+    stream_of(source)
+    for _ in range(2):  # a stream that was dropped, and one that has ended
+        assert list(stream_of(source, duration_s=1e-6)) == []
+    last = stream_of(source)
     source.close()
     source.close()
     assert repr(source) == "<Source fake, closed>"
-    for call in (stream.latest, lambda: list(stream)):
+    for call in (last.latest, lambda: list(last)):
         with pytest.raises(UsageError, match="source fake is closed"):
             call()
     with pytest.raises(UsageError, match="fake was opened before"):
         source.open()
-
-
-def test_a_source_has_one_stream_at_a_time():
-    with Source(FakeLink([scans(0)], endless=True)) as source:
-        first = stream_of(source)
-        assert first.read().new
-        for second in (lambda: stream_of(source), lambda: take_baselines(source)):
-            with pytest.raises(UsageError, match=r"^source fake has a stream already, .* close\(\)$"):
-                second()
-        first.close()
-        with pytest.raises(UsageError, match="is closed"):
-            first.latest()
-        stream_of(source)
-        for _ in range(2):  # a stream that was dropped, and one that has ended
-            assert list(stream_of(source, duration_s=1e-6)) == []
 
 
 def test_a_recording_at_the_speed_of_its_reader_has_no_latest():
@@ -267,27 +242,6 @@ def test_a_task_that_is_cancelled_loses_no_result(way, when):
     assert asyncio.run(main()) == [0, 1]
 
 
-def test_a_task_gets_what_a_cancelled_one_began():
-    """A sensor at rest has its result while the model still runs for the other one."""
-
-    async def main():
-        with Source(FakeLink([[*scans(0, sensor="6", press=0), *scans(0)]])) as source:
-            model = SlowModel()
-            stream = stream_of(source, model=model)
-            task = asyncio.create_task(anext(aiter(stream)))
-            await until(model.begun)
-            task.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await task
-            results = aiter(stream)
-            following = asyncio.create_task(anext(results))
-            await asyncio.sleep(0.01)
-            model.let.set()
-            return [(await following).scan.sensor, (await anext(results)).scan.sensor]
-
-    assert asyncio.run(main()) == ["6", "4"]
-
-
 def test_asyncio_is_told_of_errors_and_of_time():
     async def main():
         with Source(FakeLink([scans(0)], error=LinkLostError("gone"))) as source:
@@ -325,21 +279,22 @@ def test_a_name_that_no_sensor_has_is_refused_once_all_of_its_link_were_heard():
             next(paired(stream, ["a/4", "a/5"]))
 
 
-def test_a_command_for_a_sensor_waits_until_it_is_known_whether_there_is_one():
+def test_what_is_asked_of_a_sensor_that_there_is_not_is_refused_in_a_line():
+    """A pose waits until all sensors of its link were heard; a command is for those that were heard so far."""
     link, commands, sink = StagedLink(scans(0), scans(*range(1, 20)), scans(20), endless=True), Commands(), ListSink()
     with Source(link) as source:
         stream = stream_of(source, commands=commands, sinks=[sink])
-        commands.put(Command("zero", "9"))
         commands.refuse("a line is refused")
         texts = []
         for stage in range(3):
+            commands.put(Command("zero", "9"))
             commands.poses.put(TimedPose(PadPose(0, 0), 10**9 + stage, "9"))
-            stream.latest()
             link.let(stage)
             stream.latest()
             texts.append([event.text for event in sink.events])
             texts[-1] += [event.text for result in sink.results for event in result.events]
-    assert "a line is refused" in texts[0] and not [text for text in texts[0] if "no sensor" in text]
-    assert {"zeroing refused: no sensor 9, there are 4", "a pose is refused: no sensor '9': sensors are 4"} < {
+    assert {"a line is refused", "zeroing refused: no scan has arrived yet"} <= set(texts[0])
+    assert not [text for text in texts[0] if "a pose is refused" in text]
+    assert {"zeroing refused: no sensor 9, there are 4", "a pose is refused: no sensor '9': sensors are 4"} <= {
         *texts[-1]
     }

@@ -13,7 +13,7 @@ from cli_samples import base_options, files, records, run, start, write_recordin
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
-from edge.api import MapSink, ObjectMap, PadPose, Runtime, Source, Stream, TimedPose, open_recording, open_runtime, pump
+from edge.api import PadPose, Runtime, Source, TimedPose, pump
 from edge.mapping.map_files import check_npz
 from edge.pipeline.commands import RESET, CommandLines, Commands
 from edge.pipeline.pose_queue import (
@@ -72,30 +72,25 @@ class TestFields:
 class TestLines:
     @pytest.fixture
     def lines(self):
-        """Commands, and the lines that they come from through the end of a pipe."""
+        """Commands, and the end of a pipe from whose lines they come."""
         (read_end, write_end), commands = os.pipe(), Commands()
         lines = CommandLines(commands, read_end)
-        yield commands, lines, write_end
+        yield commands, write_end
         os.close(write_end)
         lines.close()
         os.close(read_end)
 
     def test_poses_and_commands_part_and_bad_lines_stop_nothing(self, lines):
-        commands, _, write_end = lines
-        os.write(write_end, f'{WHOLE}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{WHOLE}\n'.encode())
-        got, poses = [], []
-        wait_for(lambda: got.extend(commands.poll()) or poses.extend(commands.poses.take()) or len(poses) == 2)
-        assert got == [RESET] and [one.time_ns for one in poses] == [123, 123]
-        assert (commands.refused, commands.poses.refused) == (1, 1)
-        assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
-
-    def test_the_time_of_arrival_is_that_of_the_line_while_the_loop_waits(self, lines):
-        commands, _, write_end = lines
+        """Nobody polls, since the loop may wait for a scan: a pose without a time has that of its arrival."""
+        commands, write_end = lines
         before_ns = time.monotonic_ns()
-        os.write(write_end, b'{"cmd": "pose", "x_mm": 1, "y_mm": 2}\n')
+        place = '{"cmd": "pose", "x_mm": 1, "y_mm": 2}'
+        os.write(write_end, f'{WHOLE}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{place}\n'.encode())
         poses = []
-        wait_for(lambda: poses.extend(commands.poses.take()) or poses)  # nobody polls: its own thread reads
-        assert before_ns <= poses[0].time_ns <= time.monotonic_ns()
+        wait_for(lambda: poses.extend(commands.poses.take()) or len(poses) == 2)
+        assert poses[0].time_ns == 123 and before_ns <= poses[1].time_ns <= time.monotonic_ns()
+        assert commands.poll() == [RESET] and (commands.refused, commands.poses.refused) == (1, 1)
+        assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
 
 
 class TestQueue:
@@ -122,64 +117,36 @@ def pose(time_ns, x_mm=0.0, sensor=None, holds=False):
 
 
 class TestIntake:
-    def test_a_pose_out_of_order_is_refused_with_one_line_for_many(self):
+    """Each step puts poses, takes them at a time, and looks then."""
+
+    @pytest.fixture
+    def step(self):
         queue = PoseQueue()
         intake = PoseIntake(make_runtime(), queue)
-        for time_ns in (50, 40, 30, 60):
-            queue.put(pose(time_ns))
-        assert [one.time_ns for one in intake.take([], None, 100)] == [50, 60]
-        (event,) = intake.look(100)
-        assert event.kind == "poses_trouble" and "40 ns, is not after" in event.text
-        queue.put(pose(1))
-        intake.take([], None, 200)
-        assert intake.look(200) == [] and queue.refused == 3
-        queue.put(pose(2))
-        intake.take([], None, 300)
-        events = [event for event in intake.look(100 + REPEATED_NS) if event.kind == "poses_trouble"]
-        assert len(events) == 1, "it is reported again after a while"
 
-    def test_a_source_that_falls_silent_is_reported_once_and_when_it_is_back(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue)
-        assert intake.look(10**12) == [], "without any pose there is nothing to miss"
-        for number, sensor in enumerate((None, "4")):
-            queue.put(pose(number + 1, sensor=sensor))
-        intake.take([], None, 0)
-        assert intake.look(POSES_SILENT_NS) == []
-        queue.put(pose(3, sensor="4"))
-        intake.take([], None, POSES_SILENT_NS)
-        (event,) = intake.look(POSES_SILENT_NS + 1)
-        assert (event.kind, event.sensor) == ("poses_silent", None) and "one tap" in event.text
-        assert intake.look(POSES_SILENT_NS + 2) == []
-        queue.put(pose(4))
-        intake.take([], None, POSES_SILENT_NS + 10**8)
-        (event,) = intake.look(POSES_SILENT_NS + 10**8)
-        assert (event.kind, event.text) == ("poses_back", "poses are back after 0.6 s")
+        def step(now_ns, *poses):
+            for one in poses:
+                queue.put(one)
+            taken = [one.time_ns for one in intake.take([], None, now_ns)]
+            return taken, [(event.kind, event.sensor, event.text) for event in intake.look(now_ns)], queue.refused
 
-    def test_a_pose_that_holds_is_followed_by_silence_of_any_length(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue)
-        queue.put(pose(1, holds=True))
-        intake.take([], None, 1)
-        assert intake.look(10**15) == []
+        return step
 
-    def test_poses_of_now_do_not_mix_with_those_of_a_recording_that_is_played_at_its_speed(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue)
-        queue.put(pose(3))
-        assert [one.time_ns for one in intake.take([], 4, 4)] == [3], "a recording may have none"
-        queue.put(pose(7))
-        assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
-        queue.put(pose(8, sensor="4"))
-        assert intake.take([], 9, 9) == []
-        assert queue.refused == 2 and "has poses of its own" in intake.look(9)[0].text
+    def test_a_pose_out_of_order_is_refused_with_one_line_for_many(self, step):
+        taken, ((kind, _, text),), refused = step(100, *map(pose, (50, 40, 30, 60)))
+        assert taken == [50, 60] and kind == "poses_trouble" and "40 ns, is not after" in text and refused == 2
+        assert step(200, pose(1)) == ([], [], 3)
+        assert "poses_trouble" in [kind for kind, *_ in step(100 + REPEATED_NS, pose(2))[1]], "after a while again"
 
-    def test_poses_of_now_are_refused_for_scans_of_another_time(self):
-        queue = PoseQueue()
-        intake = PoseIntake(make_runtime(), queue, recorded=True)
-        queue.put(pose(9))
-        assert [one.time_ns for one in intake.take([pose(5)], 6, 6)] == [5]
-        assert queue.refused == 1 and "recording" in intake.look(6)[0].text
+    def test_a_source_that_falls_silent_is_reported_once_and_when_it_is_back(self, step):
+        assert step(10**12)[1] == [], "without any pose there is nothing to miss"
+        step(0, pose(1), pose(2, sensor="4"), pose(1, sensor="6", holds=True))
+        assert step(POSES_SILENT_NS, pose(3, sensor="4"))[1] == []
+        ((kind, sensor, text),) = step(POSES_SILENT_NS + 1)[1]
+        assert (kind, sensor) == ("poses_silent", None) and "one tap" in text
+        assert step(POSES_SILENT_NS + 2)[1] == []
+        assert step(POSES_SILENT_NS + 10**8, pose(4))[1] == [("poses_back", None, "poses are back after 0.6 s")]
+        assert {sensor for _, sensor, _ in step(10**15)[1]} == {None, "4"}, "one that holds is not missed"
 
 
 class PoseSink(ListSink):
@@ -195,16 +162,27 @@ class PoseSink(ListSink):
         self.seen.append(("scan", result.scan.number))
 
 
-def test_poses_come_to_the_sinks_before_the_scans_that_they_serve():
+@pytest.mark.parametrize(
+    ("of_link", "why"),
+    [
+        ({}, None),
+        ({"patient": True}, "of another time than now: add --paced"),
+        ({"states_poses": True}, "its scans are of a recording, which has poses of its own"),
+    ],
+)
+def test_poses_come_to_the_sinks_before_the_scans_that_they_serve(of_link, why):
     commands, sink, statistics = Commands(), PoseSink(), Statistics()
     commands.poses.put(pose(1, 7.0))
     link = FakeLink([[make_scan(0)], [make_scan(1)]])
+    vars(link).update(of_link)
     with Source(link) as source:
         pump(source, make_runtime(), [sink], statistics, commands=commands)
-    assert sink.seen == [("pose", 7.0), ("scan", 0), ("scan", 1)]
-    assert (statistics.poses, statistics.poses_refused, statistics.poses_dropped) == (1, 0, 0)
-    assert sink.counters[-1]["poses"] == 1
-    assert "poses: 1 received, 1 used, 0 refused, 0 dropped" in statistics.summary(source="fake")
+    used = int(why is None)
+    assert sink.seen == [("pose", 7.0), ("scan", 0), ("scan", 1)][1 - used :]
+    assert [why in event.text for event in sink.events] == [True] * (1 - used)
+    assert (statistics.poses, statistics.poses_refused, statistics.poses_dropped) == (used, 1 - used, 0)
+    assert sink.counters[-1]["poses"] == used
+    assert f"poses: 1 received, {used} used, {1 - used} refused, 0 dropped" in statistics.summary(source="fake")
 
 
 def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
@@ -275,30 +253,3 @@ def test_a_run_without_poses_says_so_and_writes_nothing(files, tmp_path):
     assert done.returncode == 0 and list(tmp_path.iterdir()) == []
     assert "patterns came without a pose, so the map is empty: send poses of the pad" in done.stderr
     assert "without a pose; no file written" in done.stderr
-
-
-def test_a_recording_with_poses_becomes_a_map(files, tmp_path):
-    posed = tmp_path / "posed.mcap"
-    with start("record", posed, *base_options(files), "--source", f"replay:{files / 'taps.npz'}",
-               stdin=subprocess.PIPE) as process:  # fmt: skip
-        process.stdin.write(HELD)
-        process.stdin.flush()
-        assert process.wait() == 0, process.stderr.read()
-    out = tmp_path / "m.npz"
-    done = run("map", *base_options(files), "--source", f"replay:{posed}", "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert centre_of(out)[0] == [5, -3]
-
-
-def test_a_map_is_made_by_hand_and_from_a_stream(files):
-    with open_recording(files / "taps.npz") as source:
-        runtime = open_runtime(files / "tiny.onnx", source, baselines=files / "zero.json")
-        by_hand, sink = ObjectMap(), MapSink(ObjectMap())
-        for result in Stream(source, runtime, sinks=[sink]):
-            by_hand.add(result, PadPose(1.0, 2.0))
-            if result.scan.number == 9:  # after the first of four taps
-                runtime.pose(PadPose(3.0, 0.0), result.scan.time_ns + 1, "4", holds=True)
-    by_hand.finish()
-    sink.close()
-    assert by_hand.fused == 4 and np.isfinite(by_hand.layers().contact).any()
-    assert sink.without_pose == 5 and sink.whole.fused == 3, "a pose that the runtime was given itself counts"

@@ -58,6 +58,14 @@ def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
     assert Cadence(100).period_ns == followed(intervals_ms, rate_hz=100).period_ns == 10 * MS
 
 
+def test_scans_that_lay_unread_set_no_pace():
+    cadence = Cadence()
+    for number, time_ms in enumerate([*range(500, 512), *range(520, 640, 10)]):
+        cadence.follow(replace(scan(number, time_ms), unread_ns=400 * MS * (time_ms < 520)))
+        assert cadence.period_ns in (None, 10 * MS)
+    assert cadence.rate_hz == 100
+
+
 def test_a_pattern_is_late_after_one_period_and_not_before():
     for latency_us, late in ((10_000, 0), (10_000.001, 9 - FEWEST_INTERVALS)):
         cadences = Cadences()
@@ -178,32 +186,39 @@ def test_after_an_outage_its_own_sensors_are_excused():
     assert "left/5" in [event.sensor for event in cadences.look()]
 
 
-def rest(cadences, scans, state="idle", *, begin=0, period_ms=10, stamped=True):
-    for number in range(begin, begin + scans):
-        time_ms = round(number * period_ms)
-        follow(cadences, scan(number, time_ms, device_ms=time_ms if stamped else None), state)
+def rest(scans, *states, cadences=None, begin=0, period_ms=10, stamped=True, sensors=1, patience_s=0.1):
+    """Return the cadences of sensors after so many scans of each state."""
+    cadences = cadences or Cadences()
+    cadences.patience_s = patience_s
+    for number, state in enumerate((state for state in states for _ in range(scans)), begin):
+        for name in range(4, 4 + sensors):
+            time_ms = number * period_ms
+            follow(cadences, scan(number, time_ms, f"{name}", device_ms=time_ms if stamped else None), state)
     cadences.look()
-    return cadences.pace
+    return cadences
 
 
-def test_rest_is_a_second_without_contact_of_stamped_sensors():
-    cadences = Cadences(patience_s=0.1)
-    assert rest(cadences, 0) == rest(cadences, 50, "contact") == rest(cadences, 100, begin=50) == Pace()
-    assert cadences.waited_ns <= 1490 * MS
-    resting = rest(cadences, 2, begin=150)
-    assert resting == Pace(0.01, 10) and cadences.waited_ns > 1600 * MS
-    assert rest(cadences, 1, "contact", begin=152) == Pace()
+def test_rest_is_a_second_without_contact():
+    cadences = rest(50, "contact", "idle", "idle")
+    assert cadences.pace == Pace() and cadences.waited_ns <= 1490 * MS
+    rest(2, "idle", cadences=cadences, begin=150)
+    assert cadences.pace == Pace(0.01, 10) and cadences.waited_ns > 1600 * MS
+    rest(1, "contact", cadences=cadences, begin=152)
+    assert cadences.pace == Pace()
     assert 1520 * MS < cadences.waited_ns <= 1540 * MS, "what was on its way, and nothing after it"
 
 
-def test_four_are_read_together_and_rest_needs_stamps_and_a_usual_rate():
-    for sensors, period_ms, pace in ((3, 10, Pace()), (4, 10, Pace(0.0025)), (4, 100, Pace())):
-        cadences = Cadences()
-        for number in range(9):
-            for name in range(sensors):
-                follow(cadences, scan(number, number * period_ms, f"{name}"), "contact")
-        cadences.look()
-        assert cadences.pace == pace
-    assert rest(Cadences(patience_s=0.1), 200, stamped=False) == Pace()
-    assert rest(Cadences(patience_s=0.1), 1000, period_ms=2) == Pace()
-    assert rest(Cadences(patience_s=0.1), 0) == Pace()
+@pytest.mark.parametrize(
+    ("pace", "scans", "state", "settings"),
+    [
+        (Pace(), 0, "idle", {}),
+        (Pace(), 200, "idle", {"stamped": False}),
+        (Pace(), 1000, "idle", {"period_ms": 2}),
+        (Pace(), 200, "idle", {"patience_s": 0.0}),
+        (Pace(), 9, "contact", {"sensors": 3}),
+        (Pace(0.0025), 9, "contact", {"sensors": 4}),
+        (Pace(), 9, "contact", {"sensors": 4, "period_ms": 100}),
+    ],
+)
+def test_rest_needs_stamps_and_a_usual_rate_and_four_are_read_together(pace, scans, state, settings):
+    assert rest(scans, state, **settings).pace == pace

@@ -13,6 +13,7 @@ from runtime_samples import presses, pumped
 
 from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
 from edge.pipeline.cadence import Pace
+from edge.pipeline.scan_reader import CAPACITY_SCANS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
 from firmware_bridge.links.registry import open_source
@@ -39,51 +40,28 @@ def order(taken):
 
 
 class TestOpening:
-    class SlowLink(FakeLink):
-        """Link that opens when it may, and notes that it was closed."""
+    def test_an_error_leaves_all_links_closed_and_no_thread(self):
+        class Counted(FakeLink):
+            entered = 0
 
-        def __init__(self, error=None):
-            super().__init__([[make_scan(0)], [make_scan(1)]])
-            self.entering, self.may_open, self.closed = threading.Event(), threading.Event(), threading.Event()
-            self.opening_error = error
+            def __enter__(self):
+                self.entered += 1
+                if self.name == "away":
+                    raise LinkLostError("no such port")
+                return self
 
-        def __enter__(self):
-            self.entering.set()
-            assert self.may_open.wait(10)
-            if self.opening_error is not None:
-                raise self.opening_error
-            return self
+            def __exit__(self, *exc_info):
+                self.entered -= 1
 
-        def __exit__(self, *exc_info):
-            self.closed.set()
-
-    def test_it_waits_for_what_was_begun_and_loses_nothing(self):
-        source = Source(link := self.SlowLink())
-        source.begin()
-        assert link.entering.wait(10)  # while this thread goes on
-        with pytest.raises(UsageError, match="fake is not open"):
-            source.take(0)
-        threading.Timer(0.1, link.may_open.set).start()
-        with source:
-            assert link.may_open.is_set() and numbers(take_all(source)) == [0, 1]
-        assert link.closed.is_set()
-
-    def test_its_error_comes_where_it_is_awaited(self):
-        source = Source(link := self.SlowLink(LinkLostError("no such port")))
-        source.begin()
-        link.may_open.set()
+        links = Counted([[make_scan(0)]], prefix="a/"), Counted([], prefix="b/")
+        links[1].name = "away"
+        source = Source(*links)
         with pytest.raises(LinkLostError, match="no such port"), source:
             pass
         source.close()
-
-    def test_closing_ends_what_was_begun_and_never_opened(self):
-        source = Source(link := self.SlowLink())
-        source.begin()
-        threading.Timer(0.1, link.may_open.set).start()
-        source.close()
-        assert link.closed.is_set()
+        assert links[0].entered == 0
         assert not any(thread.name == "scan-reader" for thread in threading.enumerate())
-        with pytest.raises(UsageError, match="fake was closed before"):
+        with pytest.raises(UsageError, match="fake, away was closed before"):
             source.open()
 
     def test_emulated_and_real_links_are_not_mixed_whenever_it_shows(self):
@@ -111,28 +89,22 @@ class TestOne:
             assert source.take(0.01) == []
 
     @pytest.mark.parametrize(
-        ("at", "given"), [(1, ["told", 6, 7, 8]), (5, ["told", 5, 6, 7, 8]), (9, [5, 6, 7, "told", 8])]
+        ("at", "given"),
+        [
+            (0, ["told", *range(6, CAPACITY_SCANS + 5)]),
+            (CAPACITY_SCANS, [*range(5, CAPACITY_SCANS), "told", *range(CAPACITY_SCANS, CAPACITY_SCANS + 5)]),
+        ],
     )
     def test_a_notice_keeps_its_place_among_lost_scans(self, at, given):
         class Telling(FakeLink):
             def notices(self):
-                return [Notice(0, "lost", "told")] if self.reads == at else []
+                return [Notice(0, "lost", "told")] if self.reads == at + 1 else []
 
-        through = threading.Event()
-        link = Telling([[scan] for scan in presses(range(9))])
-        inner = link.read
-
-        def read(timeout_s):
-            scans = inner(timeout_s)
-            if link.ended:
-                through.set()
-            return scans
-
-        link.read = read
-        with Source(link, capacity_scans=4) as source:
-            assert through.wait(10)
+        link = Telling([[scan] for scan in presses(range(CAPACITY_SCANS + 5))])
+        with Source(link) as source:
+            assert link.through.wait(10)
             taken = take_all(source)
-        assert order(taken) == given and source.overruns + len(taken) - 1 == 9
+        assert order(taken) == given and source.overruns + len(taken) - 1 == CAPACITY_SCANS + 5
 
 
 class TestScripts:
@@ -176,7 +148,7 @@ def recording(scans, pressed):
     return Recording(Path("made.csv"), tracks, 100.0)
 
 
-@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace(0.003), Pace()])
+@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace()])
 def test_what_is_read_does_not_depend_on_when(pace):
     """Cycles of two sensors mix on each of two buses, and reads end within them."""
     played = recording(100, 60)

@@ -266,7 +266,10 @@ def inferred(runtime, scans) -> list:
 
 
 class FakeLink(Link):
-    """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails."""
+    """Link with one batch of scans a read, which waits where a batch is an event, and then ends or fails.
+
+    A batch that is a function is called instead; `through` is set once all batches were handed on.
+    """
 
     def __init__(
         self,
@@ -284,6 +287,7 @@ class FakeLink(Link):
         self.ended = False
         self.reads = 0
         self.thread: threading.Thread | None = None
+        self.through = threading.Event()
         self._batches = list(batches)
         self._error = error
         self._endless = endless
@@ -299,6 +303,7 @@ class FakeLink(Link):
         self.thread = threading.current_thread()
         self.reads += 1
         if not self._batches:
+            self.through.set()
             if self._error is not None:
                 raise self._error
             if self._endless:
@@ -309,6 +314,9 @@ class FakeLink(Link):
         batch = self._batches.pop(0)
         if isinstance(batch, threading.Event):
             batch.wait(10)
+            return []
+        if callable(batch):
+            batch()
             return []
         self._given += len(batch)
         return [replace(scan, sensor=self.prefix + scan.sensor) for scan in batch] if self.prefix else batch

@@ -8,7 +8,7 @@ from edge_samples import BASELINE, PERIOD_NS, FakeModel, make_scan
 from edge.perception.runtime import Runtime
 from edge.pipeline.result_stream import pump
 from edge.pipeline.run_statistics import Statistics
-from edge.pipeline.scan_reader import CAPACITY_SCANS, Source
+from edge.pipeline.scan_reader import Source
 from firmware_bridge.zeroing.baseline import Baseline
 
 PRESS = 3000
@@ -66,12 +66,12 @@ class Pushed:
         return [event.kind for event in self.events]
 
 
-def pumped(link, *sinks, model=None, runtime=None, statistics=None, capacity_scans=CAPACITY_SCANS, rate_hz=None, **how):
+def pumped(link, *sinks, model=None, runtime=None, statistics=None, rate_hz=None, **how):
     """Pump a link through a runtime of sensors 4 and 6 into sinks until it ends, and return the statistics."""
     baselines = {name: Baseline.of(name, BASELINE.counts, 1000.0, 100, "file") for name in "46"}
     runtime = runtime or make_runtime(model, source=link.kind, baselines=baselines)
     statistics = statistics or Statistics()
-    with Source(link, capacity_scans=capacity_scans, rate_hz=rate_hz) as source:
+    with Source(link, rate_hz=rate_hz) as source:
         pump(source, runtime, sinks, statistics, **{"stop": threading.Event()} | how)
     return statistics
 
