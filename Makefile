@@ -45,7 +45,7 @@ models: $(VENV)/.dev $(PRESSES) $(TURNED) $(FIGURES) data/validation.npz  ## tra
 
 REPORT := nice $(BIN)/python
 
-reports: $(VENV)/.dev data/test.npz  ## every report: hours on two cores; each command stands alone, too
+reports: $(VENV)/.dev data/test.npz  ## every report: days on two cores; each command stands alone, too
 	$(REPORT) -m train.experiments all
 	$(REPORT) -m export.stability
 	$(REPORT) -m export.verify edge/models/*.onnx --out reports/parity.md

@@ -4,8 +4,15 @@ import pytest
 from experiment_samples import quick_bench, tables_of
 
 from train.experiments.__main__ import main, run
+from train.experiments.paper_tables import HELD_OUT, training_sets
 
+ERRORS = {"test PSNR dB", "run time ms"}
 COLUMNS = {
+    "table3": [ERRORS | {"method", "validation PSNR dB", "test SSIM", "parameters", "MMAC"}],
+    "table4": [ERRORS | {"scale", "paper's test PSNR dB", "MMAC"}],
+    "angle": [ERRORS | {"network", "angle deg", "over STSR dB"}],
+    "taps": [ERRORS | {"network", "taps given", "over STSR dB"}],
+    "unseen": [ERRORS | {"trained on", "tested on", "taps", "covered %", "width %", "steps"}],
     "families": [{"method", "run time us"}, {"family", "model, over"}, {"edge", "far"}],
     "pads": [{"constant", "model, down", "model, all known, up"}],
     "posed-taps": [
@@ -14,12 +21,13 @@ COLUMNS = {
         {"model", "over one tap"},
     ],
     "fig5": [{"surface", "beta by search mm"}, {"slope per N"}],
+    "fig7": [{"method", "error %", "ms a pattern"}],
 }
 """Some columns of the tables of each experiment that needs no recordings."""
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "fig5" else pytest.param(name, marks=pytest.mark.night) for name in COLUMNS]
+    "name", [name if name.startswith("fig") else pytest.param(name, marks=pytest.mark.night) for name in COLUMNS]
 )
 def test_it_runs_in_miniature(tmp_path, tmp_path_factory, name):
     page = run(name, quick_bench(tmp_path_factory), tmp_path)
@@ -28,6 +36,25 @@ def test_it_runs_in_miniature(tmp_path, tmp_path_factory, name):
     assert len(tables) == len(COLUMNS[name])
     for rows, columns in zip(tables, COLUMNS[name], strict=True):
         assert rows and columns <= set(rows[0])
+
+
+@pytest.mark.night
+def test_table3_has_every_method_and_the_papers_figures(tmp_path, tmp_path_factory):
+    (table,) = tables_of(run("table3", quick_bench(tmp_path_factory), tmp_path))
+    rows = {row["method"]: row for row in table}
+    assert {"bilinear", "bicubic", "linear map", "srgan", "stsr", "mtsr2", "compact stsr", "compact mtsr7"} <= set(rows)
+    assert rows["mtsr2"]["paper's test PSNR dB"] == "23.8"
+    assert float(rows["stsr"]["MMAC"]) == pytest.approx(7321, abs=1)
+
+
+@pytest.mark.night
+def test_training_sets_keep_to_their_names(tmp_path_factory):
+    sets = training_sets(quick_bench(tmp_path_factory))
+    surfaces = {name: set(data.family.tolist()) for name, (_, data) in sets.items()}
+    assert [name for name, there in surfaces.items() if there & set(HELD_OUT)] == ["18 + figures"]
+    assert surfaces["15, half as long"] == surfaces["15"]
+    assert surfaces["15 + figures"] - surfaces["15"] == {"glyph", "polygon"}
+    assert surfaces["18 + figures"] == surfaces["15 + figures"] | set(HELD_OUT)
 
 
 def test_a_folder_without_recordings_is_named_first(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Samples for the experiments' tests: one quick workbench, so that datasets are made once a session."""
+"""Samples for the experiments' tests: one quick workbench, so that datasets and networks are made once a session."""
 
 from pathlib import Path
 
@@ -10,7 +10,8 @@ from train.experiments.workbench import Workbench
 
 
 def quick_bench(tmp_path_factory: pytest.TempPathFactory) -> Workbench:
-    return Workbench(tmp_path_factory.getbasetemp() / "quick", quick=True)
+    folder = tmp_path_factory.getbasetemp() / "quick"
+    return Workbench(folder / "data", folder / "checkpoints", quick=True)
 
 
 REST = np.array([15_900, 16_430, 38_600])[:, None, None] + 11 * np.arange(16).reshape(4, 4)

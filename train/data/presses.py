@@ -20,6 +20,7 @@ from edge.evaluation.test_set import check_axes
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.recording.npz_recording import read_npz
 from train.errors import DatasetError
+from train.physics.tpsf import resample, resample_touching
 
 SEED: Final = 20240228
 """Seed of all frozen sets: the paper's day of publication. It must never change, or figures cannot be compared."""
@@ -99,6 +100,16 @@ class PressSet:
             return np.pad(array[:, :taps], [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2))
 
         return replace(self, counts=padded(self.counts), angle_deg=padded(self.angle_deg), poses=padded(self.poses))
+
+    def at_scale(self, scale: int) -> "PressSet":
+        """Return the sequences with the truth at another scale, in pattern pixels per taxel pitch."""
+        if scale == self.scale:
+            return self
+        return replace(
+            self,
+            patterns=resample(self.patterns, self.scale, scale).astype(np.float16),
+            touching=resample_touching(self.touching, self.scale, scale),
+        )
 
     def only_turned(self) -> "PressSet":
         """Return the sequences whose taps are all at one place, as the paper's schedule turns the pad."""

@@ -1,35 +1,67 @@
-"""Workbench of the experiments: datasets made once and kept, and models run on them as the runtime does."""
+"""Workbench of the experiments: datasets and networks made once and kept, and models run as the runtime does."""
 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+from timeit import repeat
 from typing import Final, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.utils.flop_counter import FlopCounterMode
 
+from edge.evaluation.test_set import FrozenSet
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL
 from edge.inference.onnx_session import ModelSession
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.frozen_presses import WIDE_TEST, FrozenPresses, load_frozen_presses
 from train.data.make_presses import make_presses, quiet_workers
-from train.data.presses import PressSet
+from train.data.presses import PressSet, one_thread
 from train.data.world import World
-from train.report import Report
+from train.freeze import freeze
+from train.learning.checkpoint import Training, fit_network, load_network
+from train.learning.checkpoint import infer as infer_network
+from train.networks.blocks import PatternNet
+from train.physics.gripped import FRAMES, SCALE
+from train.report import Report, Row
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import ANGLE_STEP_DEG, Split
 
+_TIMED_RUNS: Final = 12  # of which the first third is left out
+_frozen = cache(freeze)  # which takes minutes, and several experiments want the same
 _QUICK_PRESSES: Final = 42
 
 Figures = dict[str, NDArray[np.float64]]
 """Every metric of every frame, (n,) each, as returned by edge.evaluation.evaluate."""
 
 
+@dataclass(frozen=True)
+class Method:
+    """Method from windows (n, taps, 3, rows, cols) in zeroed counts to patterns and deviations, (n, H, W) in [mm]."""
+
+    name: str
+    taps: int  # of a window that the method uses
+    contact_level: float  # share of a pattern's maximum from which a pixel counts as touched
+    run: Callable[[NDArray[np.float32]], tuple[NDArray[np.floating], NDArray[np.float32] | None]]
+    cost: Row = field(default_factory=dict)  # parameters, multiply-accumulates and run time, as cells of a row
+    training: Row = field(default_factory=dict)  # steps and time, as cells of a row
+
+    def patterns(self, windows: NDArray[np.float32]) -> NDArray[np.floating]:
+        """Return patterns (n, H, W) in [mm] of windows (n, K, 3, rows, cols); K is at least `taps`."""
+        return self.run(windows[:, : self.taps])[0]
+
+
 @dataclass
 class Workbench:
-    """Folders of datasets and shipped models, with the files `used` of them; tiny sets if `quick`."""
+    """Folders of datasets, trained networks and shipped models, with the files `used` of them; tiny ones if `quick`."""
 
     data_folder: Path = Path("data")
+    checkpoints: Path = Path("checkpoints")
     quick: bool = False
     models: Path = BUNDLE_DIR
     used: set[Path] = field(default_factory=set)
@@ -57,6 +89,65 @@ class Workbench:
         """Return the wide frozen set."""
         wide = load_frozen_presses(self.use(WIDE_TEST))
         return wide.pick(np.arange(len(wide)) % 12 == 0) if self.quick else wide
+
+    def fit(self, training: Training, data: PressSet, validation: FrozenSet) -> Path:
+        """Return the checkpoint of a network, which is trained unless the same training on these data exists."""
+        if self.quick:
+            training = _quick(training)
+        fit_network(training, data, validation, self.checkpoints)
+        return self.use(self.checkpoints / f"{training.name}.pt")
+
+    def network(self, training: Training, data: PressSet, validation: FrozenSet) -> Method:
+        """Return a trained network; the one that it starts from must be there."""
+        path = self.fit(training, data, validation)
+        net, report = load_network(path)
+        steps, elapsed_s, level = report["steps"], report["elapsed_s"], report["contact_level"]
+        while (start := report["config"]["start"]) is not None:  # its training counts as well
+            _, report = load_network(self.checkpoints / f"{start}.pt")
+            steps, elapsed_s = steps + report["steps"], elapsed_s + report["elapsed_s"]
+        cells: Row = {"steps": steps, "training min": round(elapsed_s / 60, 1)}
+        return Method(path.stem, net.taps, level, partial(infer_network, net), _cost_of_network(net), cells)
+
+    def frozen(
+        self,
+        split: Split,
+        surfaces: Sequence[str] = SURFACES,
+        scale: int = SCALE,
+        angle_step_deg: float = ANGLE_STEP_DEG,
+    ) -> FrozenSet:
+        """Return a frozen set made like the bundled one, at another place, with other surfaces, scale or angle."""
+        frozen = _frozen(tuple(surfaces[:2] if self.quick else surfaces), split, scale, angle_step_deg)
+        return frozen.thinned(FRAMES) if self.quick else frozen  # one frame a tap
+
+
+def _cost_of_network(net: PatternNet) -> Row:
+    """Return parameters, multiply-accumulates, and run time of one window in torch on one thread, as cells of a row."""
+    window = torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:])
+    with one_thread(), torch.inference_mode():
+        run_time_ms = median_ms(lambda: net(window))
+    parameters = sum(parameter.numel() for parameter in net.parameters())
+    return {"parameters": parameters, "MMAC": round(macs(net) / 1e6, 1), "run time ms": run_time_ms}
+
+
+def median_ms(run: Callable[[], object]) -> float:
+    """Return the median time of some runs, without the first third of them, in [ms]."""
+    times_s = repeat(run, number=1, repeat=_TIMED_RUNS)
+    return round(1e3 * float(np.median(times_s[_TIMED_RUNS // 3 :])), 3)
+
+
+def _quick(training: Training) -> Training:
+    """Return the training in miniature, under its own name."""
+    recipe = replace(training.recipe, steps=1, batch=2)
+    options = {"channels": 16, "blocks": 1} if training.network.startswith("compact") else {}
+    start = training.start and f"quick-{training.start}"
+    return replace(training, name=f"quick-{training.name}", recipe=recipe, options=options, start=start)
+
+
+def macs(net: PatternNet) -> int:
+    """Count multiply-accumulates of one window in convolutions and matrix products, without norms and interpolation."""
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        net.eval()(torch.zeros(1, 3 * int(net.taps), *USPA44.scan_shape[1:]))
+    return counter.get_total_flops() // 2
 
 
 SHORT: Final = {False: "model", True: "model, all known"}

@@ -9,7 +9,7 @@ in [deg], as in `firmware_bridge.poses`.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from firmware_bridge.pad_geometry import USPA44
 from train.surfaces.depth_image import Pose
 
-PLACES_MM: Final[Mapping[str, tuple[float, float]]] = {"test": (-2.5, 2.5), "validation": (0.0, 2.5)}
+Split = Literal["validation", "test"]
+PLACES_MM: Final[Mapping[Split, tuple[float, float]]] = {"test": (-2.5, 2.5), "validation": (0.0, 2.5)}
 """Place of each split's targets: the first two of the paper's positions, a grid of 3 x 3 around the centre."""
 ANGLE_STEP_DEG: Final = 5.0
 MAX_TAPS: Final = 7

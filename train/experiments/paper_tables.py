@@ -1,0 +1,344 @@
+"""The paper's protocol, and its tables: errors by method, scale, angle between taps, number of taps, and surface.
+
+First come the data, the networks that are trained on them, and the methods that are compared; then Tables III and IV,
+and Figs. 12, 13 and 16.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.evaluation.classical_methods import CONTACT_LEVEL, fitted_methods, method_macs
+from edge.evaluation.test_set import FrozenSet, judge
+from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import USPA44
+from train.data.presses import PressSet, join_presses
+from train.data.world import World
+from train.errors import CheckpointError
+from train.experiments.workbench import Figures, Method, Workbench, median_ms
+from train.fit import given_taps
+from train.freeze import CLASSICAL_WINDOWS, fit_classical
+from train.learning.checkpoint import Training
+from train.learning.interval_fit import half_width_mm
+from train.learning.training_loop import Recipe
+from train.physics.gripped import FINE_SCALE, SCALE
+from train.report import Report, Row, with_interval
+from train.surfaces.named_surfaces import SURFACES
+from train.surfaces.poses import ANGLE_STEP_DEG, MAX_TAPS
+
+HELD_OUT: Final = ("S", "hollow circle", "hollow triangle")  # surfaces that Fig. 16 leaves out of a training.
+KNOWN: Final = tuple(name for name in SURFACES if name not in HELD_OUT)
+_SET: Final = World(taps=MAX_TAPS, schedule="turns", spread=0.0, scale=FINE_SCALE)
+SETS: Final = {
+    "known": replace(_SET, families=dict.fromkeys(KNOWN, 1.0), count=7500, seed=1),
+    "held-out": replace(_SET, families=dict.fromkeys(HELD_OUT, 1.0), count=1500, seed=2),
+    "figures": replace(_SET, families={"glyph": 1.0, "polygon": 1.0}, count=9000, seed=3),
+}
+"""Presses by the nominal pad, turned from tap to tap: of the 15 other surfaces, of those three, of random figures."""
+
+_PASS: Final = 1125
+"""Steps of the paper's networks in batches of 16: one pass over the data, a quarter of an hour for the STSR."""
+BASE: Final = Training("taps-stsr", "compact-stsr", Recipe(steps=16_000, bf16=True))
+"""Compact STSR trained on the paper's figures and random ones, without pad constants."""
+
+
+def presses(bench: Workbench, name: str) -> PressSet:
+    """Return one of SETS, with the truth at x20."""
+    return bench.presses(f"paper-{name}", SETS[name], MAX_TAPS)
+
+
+def mixed(bench: Workbench, scale: int = SCALE) -> PressSet:
+    """Return the mixed data, the 18 surfaces and as many random figures, with the truth at a scale."""
+    return join_presses([presses(bench, name) for name in SETS]).at_scale(scale)
+
+
+def compact(name: str) -> Training:
+    """Return the training of a compact network: stsr, the base; mtsr2, ... mtsr7, trained on from it."""
+    return BASE if name == "stsr" else from_base(name, int(name.removeprefix("mtsr")), 2000)
+
+
+def from_base(name: str, taps: int, steps: int, scale: int = SCALE) -> Training:
+    """Return the training of a compact network from the base's trunk; at another scale its output layers are new."""
+    recipe = Recipe(steps=steps, learning_rate=1e-3, given=given_taps(taps))
+    network, seed = ("compact-stsr", 1) if taps == 1 else (f"compact-mtsr{taps}", 1 + taps)
+    return Training(f"taps-{name}", network, recipe, scale, BASE.name, seed)
+
+
+def published(name: str) -> Training:
+    """Return the training of a network of the paper: SRGAN on top of SRCNN, every MTSR-K on top of the STSR.
+
+    `stsr longer` is trained on for as long as MTSR-2 from the STSR, so that the two differ by the second tap alone.
+    """
+    network, _, longer = name.partition(" ")
+    taps = int(network.removeprefix("mtsr")) if network.startswith("mtsr") else 1
+    start = "seed-srcnn" if network == "srgan" else "seed-stsr" if taps > 1 or longer else None
+    given, steps = given_taps(taps), _PASS // 4 if start == "seed-stsr" else _PASS
+    recipe = Recipe(steps, batch=16, learning_rate=5e-4, weight_decay=1e-2, given=given, bf16=True)
+    return Training(f"seed-{name}", network, recipe, start=start)
+
+
+_STARTS: Final = {start.name: start for start in (BASE, published("stsr"), published("srcnn"))}
+
+
+def trained(bench: Workbench, training: Training, data: PressSet, validation: FrozenSet) -> Method:
+    """Return a trained network; the network that it starts from is trained first."""
+    if training.start:
+        bench.fit(_STARTS[training.start], data, validation)
+    return bench.network(training, data, validation)
+
+
+def compact_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
+    """Return compact networks by name (stsr, mtsr2, ...), trained on `data` where no checkpoint exists."""
+    validation = bench.frozen("validation")
+    return [replace(trained(bench, compact(name), data, validation), name=name) for name in names]
+
+
+def classical_methods(bench: Workbench, data: PressSet, names: Sequence[str]) -> list[Method]:
+    """Return methods of edge.evaluation.classical_methods by name, fitted on windows of `data`."""
+    path = bench.data_folder / f"classical-{data.sha256()[:10]}.npz"
+    if not path.exists():
+        fitted = fit_classical(data, 300 if bench.quick else CLASSICAL_WINDOWS)
+        np.savez_compressed(path, allow_pickle=False, **fitted)
+    fits, scan = fitted_methods(path, SCALE), np.zeros((1, *USPA44.scan_shape), dtype=np.float32)
+
+    def method(name: str) -> Method:
+        parameters = 3 * USPA44.taxel_count * (USPA44.taxel_count * SCALE**2) if name == "linear map" else 1
+        mega_macs, run_time_ms = round(method_macs(name, SCALE) / 1e6, 3), median_ms(partial(fits[name], scan))
+        cost: Row = {"parameters": parameters, "MMAC": mega_macs, "run time ms": run_time_ms}
+        return Method(name, 1, CONTACT_LEVEL, lambda windows: (fits[name](windows[:, 0]), None), cost)
+
+    return [method(name) for name in names]
+
+
+def judged(
+    head: Row,
+    method: Method,
+    sets: Mapping[str, FrozenSet],
+    given: int | None = None,
+    alone_db: NDArray[np.float64] | None = None,
+) -> tuple[Row, NDArray[np.float64]]:
+    """Return the row of a method with its errors on each set, and the PSNR in [dB] of every frame of the last, (n,).
+
+    The method gets the newest `given` taps, or all that it uses; `alone_db` is that of the STSR, to state the gain.
+    """
+    row, found_db = dict(head), np.empty(0)
+    for split, frozen in sets.items():
+        figures = judge(method.patterns(frozen.windows(method.taps, given)), frozen, method.contact_level)
+        row |= error_cells(figures, frozen, split)
+        found_db = figures["psnr_db"]
+        if alone_db is not None:
+            row["over STSR dB"] = with_interval(found_db - alone_db, frozen.tap, sign="+")
+    return row | method.cost | method.training, found_db
+
+
+def error_cells(figures: Figures, frozen: FrozenSet, split: str) -> Row:
+    """Return mean errors over a frozen set as cells of a row, PSNR with its interval by tap."""
+    return {
+        f"{split} PSNR dB": with_interval(figures["psnr_db"], frozen.tap),
+        f"{split} SSIM": round(float(figures["ssim"].mean()), 4),
+        f"{split} RMSE %": round(float(figures["rmse_percent"].mean()), 3),
+        f"{split} IoU": round(float(figures["contact_iou"].mean()), 4),
+        f"{split} boundary mm": round(float(figures["boundary_mm"].mean()), 3),
+    }
+
+
+TABLE_3: Final[dict[str, tuple[float, float]]] = {
+    "bilinear": (18.10, 0.5663),
+    "srcnn": (21.10, 0.7690),
+    "srgan": (21.54, 0.7876),
+    "stsr": (22.45, 0.8170),
+    "mtsr2": (23.80, 0.8954),
+    "mtsr3": (23.73, 0.8907),
+    "mtsr4": (23.69, 0.8934),
+    "mtsr5": (24.06, 0.9068),
+    "mtsr6": (23.93, 0.8984),
+    "mtsr7": (24.04, 0.9004),
+}
+"""PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table III): other data, other units."""
+
+TABLE_4: Final = {4: (22.69, 0.8297), 6: (22.84, 0.8326), 8: (22.12, 0.8108), 10: (22.45, 0.8170), 20: (22.56, 0.8219)}
+"""Scale to PSNR in [dB] and SSIM on the test set (Wu and Liu 2024, Table IV)."""
+
+COMPARED: Final = (
+    *(("compact stsr", "stsr"), ("compact mtsr4", "mtsr4")),
+    *(("mtsr2", "stsr longer"), ("compact mtsr2", "compact stsr")),
+)
+ONE_IN: Final = 8  # step between evaluated frames of a tap
+
+
+def _of_paper(figures: tuple[float, float] | None) -> Row:
+    db, ssim = figures or (None, None)
+    return {"paper's test PSNR dB": db, "paper's test SSIM": ssim}
+
+
+def table3(bench: Workbench, report: Report) -> None:
+    """Compare all methods on the same targets at x10: Table III."""
+    data, validation = mixed(bench), bench.frozen("validation")
+    sets = {"validation": validation.thinned(ONE_IN), "test": bench.frozen("test").thinned(ONE_IN)}
+    names = ("srgan", "stsr", "mtsr2") if bench.quick else tuple(TABLE_3)[1:]
+    # The paper's networks, which are large, are calibrated on few frames.
+    networks = [(name, published(name), sets["validation"]) for name in (*names, "stsr longer")]
+    networks += [(f"compact {name}", compact(name), validation) for name in ("stsr", "mtsr2", "mtsr4", "mtsr7")]
+    compared = {one.name: one for one in classical_methods(bench, data, ("bilinear", "bicubic", "linear map"))}
+    for name, training, calibrated_on in tracked(networks, "networks", "network"):
+        compared[name] = trained(bench, training, data, calibrated_on)
+    test, rows, test_db = sets["test"], list[Row](), dict[str, NDArray[np.float64]]()
+    for name, method in compared.items():
+        theirs = TABLE_3.get(name.removeprefix("compact ").removesuffix(" longer"))
+        row, test_db[name] = judged({"method": name} | _of_paper(theirs), method, sets)
+        rows.append(row)
+    report.say(
+        f"{len(test)} frames of {len(test.surface)} taps a set, one in {ONE_IN} evenly over each tap, the same for "
+        f"every row; full scale {test.full_scale_mm} mm. PSNR with its 95 % interval by tap. Run time: one window, "
+        f"torch, one thread. All are trained on the same {len(data)} sequences, the paper's networks in one pass over "
+        "them; training min and steps count those of the network that a row's started from. The paper's figures are "
+        "of real data in other units."
+    )
+    verdicts = [
+        f"- {better} over {worse} [dB]: {with_interval(test_db[better] - test_db[worse], test.tap, sign='+')}"
+        for better, worse in COMPARED
+        if {better, worse} <= set(test_db)
+    ]
+    report.say("On the test set, tap by tap:\n\n" + "\n".join(verdicts))
+    report.table(rows, "Validation and test set, x10.")
+
+
+def table4(bench: Workbench, report: Report) -> None:
+    """Compare the compact STSR at five scales, each against the truth at that scale: Table IV."""
+    rows: list[Row] = []
+    bench.fit(BASE, mixed(bench), bench.frozen("validation"))  # at its own scale
+    for scale, theirs in tracked(TABLE_4.items(), "scales", "scale"):
+        sets = {split: bench.frozen(split, scale=scale) for split in ("validation", "test")}
+        training = BASE if scale == BASE.scale else from_base(f"stsr-x{scale}", 1, 2500, scale)
+        method = bench.network(training, mixed(bench, scale), sets["validation"])
+        pattern = "{} x {}".format(*sets["test"].unit_patterns.shape[1:])
+        rows.append(judged({"scale": f"x{scale}", "pattern": pattern} | _of_paper(theirs), method, sets)[0])
+    report.say(
+        "The compact STSR. Truth is made at x20 and brought to each scale with anti-aliasing. At x10 the layers that"
+        " make pixels are as old as the base network, at the other scales they are trained from nothing for the last"
+        " steps alone: compare those with each other."
+    )
+    report.table(rows, "STSR by scale.")
+
+
+def angle(bench: Workbench, report: Report) -> None:
+    """Compare an MTSR-2 for each angle between its taps, on taps turned by that angle: Fig. 12."""
+    stsr = trained(bench, compact("stsr"), mixed(bench), bench.frozen("validation"))
+    row, alone_db = judged({"network": "STSR", "angle deg": None}, stsr, {"test": bench.frozen("test")})
+    rows = [row]
+    for angle_deg in tracked((5.0, 10.0, 15.0, 20.0, 25.0, 30.0), "angles", "angle"):
+        validation, turned = (bench.frozen(split, angle_step_deg=angle_deg) for split in ("validation", "test"))
+        training = from_base(f"mtsr2-{angle_deg:g}-deg", 2, 1500)
+        method = bench.network(training, _by_angle(bench, angle_deg), validation)
+        head: Row = {"network": "MTSR-2", "angle deg": angle_deg}
+        rows.append(judged(head, method, {"test": turned}, alone_db=alone_db)[0])
+    report.say(
+        "Compact networks, each trained from the STSR for as many steps and evaluated with its own angle; of the gain"
+        " over the STSR a part is these steps. In the paper 10 degrees are best. The newest taps differ between angles"
+        " by their pose error alone."
+    )
+    report.table(rows, "MTSR-2 by angle between the taps, test set.")
+
+
+def _by_angle(bench: Workbench, angle_step_deg: float) -> PressSet:
+    """Return the mixed data with two taps that are turned by another angle."""
+    if angle_step_deg == ANGLE_STEP_DEG:
+        return mixed(bench)
+    schedule = f"turns:{angle_step_deg:g}"
+    turned = {name: replace(world, taps=2, schedule=schedule, scale=SCALE) for name, world in SETS.items()}
+    parts = [bench.presses(f"paper-{name}-{angle_step_deg:g}-deg", world, 2) for name, world in turned.items()]
+    return join_presses(parts)
+
+
+def taps(bench: Workbench, report: Report) -> None:
+    """Compare networks of one to seven taps, and the last one with fewer, on the same targets: Fig. 13."""
+    data, test, validation = mixed(bench), {"test": bench.frozen("test")}, bench.frozen("validation")
+    trainings = {"stsr": from_base("stsr-alike", 1, 2000)}
+    trainings |= {name: compact(name) for name in (f"mtsr{number}" for number in range(2, MAX_TAPS + 1))}
+    networks = {name: trained(bench, training, data, validation) for name, training in trainings.items()}
+    ways = [(name, method.taps) for name, method in networks.items()]
+    ways += [(f"mtsr{MAX_TAPS}", given) for given in range(1, MAX_TAPS + 1)]
+    _, alone_db = judged({}, networks["stsr"], test)
+    rows = [
+        judged({"network": name, "taps given": given}, networks[name], test, given, alone_db)[0]
+        for name, given in tracked(ways, "taps", "run")
+    ]
+    report.say(
+        "Compact networks on the same targets, all trained on from one of a single tap for as long: one for each number"
+        " of taps, then the one of seven taps with fewer as input."
+    )
+    report.table(rows, "By number of taps, test set.")
+
+
+TEST_SEED: Final = 999_000_000
+TEST_FIGURES: Final = 24
+GIVEN: Final = (1, 4)
+_EVERY: Final = Training("unseen-all", "compact-mtsr4", Recipe(steps=16_000, given=given_taps(max(GIVEN)), bf16=True))
+
+
+def unseen(bench: Workbench, report: Report) -> None:
+    """Compare networks trained on surfaces alone and with random figures, on others.
+
+    Three of the 18 surfaces are held out; tested glyphs and polygons are of another seed than the trained ones. All
+    networks are identical. All figures make as many windows as all surfaces do, so training on surfaces alone runs once
+    for as long and once for as many windows of the surfaces. Figures reduce the accuracy on seen surfaces, so one
+    network sees fewer of them.
+
+    Source: Wu and Liu 2024, Fig. 16 and Sec. VI-C.
+    """
+    numbers = range(TEST_SEED, TEST_SEED + TEST_FIGURES)
+    glyphs, polygons = ([f"{kind}:{number}" for number in numbers] for kind in ("glyph", "polygon"))
+    surfaces = {"15 seen": KNOWN, "3 held out": HELD_OUT, "glyphs": glyphs, "polygons": polygons}
+    tests, validation = {name: bench.frozen("test", one) for name, one in surfaces.items()}, bench.frozen("validation")
+    networks = {
+        name: bench.network(training, data, validation if training is _EVERY else bench.frozen("validation", KNOWN))
+        for name, (training, data) in training_sets(bench).items()
+    }
+    rows: list[Row] = []
+    alone_db: dict[tuple[str, int], NDArray[np.float64]] = {}
+    for name, method in tracked(networks.items(), "judging", "network"):
+        for (tested, frozen), given in product(tests.items(), GIVEN):
+            pattern, deviation = method.run(frozen.windows(method.taps, given))
+            if deviation is None:
+                raise CheckpointError(f"{method.name} gives no deviations: take a compact network")
+            reach_mm = half_width_mm(deviation)
+            width_percent = 200 * reach_mm / frozen.indentation_mm[:, None, None]
+            figures = judge(pattern, frozen, method.contact_level, reach_mm)
+            row: Row = {"trained on": name, "tested on": tested, "taps": given}
+            row |= error_cells(figures, frozen, "test")
+            over_db = figures["psnr_db"] - alone_db.setdefault((tested, given), figures["psnr_db"])  # of the first
+            row["over the 15 dB"] = with_interval(over_db, frozen.tap, sign="+")
+            row["covered %"] = with_interval(100 * figures["coverage_90"], frozen.tap, 1)
+            row["width %"] = with_interval(width_percent.mean(axis=(1, 2)), frozen.tap, 1)
+            rows.append(row | method.cost | method.training)
+    report.say(
+        f"Held out: {', '.join(HELD_OUT)}. Figures are random glyphs and polygons, {SETS['figures'].count} to train on "
+        f"and {TEST_FIGURES} of each kind, of another seed, to test. All tests are made at the test position, though "
+        f"pose errors bring some training taps near it. Every network is `{_EVERY.network}` at x{_EVERY.scale}, "
+        f"{_EVERY.recipe.steps} steps (or half as many) of {_EVERY.recipe.batch} windows; contact levels and "
+        "deviations are set on the 15 surfaces at the validation position (on the 18 for `18 + figures`)."
+    )
+    report.table(
+        rows,
+        "`over the 15` is over the network trained on the 15 surfaces alone, frame by frame; `covered` and `width` are "
+        "of the 90 % interval, the width in % of the frame's indentation.",
+    )
+
+
+def training_sets(bench: Workbench) -> dict[str, tuple[Training, PressSet]]:
+    """Return the trainings with their presses, by name; all but the last are without the held-out surfaces."""
+    known, held_out, figures = (presses(bench, name).at_scale(_EVERY.scale) for name in SETS)
+    few = figures.pick(np.arange(min(833, len(figures))))  # a tenth of the windows; both kinds alternate
+    half = replace(_EVERY.recipe, steps=_EVERY.recipe.steps // 2)
+    return {
+        "15": (replace(_EVERY, name="unseen-alone"), known),
+        "15, half as long": (replace(_EVERY, name="unseen-alone-half", recipe=half), known),
+        "15 + 833 figures": (replace(_EVERY, name="unseen-few"), join_presses([known, few])),
+        "15 + figures": (replace(_EVERY, name="unseen-both"), join_presses([known, figures])),
+        "18 + figures": (_EVERY, join_presses([known, held_out, figures])),
+    }

@@ -1,0 +1,253 @@
+"""Finite-element reference: the pad as a Mooney-Rivlin solid under a rigid surface, at large strain.
+
+Hexahedra in the mixed formulation (displacement, pressure and volume ratio, the latter two constant in each cell
+and condensed) avoid locking as the rubber becomes incompressible. Contact is frictionless and of small slope: a
+touching node stays at the surface's height above the node's initial place, and is free in the plane. An active set
+determines the touching nodes: no node may be pulled, and none may overlap the surface.
+
+Each surface takes minutes. FElupe is required, which is GPL and so a separate extra; only this module imports it.
+
+Source: Wu and Liu 2024, section IV-D (the model); Holzapfel 2000, section 6.5 (the split of shape and volume).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from torch import Tensor
+
+from firmware_bridge.extras import how_to_install
+from firmware_bridge.pad_geometry import USPA44
+from train.errors import TrainError
+from train.physics.elastic_layer import Layer
+from train.surfaces.depth_image import Pose, depth_image
+from train.surfaces.named_surfaces import relief
+
+try:
+    import felupe
+except ModuleNotFoundError as error:
+    message = f"the FEM reference needs felupe (GPL): {how_to_install('fem')}"
+    raise ModuleNotFoundError(message, name="felupe") from error
+
+SCALE: Final = 10  # patterns are compared at 40 x 40, as in the paper
+CENTRE: Final = Pose(0.0, 0.0, 0.0)  # position 5, rotation 0 of the paper
+LAYER: Final = replace(Layer(), poisson=0.495)
+"""Layer of rubber: the solver's own Poisson's ratio is lower to account for free sides, which the elements have."""
+C2_SHARE: Final = 0.2
+"""Share of C2 in C1 + C2. At small strain only the sum counts; silicones are fitted with shares of 0 to about 0.3."""
+_SLACK: Final = 1e-4
+"""Tolerance of pull and overlap: shares of the mean push of a touching node, and of the indentation."""
+
+
+class NoEquilibriumError(TrainError, ArithmeticError):
+    """Failure of the elements to converge; the message names the indentation."""
+
+
+class Mesh(NamedTuple):
+    """Fineness of the elements: nodes per taxel pitch, and elements over the thickness."""
+
+    scale: int
+    cells_high: int
+
+    def __str__(self) -> str:
+        return f"{self.scale} nodes a pitch, {self.cells_high} high"
+
+
+FINEST: Final = Mesh(10, 8)  # mesh whose nodes are the pixels of the 40 x 40 pattern
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Patterns (s, 40, 40) of one press in [mm], its forces (s,) in [N], and the run time of each step in [s]."""
+
+    patterns_mm: NDArray[np.float32]
+    force_n: NDArray[np.float32]
+    run_s: NDArray[np.float64]
+
+
+def press_surface(surface: str, mesh: Mesh, indentation_mm: NDArray[np.floating]) -> Verdict:
+    """Press a named surface into the middle of the pad at rising indentations (s,)."""
+    pad = FemPad(*mesh)
+    found = pad.press(depth_image(relief(surface), CENTRE, pad.size, pad.cell_mm), indentation_mm)
+    return Verdict(pad.pattern(found.displacement_mm), found.force_n.astype(np.float32), found.run_s)
+
+
+class FemPresses(NamedTuple):
+    """Equilibria of one press at its steps (s,): force down and displacement of each node (s, size, size)."""
+
+    push_n: NDArray[np.float64]
+    displacement_mm: NDArray[np.float64]
+    touching: NDArray[np.bool_]
+    run_s: NDArray[np.float64]
+
+    @property
+    def force_n(self) -> NDArray[np.float64]:
+        """Contact force (s,), in [N]."""
+        return self.push_n.sum(axis=(1, 2))
+
+
+class FemPad:
+    """Pad bonded to its board, with free sides, its material that of the layer at small strain.
+
+    Nodes lie on the pixels of the pattern at a scale, and on the pad's rim.
+    """
+
+    def __init__(self, scale: int, cells_high: int, layer: Layer = LAYER) -> None:
+        self.cell_mm = USPA44.pixel_pitch_mm(scale)
+        pixels = USPA44.cols * scale
+        inner = pixels + 2 * int((USPA44.width_mm / self.cell_mm - pixels) // 2)
+        places_mm = (np.arange(inner) - (inner - 1) / 2) * self.cell_mm
+        self.nodes_mm = np.concatenate([[-USPA44.width_mm / 2], places_mm, [USPA44.width_mm / 2]])
+        self.size = len(self.nodes_mm)
+        self._rubber = MooneyRivlin.of_layer(layer)
+        mesh = felupe.Grid(self.nodes_mm, self.nodes_mm, np.linspace(0, layer.thickness_mm, cells_high + 1))
+        self._region = felupe.RegionHexahedron(mesh)
+
+    def press(self, depth_mm: NDArray[np.floating], indentation_mm: NDArray[np.floating]) -> FemPresses:
+        """Press a surface in at rising indentations (s,), each step starting from the last one's equilibrium.
+
+        Depths (size, size) are below its highest point over each node; the image of size x size cells of cell_mm fits,
+        because its rim is the pad's up to a fraction of a cell. NoEquilibriumError if the elements do not converge.
+        """
+        press = _Press(self._region, self._rubber, self.size)
+        found = [press.advance(float(step_mm), step_mm - depth_mm) for step_mm in indentation_mm]
+        return FemPresses(*map(np.array, zip(*found, strict=True)))
+
+    def pattern(self, displacement_mm: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Interpolate node displacements (s, size, size) linearly to the pixels of the pattern at SCALE."""
+        pixel_mm, count = USPA44.pixel_pitch_mm(SCALE), USPA44.cols * SCALE
+        along_mm = (np.arange(count) - (count - 1) / 2) * pixel_mm
+        surface = RegularGridInterpolator((self.nodes_mm, self.nodes_mm), np.moveaxis(displacement_mm, 0, -1))
+        return np.moveaxis(surface(tuple(np.meshgrid(along_mm, along_mm, indexing="ij"))), -1, 0).astype(np.float32)
+
+
+class _Press:
+    """State of a press: the current equilibrium and its touching nodes."""
+
+    def __init__(self, region: Any, rubber: "MooneyRivlin", size: int) -> None:
+        self._field = felupe.FieldContainer([felupe.Field(region, dim=3)])
+        stress = torch.func.grad(rubber.energy)
+        stiffness = torch.func.jacfwd(stress)
+        material = felupe.Material(
+            stress=lambda x: [_at_points(stress, x[0]), x[-1]], elasticity=lambda x: [_at_points(stiffness, x[0])]
+        )
+        # The mixed elements add the volumetric part.
+        self._body = felupe.SolidBodyNearlyIncompressible(material, self._field, bulk=rubber.bulk_mpa)
+        self._factors: SuperLU | None = None
+        self._touching = np.zeros((size, size), dtype=bool)
+        self._indentation_mm = 0.0
+        points = region.mesh.npoints
+        self._top = np.arange(points - size**2, points)
+        self._board = np.arange(size**2)
+
+    def advance(self, indentation_mm: float, wanted_mm: NDArray[np.floating]) -> tuple[Any, ...]:
+        """Advance to the surface at `wanted_mm` below the pad's face, (size, size)."""
+        start = perf_counter()
+        if self._indentation_mm:
+            # Nearly linear: the last step's field, scaled up, is close to the next one's.
+            self._field[0].values *= indentation_mm / self._indentation_mm
+        self._touch(self._touching | (wanted_mm > self._down_mm()))
+        for _ in range(20):
+            upwards_n = self._balance(wanted_mm, indentation_mm).reshape(-1, 3)[:, 2]
+            push_n = np.where(self._touching, -upwards_n[self._top].reshape(self._touching.shape), 0.0)
+            down_mm = self._down_mm()
+            pulled = push_n < -_SLACK * push_n.sum() / self._touching.sum()
+            sunk = ~self._touching & (wanted_mm - down_mm > _SLACK * indentation_mm)
+            if not (pulled | sunk).any():
+                self._indentation_mm = indentation_mm
+                return push_n, down_mm, self._touching.copy(), perf_counter() - start
+            self._touch(self._touching & ~pulled | sunk)
+        raise _none_at(indentation_mm)
+
+    def _down_mm(self) -> NDArray[np.float64]:
+        return -self._field[0].values[self._top, 2].reshape(self._touching.shape)
+
+    def _touch(self, touching: NDArray[np.bool_]) -> None:
+        if (touching != self._touching).any():
+            self._factors = None  # other nodes are held
+        self._touching = touching
+
+    def _balance(self, wanted_mm: NDArray[np.floating], indentation_mm: float) -> NDArray[np.float64]:
+        """Run Newton's iterations with the touching nodes held at their height; return the nodes' forces."""
+        held = np.full(self._field[0].values.shape, np.nan)
+        held[self._board] = 0.0
+        held[self._top[self._touching.ravel()], 2] = -wanted_mm[self._touching]
+        fixed = ~np.isnan(held.ravel())
+        try:
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                balance = felupe.newtonraphson(
+                    items=[self._body],
+                    dof0=np.flatnonzero(fixed),
+                    dof1=np.flatnonzero(~fixed),
+                    ext0=held.ravel()[fixed],
+                    solver=self._solve,
+                    tol=1e-6,  # out-of-balance forces at which a step is done, as a share of the reactions
+                    maxiter=12,
+                    verbose=False,
+                )
+        except felupe.NewtonConvergenceError as error:
+            raise _none_at(indentation_mm) from error
+        return np.asarray(balance.fun)
+
+    def _solve(self, tangent: csr_matrix, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solve by conjugate gradients with the last factors, because a tangent changes little from step to step."""
+        if self._factors is not None:
+            before = LinearOperator(tangent.shape, self._factors.solve)  # pyright: ignore[reportCallIssue] - its __new__ differs
+            solution, unfinished = cg(tangent, load, rtol=1e-6, maxiter=30, M=before)
+            if not unfinished:
+                return solution
+        try:
+            # Ordered for a symmetric matrix and without pivoting: half the fill and the time of the default.
+            options = {"SymmetricMode": True}
+            factors = splu(tangent.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        except RuntimeError as error:
+            raise felupe.NewtonConvergenceError("the tangent is singular") from error
+        self._factors = factors
+        return factors.solve(load)
+
+
+def _none_at(indentation_mm: float) -> NoEquilibriumError:
+    # A step starts from the last field scaled up, a poor start near incompressibility.
+    return NoEquilibriumError(
+        f"no equilibrium at an indentation of {indentation_mm:.3g} mm; press in other steps: smaller ones or, near a "
+        "Poisson's ratio of .5, larger"
+    )
+
+
+class MooneyRivlin(NamedTuple):
+    """Distortional part of a solid, whose volumetric part is K (J - 1)^2 / 2, in [MPa].
+
+    psi(F) = C1 (I1 J^(-2/3) - 3) + C2 (I2 J^(-4/3) - 3), with I1, I2 the invariants of C = F^T F and J = det F.
+    """
+
+    c1_mpa: float
+    c2_mpa: float
+    bulk_mpa: float
+
+    @classmethod
+    def of_layer(cls, layer: Layer) -> "MooneyRivlin":
+        """Return the solid that equals the layer at small strain: G = 2 (C1 + C2), K/G = 2 (1+nu) / (3 (1-2nu))."""
+        shear, nu = layer.shear_modulus_mpa, layer.poisson
+        bulk = shear * 2 * (1 + nu) / (3 * (1 - 2 * nu))
+        return cls((1 - C2_SHARE) * shear / 2, C2_SHARE * shear / 2, bulk)
+
+    def energy(self, gradient: Tensor) -> Tensor:
+        """Return psi in [MPa] at one point with a gradient F (3, 3)."""
+        right, volume = gradient.mT @ gradient, torch.linalg.cross(gradient[0], gradient[1]) @ gradient[2]
+        first = right.trace()
+        second = (first**2 - (right**2).sum()) / 2
+        return self.c1_mpa * (first * volume ** (-2 / 3) - 3) + self.c2_mpa * (second * volume ** (-4 / 3) - 3)
+
+
+def _at_points(function: Callable[[Tensor], Tensor], gradient: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return a tensor of each point's F, with the points last as in felupe, of gradients (3, 3, ...)."""
+    flat = torch.from_numpy(gradient.reshape(3, 3, -1))
+    found = torch.func.vmap(function, in_dims=-1, out_dims=-1)(flat).numpy()
+    return found.reshape(*found.shape[:-1], *gradient.shape[2:])
