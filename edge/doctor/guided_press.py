@@ -115,7 +115,7 @@ def judge_press(
     norm = "each corner answers where it is pressed"
     if turn is None:
         corners = ", ".join(f"{CORNERS[geometry.corners.index(one.place)]}: taxel {one.taxel}" for one in presses)
-        other = f"no turn of this pad has its corners so: {_AGAIN}, or try another --id-map"
+        other = "no turn of this pad has its corners so: run the doctor once more, or try another --id-map"
         order = Finding("taxel order", "wrong", corners, norm, other)
     else:
         order = judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy)

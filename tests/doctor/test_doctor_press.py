@@ -76,6 +76,8 @@ class TestAnswers:
     def test_presses_that_fit_no_turn_are_told_apart(self):
         crossed = [press(0, 0), press(3, 15), press(15, 3), press(12, 12)]
         assert find_order(crossed) is None
+        (order, _), mounting = judge_press(crossed)
+        assert (order.verdict, mounting) == ("wrong", None) and "top right: taxel 15" in order.measured
         assert find_order([press(0, 0), press(3, 0), press(15, 15), press(12, 12)]) is None
 
     def test_three_corners_settle_the_turn_and_the_axes(self):
