@@ -18,7 +18,6 @@ import os
 import signal
 import sys
 import time
-from typing import Protocol
 
 from edge.api import BridgeError, EdgeError, Event, Model, Result, Source, Stream, load_model, open_runtime, open_source
 
@@ -28,31 +27,19 @@ TICK_S = 0.005
 """Pause between two looks at the newest readings, half a period of a sensor, in [s]."""
 
 
-class Gripper(Protocol):
-    """Methods that a gripper must have."""
-
-    def close(self) -> None:
-        """Begin to close slowly, and return at once."""
-        ...
-
-    def stop(self) -> None:
-        """Stop where it is, at once; may be called at any time, and again."""
-        ...
-
-
 class PrintedGripper:
-    """Gripper that prints its movements."""
+    """Gripper that prints its movements, with the two methods that yours must have."""
 
     def __init__(self) -> None:
         self._moves = False
 
     def close(self) -> None:
-        """Print that it closes."""
+        """Begin to close slowly, and return at once."""
         self._moves = True
         print("gripper: closing", flush=True)
 
     def stop(self) -> None:
-        """Print that it stops, once."""
+        """Stop where it is, at once; may be called at any time, and again."""
         moved, self._moves = self._moves, False
         if moved:
             print("gripper: stopped", flush=True)
@@ -65,7 +52,7 @@ class Grip:
     """
 
     def __init__(
-        self, gripper: Gripper, area_mm2: float, *, most_counts: float, oldest_ms: float, name: str | None = None
+        self, gripper: PrintedGripper, area_mm2: float, *, most_counts: float, oldest_ms: float, name: str | None = None
     ) -> None:
         """Prepare to grip, with the limits of the command line; `name` is of the one sensor to use, None for all."""
         self.why = "it never began: no scan arrived"
@@ -117,14 +104,10 @@ class Grip:
             self._end(f"{result.area_mm2:.0f} mm2 touch, as felt {self._age_ms(scan.sensor):.1f} ms ago{checked}")
         elif result.state == "idle":  # zeroed, every taxel has sent readings, no contact
             self._free.add(scan.sensor)
-            self._begin(scan.time_ns - self._first_ns)
-
-    def _begin(self, after_ns: int) -> None:
-        """Close if every sensor has sent readings, and every pad is free."""
-        settled = after_ns >= SETTLING_NS and self._received_ns.keys() >= self._missing
-        if settled and self._free == self._received_ns.keys() and not self._closing:
-            self._closing = True
-            self._gripper.close()
+            settled = scan.time_ns - self._first_ns >= SETTLING_NS and self._received_ns.keys() >= self._missing
+            if settled and self._free == self._received_ns.keys() and not self._closing:
+                self._closing = True
+                self._gripper.close()
 
     def _on_event(self, event: Event) -> None:
         """End on any event (lost, silent, in trouble) unless it is of a sensor that is not used."""
@@ -135,8 +118,7 @@ class Grip:
         age_ms = self._age_ms(result.scan.sensor)
         if age_ms > self._oldest_ms:  # this loop, or the adapter, is too slow
             return f"the reading is {age_ms:.0f} ms old"
-        silent = self._silent()
-        if silent is not None:
+        if (silent := self._silent()) is not None:
             return silent
         if result.dead:
             return f"taxels {sorted(result.dead)} are dead"

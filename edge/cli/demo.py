@@ -5,7 +5,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
@@ -22,8 +21,9 @@ from edge.perception.result import Result
 from edge.pipeline.commands import RESET, Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.terminal.heatmap import Palette, Panel, choose_palette, draw
-from edge.terminal.text_wrap import columns, drawn
+from edge.terminal.argument_types import columns
+from edge.terminal.heatmap import Panel, draw, shows_colours
+from edge.terminal.progress_bar import drawn
 from firmware_bridge.poses import PadPose
 from firmware_bridge.zeroing.baseline import deformation
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 FREE, FOREIGN, MAGNET, SLIDE = -1, 0, 1, 2  # scenes as train/demo.py numbers them; FREE is outside of any
 _BEGINS: Final = {
-    FOREIGN: "demo: now another surface is tapped, and then the first one again: no pattern may be made from both",
-    MAGNET: "demo: now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
-    SLIDE: "demo: now the pad slides along another object, a long letter: a map is made of its patterns",
+    FOREIGN: "now another surface is tapped, and then the first one again: no pattern is ever made from both",
+    MAGNET: "now a magnet comes near the free pad, and stays while it is tapped: no contact reads like that",
+    SLIDE: "now the pad slides along another object, a long letter: a map is made of its patterns",
 }
 
 
@@ -88,15 +88,15 @@ class DemoScenes:
         """Announce the outcome of the scene, and count from 0."""
         if self._scene == FOREIGN:
             none = "no tap was dropped: this model takes one tap, or has not noticed the other surface"
-            self._say(f"demo: {f'earlier taps were dropped {self._dropped} times' if self._dropped else none}")
+            self._say(f"earlier taps were dropped {self._dropped} times" if self._dropped else none)
         elif self._scene == MAGNET:
-            told = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
+            doubted = f"{self._untrusted} of {self._patterns} patterns with the magnet were not to be believed"
             none = f"none of {self._patterns} patterns with the magnet was checked"
-            self._say(f"demo: {told if self._checked else none}")
+            self._say(doubted if self._checked else none)
         self._patterns = self._checked = self._untrusted = self._dropped = 0
 
     def _say(self, text: str) -> None:
-        self._tell(Event(time.monotonic_ns(), "note", None, text))
+        self._tell(Event(time.monotonic_ns(), "note", None, f"demo: {text}"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,13 +173,13 @@ class DemoScore:
         padded[0] = window[0]
         return self._model.run(padded)
 
-    def text(self, palette: Palette) -> str:
+    def text(self, coloured: bool) -> str:
         """Return the table of the scores, and the last tap's maps."""
         scores, of = self.scores(), f"of {self._recording.figure_taps} taps scored"
         if not scores:
             return f"none {of}: the run ended before a tap had a pattern"
         table = f"{len(scores)} {of} at their peak, against the simulated truth:\n{score_table(scores)}"
-        return f"{table}\n\ntap {scores[-1].tap + 1}:\n{_score_picture(scores[-1], palette)}"
+        return f"{table}\n\ntap {scores[-1].tap + 1}:\n{_score_picture(scores[-1], coloured)}"
 
 
 def score_table(scores: Sequence[TapScore]) -> str:
@@ -206,12 +206,10 @@ def _gained(scores: Sequence[TapScore]) -> str:
         return "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
     change = "fell" if last.rmse_percent < last.alone_percent else "did not fall"
     errors = f"{last.rmse_percent:.2f} % of full scale, {last.alone_percent:.2f} % with it alone"
-    risen = [str(one.tap + 1) for before, one in pairwise(scores) if one.rmse_percent > before.rmse_percent]
-    rose = f"\nFrom tap to tap it rose at tap {' and '.join(risen)}." if risen else ""
-    return f"With {last.result.taps_used} taps the last one's error {change}: {errors}.{rose}"
+    return f"With {last.result.taps_used} taps the last one's error {change}: {errors}."
 
 
-def _score_picture(score: TapScore, palette: Palette) -> str:
+def _score_picture(score: TapScore, coloured: bool) -> str:
     """Return the taxels, the pattern and the truth as maps side by side."""
     result = score.result
     if result.pattern is None or result.baseline is None:
@@ -225,7 +223,7 @@ def _score_picture(score: TapScore, palette: Palette) -> str:
         Panel(f"{believed}, {height} x {width}", result.pattern, 0.0, highest, result.pattern_unit),
         Panel("truth", score.truth, 0.0, highest, result.pattern_unit),
     ]
-    return draw(panels, columns(), palette)
+    return draw(panels, columns(), coloured)
 
 
 class DemoMap(MapSink):
@@ -248,7 +246,7 @@ class DemoMap(MapSink):
         elif scene is not None:
             self.complete = self._begun
 
-    def text(self, palette: Palette) -> str:
+    def text(self, coloured: bool) -> str:
         """Return the map's distance from the truth, and both as pictures; nothing before the slide."""
         if not self._begun:
             return ""
@@ -266,7 +264,7 @@ class DemoMap(MapSink):
             Panel("map", contact[shown], 0.0, 1.0, "touched"),
             Panel("truth", self._letter[shown].astype(np.float64), 0.0, 1.0, "touched"),
         ]
-        pictures = "\n\n".join(draw([panel], columns(), palette, widest=72) for panel in panels)
+        pictures = "\n\n".join(draw([panel], columns(), coloured, widest=72) for panel in panels)
         return f"{title}outline {away_mm:.2f} mm from the truth\n{pictures}"
 
 
@@ -338,6 +336,6 @@ class Demo(Sink):
 
     def _print(self, part: DemoScore | DemoMap) -> None:
         stream = drawn(self._stream)
-        if text := part.text(choose_palette(os.environ, terminal=stream.isatty(), encoding=stream.encoding)):
+        if text := part.text(shows_colours(os.environ, terminal=stream.isatty(), encoding=stream.encoding)):
             stream.write(f"\n{text}\n")
         self._unprinted.remove(part)

@@ -9,16 +9,14 @@ from typing import Final, TextIO
 import numpy as np
 
 from edge.api import DEFAULT_MODEL, POSED_MODEL, Model, ModelError, bundled_models, load_model
-from edge.terminal.progress_bar import progress
-from edge.terminal.text_wrap import columns, wrapped
+from edge.terminal.argument_types import columns, wrapped
+from edge.terminal.progress_bar import tracked
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links.discovery import Found, devices
 from firmware_bridge.schedule import Ticker
 
 RATE_HZ: Final = 100.0
-ROUNDS: Final = 3
-"""Rounds in which the models take turns, so that a bad second of a shared host does not fall on one model alone."""
-ROUND_TICKS: Final = 50
+TICKS: Final = 150
 NOTHING = (
     "no adapter found: check both plugs of a VScom (the second is the sensor's power), the lines of `dmesg` since "
     "it was plugged in, and that this user is in the group dialout"
@@ -53,7 +51,7 @@ def show_models(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     out.write("Errors on the frozen test set, with all taps; docs/models.md helps to choose.\n")
     if not measure:
         return
-    out.write(f"run times of {ROUNDS * ROUND_TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
+    out.write(f"run times of {TICKS} patterns each at {RATE_HZ:g} Hz, on one thread\n")
     # The ratio is 1.2 to 1.4 on a quiet machine.
     uneven = [path.stem for path, (p50, p99) in zip(paths, took_us, strict=True) if p99 > 3 * p50]
     if uneven:
@@ -66,22 +64,18 @@ def run_times_us(models: Sequence[Model]) -> list[tuple[float, float]]:
 
     Windows are random, with all taps: run time does not depend on their values.
     """
-    rng = np.random.default_rng(1)
-    took_us = np.zeros((len(models), ROUNDS, ROUND_TICKS))
-    with progress("run times", took_us.size, "run") as bar:
-        for round_ in range(ROUNDS):
-            for index, model in enumerate(models):
-                contract = model.contract
-                shape = (16, contract.taps, 3, contract.rows, contract.cols)
-                windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
-                ticker = Ticker(RATE_HZ)
-                for tick in range(ROUND_TICKS):
-                    ticker.wait()
-                    start_ns = time.perf_counter_ns()
-                    model.run(contract.scale_window(windows[tick % len(windows)]))
-                    took_us[index, round_, tick] = (time.perf_counter_ns() - start_ns) / 1e3
-                bar.update(ROUND_TICKS)  # not while it measures
-    both = np.percentile(took_us.reshape(len(models), -1), [50, 99], axis=1, method="inverted_cdf")
+    rng, took_us = np.random.default_rng(1), np.zeros((len(models), TICKS))
+    for index, model in enumerate(tracked(models, "run times", "model")):
+        contract = model.contract
+        shape = (16, contract.taps, 3, contract.rows, contract.cols)
+        windows = (rng.standard_normal(shape) * 1000).astype(np.float32)
+        ticker = Ticker(RATE_HZ)
+        for tick in range(TICKS):
+            ticker.wait()
+            start_ns = time.perf_counter_ns()
+            model.run(contract.scale_window(windows[tick % len(windows)]))
+            took_us[index, tick] = (time.perf_counter_ns() - start_ns) / 1e3
+    both = np.percentile(took_us, [50, 99], axis=1, method="inverted_cdf")
     return [(float(p50), float(p99)) for p50, p99 in both.T]
 
 

@@ -8,53 +8,30 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TextIO
 
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
-from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
-from edge.doctor.write_sensor_file import check_writable, keep, refuse_device
+from edge.doctor.taxel_checks import Finding, Verdict
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
-from edge.terminal.progress_bar import progress
+from edge.terminal.argument_types import columns, wrapped
+from edge.terminal.progress_bar import drawn, progress, rewritable
 from edge.terminal.stop_signals import stop_on_signals
-from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
+from firmware_bridge import in_place
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
-from firmware_bridge.in_place import BACKUP_SUFFIX
 from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
-from firmware_bridge.sensor_file.model import SensorFile
-from firmware_bridge.zeroing.baseline import deformation
-
-
-class FeltLine:
-    """Line of the load on the pad that is rewritten in place on a terminal; nothing is written elsewhere."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = drawn(stream)
-        self._rewritable = rewritable(self._stream)
-        self._shown_s = self.asked_s = time.monotonic()
-
-    def show(self, felt: float) -> None:
-        """Show the load, as a share of that of a press, at most ten times a second."""
-        now_s = time.monotonic()
-        if now_s - self._shown_s < 0.1 or not self._rewritable:
-            return
-        self._shown_s = now_s
-        left_s = max(PATIENCE_S - (now_s - self.asked_s), 0)
-        skip = ", Enter skips" if _stdin_is_terminal() else ""
-        text = f"felt [{'#' * min(int(10 * felt), 10):10}] {left_s:.0f} s left{skip}"
-        self._stream.write(f"\r{text[: columns() - 1]}\x1b[K")
-        self._stream.flush()
-
-    def clear(self) -> None:
-        """Clear the line, for text that stays."""
-        if self._rewritable:
-            self._stream.write("\r\x1b[K")
+from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
+from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 
 def enter_pressed() -> bool:
@@ -86,6 +63,7 @@ class Visit:
         self._options, self._reader, self._known = options, reader, known
         self._link = reader.link
         self._err, self._stop = err, stop
+        self._rewritable = rewritable(err)
 
     def watch(self, watched: Watched) -> None:
         """Watch the link while the pads are free; raises LinkLostError."""
@@ -130,29 +108,36 @@ class Visit:
         baseline, mounting = examined.baselines[name], self._known.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
             self._say(whose + guide.first)
-        received_s = time.monotonic()
-        line = FeltLine(self._err)
+        received_s = asked_s = time.monotonic()
         enter_pressed()  # one of before is no answer to this request
-
-        def ask(request: str | None) -> None:
-            if request is not None:
-                line.clear()
-                self._say(whose + request)
-                line.asked_s = time.monotonic()
-
         while not (guide.done or self._stop.is_set() or self._link.ended):
             if time.monotonic() - received_s > GIVEN_UP_S:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
                 examined.findings.append(Finding("guided press", "wrong", "broken off", "", why, name))
                 break
+            requests: list[str | None] = []
             for scan in self._reader.read(POLL_S):
                 if scan.sensor == name:
                     received_s = time.monotonic()
-                    ask(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
+                    requests.append(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
             if enter_pressed():
-                ask(guide.skip())
-            line.show(guide.felt)
-        line.clear()
+                requests.append(guide.skip())
+            for request in filter(None, requests):
+                self._say(whose + request)
+                asked_s = time.monotonic()
+            self._show_load(guide.felt, asked_s + PATIENCE_S - time.monotonic())
+        self._rewrite("")
+
+    def _show_load(self, felt: float, left_s: float) -> None:
+        """Show the load, as a share of that of a press, in a line that is rewritten in place."""
+        skip = ", Enter skips" if _stdin_is_terminal() else ""
+        text = f"felt [{'#' * min(int(10 * felt), 10):10}] {max(left_s, 0):.0f} s left{skip}"
+        self._rewrite(text[: columns() - 1])
+
+    def _rewrite(self, text: str) -> None:
+        if self._rewritable:
+            drawn(self._err).write(f"\r{text}\x1b[K")
+            self._err.flush()
 
     def _why_no_press(self) -> str | None:
         if self._options.no_press:
@@ -164,6 +149,7 @@ class Visit:
         return None
 
     def _say(self, text: str) -> None:
+        self._rewrite("")
         print(*wrapped(text, columns()), sep="\n", file=self._err, flush=True)
 
 
@@ -225,13 +211,13 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
                 "duration_s": round(watched.duration_s, 3),
                 "stopped": stopped_s is not None,
                 "verdict": worst(examined.findings),
-                "findings": [finding.document() for finding in examined.findings],
+                "findings": [asdict(finding) for finding in examined.findings],
                 "sensor_file": str(options.out) if kept else None,
             }
             print(json.dumps(document, indent=1), file=out)
         else:
             files = [f"kept in {options.out}"] if kept else []
-            files += [f"the former file is now {options.out}{BACKUP_SUFFIX}"] if kept and replaced else []
+            files += [f"the former file is now {options.out}{in_place.BACKUP_SUFFIX}"] if kept and replaced else []
             if kept and options.weight_g is not None:
                 then = f"python -m train.own {options.out} --recordings FOLDER --out mine"
                 files += wrapped(f"train a model for it alone: {then}", columns())
@@ -246,3 +232,113 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
                 print(f"{options.out}: not written, because the free pad was not measured to the end", file=err)
             return 130
     return 1 if visit.unfinished or worst(examined.findings) == "wrong" else 0
+
+
+def check_writable(path: Path, known: SensorFile) -> None:
+    """Check that a file may be written, before minutes are spent on its content.
+
+    It is a new one, or that of `known`, of which all is kept that is not measured again. Raises SensorFileError for
+    another, and for one that cannot be written.
+    """
+    try:
+        in_place.check_writable(path)
+    except OSError as error:
+        why = error.strerror or error
+        raise SensorFileError(f"{path}: cannot be written: {why}: pass --out a file in a folder of yours") from error
+    if path.exists() and (known.path is None or known.path.resolve() != path.resolve()):
+        raise SensorFileError(
+            f"{path}: left as it is, because what it holds would be lost: pass --sensor {path} as well, to keep what "
+            "is not measured again, or another --out"
+        )
+
+
+def refuse_device(path: Path, known: SensorFile) -> None:
+    """Raise a SensorFileError where an emulated sensor would be written into the file of a device."""
+    measured = (one for one in known.sensors.values() if one.baseline is not None or "mounting" not in one.assumed)
+    if path.exists() and not all(one.emulated for one in measured):
+        raise SensorFileError(
+            f"{path}: left as it is, because it is of a device, and this one is emulated: another --out"
+        )
+
+
+def keep(
+    path: Path,
+    known: SensorFile,
+    port: str | None,
+    baselines: Mapping[str, Baseline],
+    found: Mapping[str, Mounting],
+    counts_per_newton: Mapping[str, float],
+    *,
+    emulated: bool = False,
+) -> SensorFile:
+    """Write what is `known` from before and the new results, by sensor, into a sensor file, and return it.
+
+    `port` is that of the adapter, whose serial number is kept where it has one; baselines are of the free pads as they
+    were read, and `found` are corrections of the mounting. Raises SensorFileError where the file cannot be written.
+    """
+    with changing(path):
+        entries, as_wired = dict(known.sensors), Mounting(taxel_count=known.geometry.taxel_count)
+        if path.exists():  # a run may have learned gains meanwhile
+            for name, entry in load_sensor_file(path).sensors.items():
+                entries[name] = replace(entries.get(name, entry), learned=entry.learned)
+        for name in sorted({*baselines, *found, *counts_per_newton}):
+            entry = entries.get(name, SensorEntry(as_wired, assumed=frozenset({"mounting"})))
+            parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
+            renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
+            turned = found.get(name, as_wired)
+            baseline = baselines.get(name, entry.baseline)
+            if baseline is not None and turned.moves_taxels:
+                counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
+                baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
+            per_newton = counts_per_newton.get(name, entry.counts_per_newton)
+            pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
+            entries[name] = SensorEntry(
+                entry.mounting.then(turned),
+                per_newton,
+                baseline,
+                *pads,
+                assumed=entry.assumed - renewed,
+                emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
+                frame=entry.frame,
+            )
+        # A sensor of a named source is one of several, each with an adapter of its own.
+        serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)
+        written = replace(known, adapter=serial_number or known.adapter, sensors=entries)
+        save_sensor_file(path, written)
+        return written
+
+
+def _serial_number(port: str) -> str | None:
+    device, ports = str(Path(port).resolve()), serial_ports()
+    number = next((one.serial_number for one in ports if one.path == device), None)
+    return number if [one.serial_number for one in ports].count(number) == 1 else None
+
+
+def worst(findings: Iterable[Finding]) -> Verdict:
+    """Return the gravest verdict; "not known" counts as ok."""
+    verdicts = {finding.verdict for finding in findings}
+    return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
+
+
+def summary(findings: Iterable[Finding]) -> str:
+    """Return a short count of the findings that are not ok; "not known" is neither well nor wrong."""
+    count = Counter(finding.verdict for finding in findings)
+    unknown = [f"{count['not known']} not known"] if count["not known"] else []
+    if count["wrong"] or count["look"]:
+        return ", ".join([f"{count['wrong']} wrong", f"{count['look']} to look at", *unknown])
+    return ", ".join(["nothing wrong", *unknown]) if unknown else "all well"
+
+
+def page(findings: Sequence[Finding], columns: int) -> str:
+    """Return all findings as text, those of the link first, in lines of `columns` at most unless a word is wider."""
+    marks = {"ok": "ok", "look": "LOOK", "wrong": "WRONG", "not known": "?"}
+    lines: list[str] = []
+    indent = " " * 8
+    for sensor in dict.fromkeys(finding.sensor for finding in findings):
+        lines.append("link" if sensor is None else f"sensor {sensor}")
+        for finding in (one for one in findings if one.sensor == sensor):
+            norm = f" (norm: {finding.norm})" if finding.norm else ""
+            text = f"{finding.name}: {finding.measured}{norm}"
+            lines += wrapped(text, columns, f"  {marks[finding.verdict]:6}", indent)
+            lines += wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ")
+    return "\n".join(lines)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from edge.doctor import link_checks
 from edge.doctor import taxel_checks as taxels
-from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import LineFacts
-from edge.doctor.taxel_checks import FEWEST_SCANS, Samples
+from edge.doctor.taxel_checks import FEWEST_SCANS, Finding, Samples, judged
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
@@ -66,7 +65,7 @@ class Examined:
 def judge(watched: Watched, unix_time_s: float) -> Examined:
     """Return all findings of a watch; `unix_time_s` dates the baselines, in [s] since 1970, NaN if unknown."""
     samples = {name: Samples(scans) for name, scans in sorted(watched.scans.items()) if len(scans) > 1}
-    enough = {name: one for name, one in samples.items() if one.enough}
+    enough = {name: one for name, one in samples.items() if one.scans >= FEWEST_SCANS}
     half_silent = {name for name, one in enough.items() if 2 * np.count_nonzero(one.living) <= one.living.size}
     facts, counters, duration_s = watched.facts, watched.counters, watched.duration_s
     taxel_count = watched.model.geometry.taxel_count

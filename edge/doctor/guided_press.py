@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.findings import Finding, judged
+from edge.doctor.taxel_checks import Finding, judged
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
@@ -32,14 +32,6 @@ class Press:
     push_counts: tuple[float, float] | None  # change of summed x and y when pushed to the middle; None if not felt
 
 
-@dataclass(frozen=True)
-class Axes:
-    """Directions of the axes: `signs` of x and y, after the swap."""
-
-    swap_xy: bool
-    signs: tuple[int, int]
-
-
 def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
     """Return the orientations in which a pad can lie, by name; each gives the taxel of every place.
 
@@ -49,11 +41,10 @@ def orders(geometry: SensorGeometry = USPA44) -> dict[str, tuple[int, ...]]:
     found: dict[str, tuple[int, ...]] = {}
     for mirrored in (False, True):
         for quarters in range(4) if geometry.rows == geometry.cols else (0, 2):
-            ways = ["mirrored left to right"] * mirrored + [f"turned by {90 * quarters} degrees clockwise"] * bool(
-                quarters
-            )
+            turn = f"turned by {90 * quarters} degrees clockwise" if quarters else ""
+            ways = ("mirrored left to right" if mirrored else "", turn)
             turned = np.rot90(np.fliplr(grid) if mirrored else grid, -quarters)
-            found[", then ".join(ways) or AS_MAPPED] = tuple(turned.ravel().tolist())
+            found[", then ".join(filter(None, ways)) or AS_MAPPED] = tuple(turned.ravel().tolist())
     return found
 
 
@@ -75,14 +66,12 @@ def corner_taxel(z_counts: NDArray[np.floating]) -> int | None:
 
 def find_order(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> str | None:
     """Return the name of the pad's orientation in `orders`; None where no orientation fits."""
-    for name, order in orders(geometry).items():
-        if all(order[press.place] == press.taxel for press in presses):
-            return name
-    return None
+    fits = (name for name, order in orders(geometry).items() if all(order[one.place] == one.taxel for one in presses))
+    return next(fits, None)
 
 
-def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Axes | None:
-    """Return the directions of x and y; None where too few pushes were felt, or where they contradict each other."""
+def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> tuple[bool, tuple[int, int]] | None:
+    """Return whether x and y are swapped, and their signs after that; None where pushes are too few or contradict."""
     pushes = [press for press in presses if press.push_counts is not None]
     if len(pushes) < FEWEST_CORNERS:
         return None
@@ -95,7 +84,7 @@ def find_axes(presses: Sequence[Press], geometry: SensorGeometry = USPA44) -> Ax
         along = votes[[1, 0]] if swap else votes
         # 1 where every corner agrees, 0.5 or 0 where one of four or three contradicts, 0 for the other axis.
         if (np.abs(np.diag(along)) >= 0.8).all():
-            return Axes(swap, (int(np.sign(along[0, 0])), int(np.sign(along[1, 1]))))
+            return swap, (int(np.sign(along[0, 0])), int(np.sign(along[1, 1])))
     return None
 
 
@@ -103,15 +92,6 @@ def z_sign(presses: Sequence[Press]) -> int | None:
     """Return 1 if z rises under every press, -1 if it falls under every one; None where they contradict each other."""
     signs = {int(np.sign(press.z_counts)) for press in presses}
     return signs.pop() if len(signs) == 1 else None
-
-
-def _why_no_order(presses: Sequence[Press], geometry: SensorGeometry) -> str:
-    for taxel in geometry.corners:
-        places = [press.place for press in presses if press.taxel == taxel]
-        if len(places) > 1:
-            names = " and ".join(CORNERS[geometry.corners.index(place)] for place in places)
-            return f"{names} answered at the same corner"
-    return "opposite corners do not answer at opposite corners"
 
 
 _AGAIN: Final = "press again: run the doctor once more"
@@ -134,13 +114,15 @@ def judge_press(
     turn, axes, z = find_order(presses, geometry), find_axes(presses, geometry), z_sign(presses)
     norm = "each corner answers where it is pressed"
     if turn is None:
-        other = "the id map has the taxels in another order than any turn of this pad: try another --id-map"
-        order = Finding("taxel order", "wrong", _why_no_order(presses, geometry), norm, other)
+        corners = ", ".join(f"{CORNERS[geometry.corners.index(one.place)]}: taxel {one.taxel}" for one in presses)
+        other = "no turn of this pad has its corners so: run the doctor once more, or try another --id-map"
+        order = Finding("taxel order", "wrong", corners, norm, other)
     else:
         order = judged("taxel order", "ok" if turn == AS_MAPPED else verdict, turn, norm, remedy)
     if axes is None or z is None:
         return [order, _unclear_axes(sum(press.push_counts is not None for press in presses), z)], None
-    mounting = Mounting(swap_xy=axes.swap_xy, signs=(*axes.signs, z), taxel_count=geometry.taxel_count)
+    swapped, signs_xy = axes
+    mounting = Mounting(swap_xy=swapped, signs=(*signs_xy, z), taxel_count=geometry.taxel_count)
     ways = [way for way, sign in zip("xyz", mounting.signs, strict=True) if sign < 0]
     parts = ["x and y swapped"] * mounting.swap_xy + [f"{', '.join(ways)} reversed"] * bool(ways)
     measured = " and ".join(parts) or "x right, y down, z up when pressed"
@@ -183,16 +165,6 @@ class Reading(NamedTuple):
 
     zeroed: NDArray[np.float32]
     time_s: float
-
-    @property
-    def load_counts(self) -> float:
-        """Sum of the sizes of z, in either direction."""
-        return float(np.abs(self.zeroed[2]).sum())
-
-    @property
-    def shear_counts(self) -> NDArray[np.float32]:
-        """Sums of x and of y."""
-        return self.zeroed[:2].sum(axis=(1, 2))
 
 
 class _SkippedError(Exception):
@@ -237,7 +209,7 @@ class GuidedPress:
     @property
     def felt(self) -> float:
         """Load on the pad by the last reading, of that at which a press is measured."""
-        return float(np.abs(self._held[2]).sum()) / ON_COUNTS
+        return _load_counts(self._held) / ON_COUNTS
 
     def _go_on(self, step: Callable[[], str | None]) -> str | None:
         if self.done:
@@ -277,14 +249,14 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
 
     def pushed(reading: Reading) -> bool:
         # 300 counts are about 0.2 N; noise of two counts a taxel sums up to eight.
-        return _touched(reading) and bool(np.abs(reading.shear_counts - before).min() >= 300.0)
+        return _touched(reading) and bool(np.abs(_shear_counts(reading) - before).min() >= 300.0)
 
     felt = yield from _wait(
         "Still pressing, push towards the middle of the pad.", lambda one: pushed(one) or _free(one), 10
     )
     push = None
     if felt is not None and pushed(felt[-1]):
-        x, y = np.mean([reading.shear_counts for reading in felt], axis=0) - before
+        x, y = np.mean([_shear_counts(one) for one in felt], axis=0) - before
         push = (float(x), float(y))
     yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)
@@ -323,9 +295,19 @@ def _wait(say: str, fulfils: Callable[[Reading], bool], scans: int) -> Dialogue[
         reading = yield None
 
 
+def _load_counts(zeroed: NDArray[np.float32]) -> float:
+    """Return the sum of the sizes of z, in either direction."""
+    return float(np.abs(zeroed[2]).sum())
+
+
+def _shear_counts(reading: Reading) -> NDArray[np.float32]:
+    """Return the sums of x and of y."""
+    return reading.zeroed[:2].sum(axis=(1, 2))
+
+
 def _touched(reading: Reading) -> bool:
-    return reading.load_counts >= ON_COUNTS
+    return _load_counts(reading.zeroed) >= ON_COUNTS
 
 
 def _free(reading: Reading) -> bool:
-    return reading.load_counts < OFF_COUNTS
+    return _load_counts(reading.zeroed) < OFF_COUNTS

@@ -9,8 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from edge.doctor.findings import Finding, graded, judged
-from edge.doctor.taxel_checks import Samples
+from edge.doctor.taxel_checks import Finding, Samples, graded, judged
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
 from firmware_bridge.pad_geometry import USPA44
@@ -27,14 +26,11 @@ def check_id_map(ids: AbstractSet[int], model: ModelMap, half_silent: bool) -> F
         return None
     norm = "every taxel of a sensor by its id"
     whole = _whole_sensors(ids, model)
-    others = {
-        name: sensors
-        for name, other in ID_MAPS.items()
-        if name != model.name and (sensors := _whole_sensors(ids, other))
-    }
+    others = {name: _whole_sensors(ids, other) for name, other in ID_MAPS.items() if name != model.name}
     # The ids of a smaller pad may be among those of a larger one: then the larger one is on the bus.
-    largest = max((ID_MAPS[name].geometry.taxel_count for name in others), default=0)
-    others = {name: sensors for name, sensors in others.items() if ID_MAPS[name].geometry.taxel_count == largest}
+    sizes = {name: ID_MAPS[name].geometry.taxel_count for name, sensors in others.items() if sensors}
+    largest = max(sizes.values(), default=0)
+    others = {name: others[name] for name, size in sizes.items() if size == largest}
     if whole and not half_silent and largest <= model.geometry.taxel_count:
         return Finding("id map", "ok", f"{model.name}, all ids of sensor {', '.join(whole)} received", norm)
     if others:
@@ -89,7 +85,6 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
     )
     if not received:
         return Finding("link", "wrong", measured, "", off)
-    bad = counters.get("bad_lines", 0) + counters.get("non_ascii_lines", 0)
     if not frames and received >= 64:  # fewer are the adapter's answers to commands
         remedy = "not slcan, or another line speed than the adapter's: try --source slcan:PORT@BAUD (VScom 3000000)"
         return Finding("link", "wrong", measured, "", remedy)
@@ -99,6 +94,7 @@ def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None
             "xela_server and every other program that holds it, pull its plug and put it in again"
         )
         return Finding("link", "wrong", measured + (refused or ", answers only"), "", remedy if refusals else off)
+    bad = counters.get("bad_lines", 0) + counters.get("non_ascii_lines", 0)
     measured += f", {bad} bad lines{refused}"
     verdict = "ok" if bad <= 1 else graded(bad / (bad + frames), *_BAD_LIMITS)
     if verdict != "ok":
@@ -123,7 +119,7 @@ def check_baud(
     if facts.baud is None or not frames or not sensors or duration_s <= 0:
         return None
     line_bytes = 26 if received / frames > 24 else 22  # of a taxel's slcan line with a time stamp, and without one
-    carries_hz = capacity_hz(facts.baud, line_bytes, sensors, taxel_count)
+    carries_hz = facts.baud / BITS_PER_BYTE / (line_bytes * taxel_count * sensors)
     used = received * BITS_PER_BYTE / duration_s / facts.baud
     pads = f"{sensors} sensors" if sensors > 1 else "a sensor"
     measured = f"{facts.baud} baud carry {carries_hz:.0f} scans a second of {pads}, {100 * used:.0f} % are used"
@@ -135,11 +131,6 @@ def check_baud(
         return Finding("baud rate", "wrong", measured, norm, remedy)
     slow = carries_hz < (100.0 if rate_hz is None else rate_hz) and "ttyACM" not in (facts.port or "")
     return judged("baud rate", "look" if slow else "ok", measured, norm, remedy)
-
-
-def capacity_hz(baud: int, line_bytes: int, sensors: int = 1, taxel_count: int = USPA44.taxel_count) -> float:
-    """Return the scans a second of each sensor that a serial line carries, in [Hz]."""
-    return baud / BITS_PER_BYTE / (line_bytes * taxel_count * sensors)
 
 
 def check_latency(facts: LineFacts) -> Finding | None:

@@ -11,7 +11,7 @@ from edge.perception.event import Event
 from edge.perception.result import NextTap, Result
 from edge.pipeline.cadence import Cadence
 from edge.pipeline.sink import Sink
-from edge.terminal.text_wrap import drawn, rewritable
+from edge.terminal.progress_bar import drawn, rewritable
 from firmware_bridge.errors import harmless
 from firmware_bridge.schedule import SHOWN_AT_REST_S, SHOWN_SILENT_S
 

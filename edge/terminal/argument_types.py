@@ -1,15 +1,32 @@
-"""Common parts of the options of all commands: one line for wrong usage, and types of numbers."""
+"""Common parts of all commands: text as wide as the terminal, one line for wrong usage, and types of numbers."""
 
 import argparse
 import math
 import re
+import shutil
 import textwrap
 from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
 from edge import __version__
-from edge.terminal.text_wrap import FEWEST_COLUMNS
 from firmware_bridge.schedule import POSITIVE
+
+FEWEST_COLUMNS: Final = 30
+
+
+def columns() -> int:
+    """Return the width of the terminal, or the default of one, at least FEWEST_COLUMNS."""
+    return max(shutil.get_terminal_size().columns, FEWEST_COLUMNS)
+
+
+def wrapped(text: str, width: int, start: str = "", indent: str = "") -> list[str]:
+    """Wrap a paragraph into lines of `width` columns, of which the first begins with `start`, the others with `indent`.
+
+    A wider word stays whole, since paths and options are copied from the text.
+    """
+    return textwrap.wrap(
+        text, width, initial_indent=start, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
 
 
 class HelpFormatter(argparse.HelpFormatter):

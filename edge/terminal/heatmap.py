@@ -1,17 +1,15 @@
 """Maps as text for a terminal: arrays in, lines out.
 
-With colour, one character cell shows two pixels, an upper half block in one colour on a ground of
-another. Without colour, a cell is one character, denser for larger values.
+With colour, one character cell shows two pixels, an upper half block in one of 256 colours on a ground of another.
+Without colour, a cell is one character, denser for larger values.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-
-Palette = Literal["truecolor", "256", "plain"]
 
 # A few stops of viridis, which reads the same to the colour-blind and grows steadily lighter.
 STOPS: Final = np.array(
@@ -37,18 +35,16 @@ class Panel:
     unit: str
 
 
-def choose_palette(environment: Mapping[str, str], *, terminal: bool, encoding: str | None) -> Palette:
-    """Return the best palette that the output can show, by the variables NO_COLOR, TERM and COLORTERM."""
+def shows_colours(environment: Mapping[str, str], *, terminal: bool, encoding: str | None) -> bool:
+    """Return whether the output can show colours, by its encoding and the variables NO_COLOR and TERM."""
     try:
         HALF_BLOCK.encode(encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
-        return "plain"
-    if not terminal or environment.get("NO_COLOR") or environment.get("TERM", "dumb") == "dumb":
-        return "plain"
-    return "truecolor" if environment.get("COLORTERM") in ("truecolor", "24bit") else "256"
+        return False
+    return terminal and not environment.get("NO_COLOR") and environment.get("TERM", "dumb") != "dumb"
 
 
-def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = 40) -> str:
+def draw(panels: Sequence[Panel], columns: int, coloured: bool, widest: int = 40) -> str:
     """Draw panels side by side, or below each other if the terminal of so many columns is too narrow.
 
     No panel is wider than `widest` columns.
@@ -57,8 +53,8 @@ def draw(panels: Sequence[Panel], columns: int, palette: Palette, widest: int = 
     width -= width % 8  # with half as many lines, a map of 4 x 4 then has sharp borders
     if width < 20:
         width = max(1, min(widest, columns))
-        return "\n\n".join("\n".join(_lines(panel, width, palette)) for panel in panels)
-    rows = zip(*(_lines(panel, width, palette) for panel in panels), strict=True)
+        return "\n\n".join("\n".join(_lines(panel, width, coloured)) for panel in panels)
+    rows = zip(*(_lines(panel, width, coloured) for panel in panels), strict=True)
     return "\n".join((" " * GAP).join(row).rstrip() for row in rows)
 
 
@@ -75,27 +71,27 @@ def _overlaps(old: int, new: int) -> NDArray[np.float64]:
     return np.maximum(upper - lower, 0) * new
 
 
-def _lines(panel: Panel, width: int, palette: Palette) -> list[str]:
+def _lines(panel: Panel, width: int, coloured: bool) -> list[str]:
     """Return title, map and scale, each `width` cells wide."""
     span = panel.high - panel.low
     height = max(1, width * panel.values.shape[0] // (2 * panel.values.shape[1]))
-    pixel_rows = height if palette == "plain" else 2 * height
+    pixel_rows = 2 * height if coloured else height
     shares = (resample(panel.values, pixel_rows, width) - panel.low) / (span if span > 0 else 1)
     shares = np.clip(shares, 0, 1)
-    if palette == "plain":
-        body = ["".join(row) for row in _shades(shares)]
+    if coloured:
+        body = [_blocks(upper, lower) for upper, lower in zip(shares[::2], shares[1::2], strict=True)]
     else:
-        body = [_blocks(upper, lower, palette) for upper, lower in zip(shares[::2], shares[1::2], strict=True)]
-    return [panel.title[:width].ljust(width), *body, _scale(panel, width, palette)]
+        body = ["".join(row) for row in _shades(shares)]
+    return [panel.title[:width].ljust(width), *body, _scale(panel, width, coloured)]
 
 
-def _scale(panel: Panel, width: int, palette: Palette) -> str:
+def _scale(panel: Panel, width: int, coloured: bool) -> str:
     low, high = f"{_short(panel.low)} ", f" {_short(panel.high)} {panel.unit}"
     room = width - len(low) - len(high)
     if room < 0:
         return f"{low}..{high}"[:width].ljust(width)
     steps = np.linspace(0, 1, room)
-    return low + ("".join(_shades(steps)) if palette == "plain" else _blocks(steps, steps, palette)) + high
+    return low + (_blocks(steps, steps) if coloured else "".join(_shades(steps))) + high
 
 
 def _short(value: float) -> str:
@@ -107,10 +103,10 @@ def _shades(shares: NDArray[np.float64]) -> NDArray[np.str_]:
     return levels[np.minimum((shares * len(SHADES)).astype(int), len(SHADES) - 1)]
 
 
-def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64], palette: Palette) -> str:
+def _blocks(upper: NDArray[np.float64], lower: NDArray[np.float64]) -> str:
     """Return one line of half blocks; a colour is set only where it changes."""
     text, last = [], ""
-    for top, bottom in zip(_colour_codes(upper, palette), _colour_codes(lower, palette), strict=True):
+    for top, bottom in zip(_colour_codes(upper), _colour_codes(lower), strict=True):
         colour = f"\x1b[38;{top};48;{bottom}m"
         text.append(HALF_BLOCK if colour == last else colour + HALF_BLOCK)
         last = colour
@@ -124,9 +120,6 @@ def colours(shares: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack(channels, axis=-1).astype(np.float64)
 
 
-def _colour_codes(shares: NDArray[np.float64], palette: Palette) -> list[str]:
-    rgb = colours(shares)
-    if palette == "truecolor":
-        return ["2;{:.0f};{:.0f};{:.0f}".format(*colour) for colour in rgb]
-    cube = np.abs(rgb[..., None] - np.array([0, 95, 135, 175, 215, 255])).argmin(axis=-1)
+def _colour_codes(shares: NDArray[np.float64]) -> list[str]:
+    cube = np.abs(colours(shares)[..., None] - np.array([0, 95, 135, 175, 215, 255])).argmin(axis=-1)
     return [f"5;{16 + 36 * red + 6 * green + blue}" for red, green, blue in cube.tolist()]

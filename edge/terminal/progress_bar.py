@@ -1,11 +1,10 @@
-"""Progress bars of tqdm for work of more than two seconds, on a terminal alone."""
+"""Lines that are drawn on a terminal alone: progress bars of tqdm, for work of more than two seconds, and others."""
 
 import os
 import sys
 from collections.abc import Collection, Iterator
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeVar
 
-from edge.terminal.text_wrap import drawn
 from firmware_bridge.errors import harmless
 
 if TYPE_CHECKING:
@@ -13,6 +12,16 @@ if TYPE_CHECKING:
 
 DELAY_S: Final = 2.0
 _Thing = TypeVar("_Thing")
+
+
+def rewritable(stream: TextIO | None) -> bool:
+    """Return whether a line can be rewritten in place: on a terminal, unless it knows no escape sequences."""
+    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def drawn(stream: TextIO) -> TextIO:
+    """Return the stream for text with control characters of our own, which it otherwise escapes."""
+    return getattr(stream, "drawn", stream)
 
 
 def progress(what: str, total: float, unit: str, *, done: float = 0, stream: TextIO | None = None) -> "tqdm[Any]":  # pyright: ignore[reportInvalidTypeArguments]

@@ -265,16 +265,6 @@ def test_every_command_is_run_by_one_of_these_tests():
 
 
 @pytest.mark.parametrize("table", [PARSED, LEFT_OUT], ids=["parsed", "left out"])
-def test_what_is_excused_because_another_test_runs_it_is_named_there(table):
-    for pattern, why in table.items():
-        tests = [next((ROOT / "tests").rglob(f"{name}.py"), Path(name)) for name in re.findall(r"\btest_\w+", why)]
-        scripts = re.findall(r"([\w|()]+)\\.py", pattern)
-        for name in (one for script in scripts for one in script.strip("()").split("|")):
-            assert any(name in test.read_text() for test in tests), f"{name}: which test runs it?"
-        assert all(test.is_file() for test in tests), why
-
-
-@pytest.mark.parametrize("table", [PARSED, LEFT_OUT], ids=["parsed", "left out"])
 def test_what_is_excused_is_still_written(table):
     stale = [pattern for pattern in table if not any(re.fullmatch(pattern, one) for one in COMMANDS)]
     assert stale == []

@@ -10,9 +10,8 @@ from edge_samples import BASELINE, FakeLink
 from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
-from edge.doctor import write_sensor_file as keep
-from edge.doctor.findings import Finding, summary
-from edge.doctor.write_sensor_file import check_writable
+from edge.doctor.command import check_writable, keep, summary
+from edge.doctor.taxel_checks import Finding
 from edge.pipeline.gain_keeper import keep_learned
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator
@@ -35,7 +34,7 @@ def good(tmp_path):
 class TestLoss:
     def test_nothing_found_and_nothing_known_writes_nothing(self, tmp_path):
         with pytest.raises(SensorFileError, match=r"s\.toml: not written, because nothing was measured"):
-            keep.keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
+            keep(tmp_path / "s.toml", SensorFile(), None, NONE, NONE, NONE)
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize(
@@ -49,7 +48,7 @@ class TestLoss:
         path = tmp_path / "s.toml"
         save_sensor_file(path, SensorFile(sensors={"4": held}))
         found = {"6": Baseline.of("6", BASELINE.counts, 1.79e9, 100, "start-up")}
-        keep.keep(path, load_sensor_file(path), None, found, NONE, NONE)
+        keep(path, load_sensor_file(path), None, found, NONE, NONE)
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
         now = load_sensor_file(path).sensors["4"]
         assert (now.mounting, now.pad, now.frame) == (held.mounting, held.pad, held.frame)
@@ -76,7 +75,7 @@ class TestLoss:
         known = load_sensor_file(path)
         for name in ("4", "6"):
             keep_learned(path, name, learned)
-        keep.keep(path, known, None, {"4": BASELINE}, NONE, NONE)
+        keep(path, known, None, {"4": BASELINE}, NONE, NONE)
         now = load_sensor_file(path)
         assert now.pads == {"4": learned, "6": learned} and now.baselines["4"].id == BASELINE.id
 
@@ -109,32 +108,28 @@ class TestMarks:
 
     def test_a_later_visit_takes_back_what_it_finds(self, tmp_path):
         path = tmp_path / "s.toml"
-        first = keep.keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE, emulated=True)
+        first = keep(path, SensorFile(), None, {"4": BASELINE}, {"4": Mounting()}, NONE, emulated=True)
         assert first.sensors["4"].emulated == {"mounting", "baseline"} and not first.sensors["4"].assumed
-        second = keep.keep(path, load_sensor_file(path), None, {"4": BASELINE}, NONE, NONE)
+        second = keep(path, load_sensor_file(path), None, {"4": BASELINE}, NONE, NONE)
         assert second.sensors["4"].emulated == {"mounting"}
-        third = keep.keep(path, load_sensor_file(path), None, NONE, {"4": Mounting()}, NONE)
+        third = keep(path, load_sensor_file(path), None, NONE, {"4": Mounting()}, NONE)
         assert not third.sensors["4"].emulated and load_sensor_file(path).sensors["4"].emulated == frozenset()
 
 
 EMULATED = SensorFile(sensors={"4": SensorEntry(baseline=BASELINE, emulated=frozenset({"baseline"}))})
 
 
-class TestUse:
-    def test_a_device_refuses_it_unless_forced(self):
-        with (
-            pytest.raises(
-                SensorFileError, match=r"has baseline of an emulated sensor 4, and this is a device: .*--force"
-            ),
-            Source(FakeLink([], kind="device"), sensor_file=EMULATED),
-        ):
+def test_a_device_refuses_an_emulated_sensor_unless_forced():
+    words = r"has baseline of an emulated sensor 4, and this is a device: .*--force"
+    with (
+        pytest.raises(SensorFileError, match=words),
+        Source(FakeLink([], kind="device"), sensor_file=EMULATED),
+    ):
+        pass
+    for kind, force in (("device", True), ("emulated", False), ("replay", False)):
+        with Source(FakeLink([], kind=kind), sensor_file=EMULATED, force=force):
             pass
-        with Source(FakeLink([], kind="device"), sensor_file=EMULATED, force=True):
-            pass
-        for kind in ("emulated", "replay"):
-            with Source(FakeLink([], kind=kind), sensor_file=EMULATED):
-                pass
-        refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
+    refuse_emulated(SensorFile(sensors={"4": WHOLE}), "device", force=False)
 
 
 WELL = as_scans(healthy_counts(200))

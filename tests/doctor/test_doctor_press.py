@@ -76,6 +76,8 @@ class TestAnswers:
     def test_presses_that_fit_no_turn_are_told_apart(self):
         crossed = [press(0, 0), press(3, 15), press(15, 3), press(12, 12)]
         assert find_order(crossed) is None
+        (order, _), mounting = judge_press(crossed)
+        assert (order.verdict, mounting) == ("wrong", None) and "top right: taxel 15" in order.measured
         assert find_order([press(0, 0), press(3, 0), press(15, 15), press(12, 12)]) is None
 
     def test_three_corners_settle_the_turn_and_the_axes(self):
@@ -83,8 +85,7 @@ class TestAnswers:
             presses = [press(place) for place in CORNERS]
             del presses[left_out]
             assert find_order(presses) == "as in the id map"
-            axes = find_axes(presses)
-            assert axes is not None and (axes.swap_xy, axes.signs) == (False, (1, 1))
+            assert find_axes(presses) == (False, (1, 1))
 
     @pytest.mark.parametrize(
         ("presses", "verdict", "measured"),

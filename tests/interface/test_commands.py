@@ -53,12 +53,24 @@ def pipe():
             os.close(end)
 
 
-def test_commands_come_as_lines_however_they_are_cut(pipe):
+FORCED_ZERO = Command("zero", None, True)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "expected", "refused"),
+    [
+        ([b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"', b':"reset"}\r\n'], [RESET] * 3, 0),
+        ([b"x" * 4000] * 20 + [b'{"cmd": "reset"}\n{"cmd": "reset"}\n'], [RESET], 1),  # a line without end is one
+        ([b'{"cmd": "zero", "sensor": null, "force": true}'], [FORCED_ZERO], 0),  # the end of the pipe ends a line
+    ],
+)
+def test_commands_come_as_lines_however_they_are_cut(pipe, pieces, expected, refused):
     commands = lines_of(pipe[0])
-    for piece in (b'{"cmd": ', b'"reset"}', b'\n{"cmd": "reset"}\n{"cmd"', b':"reset"}\r\n'):
+    for piece in pieces:
         os.write(pipe[1], piece)
-        time.sleep(0.01)
-    assert taken(commands, 3) == [RESET] * 3 and commands.refused == 0
+        time.sleep(0.005)
+    os.close(pipe[1])
+    assert taken(commands, len(expected) + refused) == expected and commands.refused == refused
 
 
 @pytest.mark.parametrize(
@@ -76,21 +88,6 @@ def test_other_lines_are_counted(pipe, line):
     commands = lines_of(pipe[0])
     os.write(pipe[1], line + b'\n\n  \n{"cmd": "reset"}\n')
     assert taken(commands, 2) == [RESET] and commands.refused == 1
-
-
-def test_a_line_without_end_stays_bounded_and_is_counted_once(pipe):
-    commands = lines_of(pipe[0])
-    for _ in range(20):
-        os.write(pipe[1], b"x" * 4000)
-    os.write(pipe[1], b'{"cmd": "reset"}\n{"cmd": "reset"}\n')
-    assert taken(commands, 2) == [RESET] and commands.refused == 1
-
-
-def test_the_end_of_the_pipe_ends_commands_but_keeps_the_last_line(pipe):
-    commands = lines_of(pipe[0])
-    os.write(pipe[1], b'{"cmd": "zero", "sensor": null, "force": true}')
-    os.close(pipe[1])
-    assert taken(commands, 1) == [Command("zero", None, True)]
 
 
 def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):

@@ -7,7 +7,7 @@ from cli_samples import write_recording
 from edge_samples import BASELINE, REST, FakeModel, make_pad_contract, make_scan
 
 from edge.api import Pad, RecordingError, Scan, Source, Stream, UsageError, open_recording, open_runtime, open_source
-from edge.doctor.write_sensor_file import keep
+from edge.doctor.command import keep
 from firmware_bridge.links.registry import open_sources
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.scans.mounting import AS_MAPPED, Mounting

@@ -1,5 +1,7 @@
 """Images and state of LeRobot, made of a result. No I/O."""
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,6 +41,11 @@ def taxels_of(result: Result) -> NDArray[np.float32]:
     if result.zeroed is None:
         return np.zeros(result.scan.counts.size, dtype=np.float32)
     return np.nan_to_num(result.zeroed.ravel(), nan=0.0).astype(np.float32)
+
+
+def window_of(readings: deque[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return readings as (maxlen, channels), the newest last; until there are so many the first stands for the rest."""
+    return np.stack([readings[0]] * ((readings.maxlen or 0) - len(readings)) + list(readings))
 
 
 def state_of(result: Result, contract: Contract) -> dict[str, float]:

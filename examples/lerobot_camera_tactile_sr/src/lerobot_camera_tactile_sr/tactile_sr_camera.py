@@ -23,7 +23,7 @@ from edge.api import (
     open_runtime,
     open_source,
 )
-from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of, taxels_of
+from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of, taxels_of, window_of
 
 
 @CameraConfig.register_subclass("tactile_sr")
@@ -157,8 +157,7 @@ class TactileSrCamera(Camera):
         """
         self._check_age(max_age_ms)
         with self._changed:
-            kept = list(self._readings)
-        return np.stack([kept[0]] * (self.config.window_scans - len(kept)) + kept)
+            return window_of(self._readings)
 
     def disconnect(self) -> None:
         """Close the sensor; raises DeviceNotConnectedError where it is not connected."""
@@ -209,14 +208,15 @@ class TactileSrCamera(Camera):
                     self._take(result)
             raise ValueError("the source has ended")
         except (BridgeError, EdgeError, ValueError) as error:
-            self._fail(error)
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
 
     def _take(self, result: Result) -> None:
         name = self.config.name
         if name is None and self._newest is not None and self._newest.scan.sensor != result.scan.sensor:
-            raise ValueError(
-                f"sensors {self._newest.scan.sensor} and {result.scan.sensor} send: set name to one of them"
-            )
+            both = f"{self._newest.scan.sensor} and {result.scan.sensor}"
+            raise ValueError(f"sensors {both} send: set name to one of them")
         if name is not None and result.scan.sensor != name:
             return
         with self._changed:
@@ -226,9 +226,4 @@ class TactileSrCamera(Camera):
             # As old as its readings: what waited on the way is not of now. A recording has times of its own.
             self._newest_s = time.monotonic() if result.source == "replay" else result.scan.on_bus_ns / 1e9
             self._newest, self._fresh = result, True
-            self._changed.notify_all()
-
-    def _fail(self, error: Exception) -> None:
-        with self._changed:
-            self._failure = error
             self._changed.notify_all()

@@ -24,7 +24,7 @@ from edge.api import (
     open_recording,
     open_runtime,
 )
-from lerobot_camera_tactile_sr.observation import AXES, image_of, state_names, state_of, taxels_of
+from lerobot_camera_tactile_sr.observation import AXES, image_of, state_names, state_of, taxels_of, window_of
 
 STATE = "observation.state"
 WINDOW = "observation.tactile_window"
@@ -87,9 +87,8 @@ def _frame(
 ) -> dict[str, Any]:
     state = [number for result in results for number in state_of(result, contract).values()]
     images = {image_key(one.scan.sensor): image_of(one, contract, full_scale_mm) for one in results}
-    # Right after zeroing there are fewer readings than a frame has rows: the first one stands for those before it.
-    rows = [[kept[0]] * ((kept.maxlen or 0) - len(kept)) + list(kept) for kept in readings.values()]
-    return {STATE: np.array(state, dtype=np.float32), WINDOW: np.concatenate(rows, axis=1), **images}
+    window = np.concatenate([window_of(kept) for kept in readings.values()], axis=1)
+    return {STATE: np.array(state, dtype=np.float32), WINDOW: window, **images}
 
 
 def convert(
