@@ -24,7 +24,7 @@ from edge.terminal.stop_signals import stop_on_signals
 from edge.terminal.text_wrap import columns, drawn, rewritable, wrapped
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.in_place import BACKUP_SUFFIX
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorFile

@@ -12,8 +12,9 @@ from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.links.base import FrameLink, SourceKind, not_open
+from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.discovery import can_networks, is_pretended
+from firmware_bridge.links.frame_link import FrameLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.frame_scans import FrameScans
 from firmware_bridge.scans.scan import Scan

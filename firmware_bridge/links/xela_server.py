@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from threading import Event
 from types import MappingProxyType
 from typing import Final, Self
@@ -52,7 +52,6 @@ class XelaServerLink(Link):
         geometry: SensorGeometry = USPA44,
         prefix: str = "",
         mountings: Mapping[str, Mounting] = MappingProxyType({}),
-        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL.
 
@@ -63,7 +62,6 @@ class XelaServerLink(Link):
         self.kind: SourceKind = "device"
         self.url = self._address[2]
         self._scans = ServerScans(geometry, prefix, mountings)
-        self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._connection: ClientConnection | None = None
@@ -81,7 +79,7 @@ class XelaServerLink(Link):
         self._scans.begin()
         self._pong = None
         self._connection = self._connect()
-        self._received_ns = self._clock_ns()
+        self._received_ns = time.monotonic_ns()
         try:
             self._first = self._take(self._connection, 0.5)  # a server greets at once; no message is no error
         except BaseException:
@@ -122,7 +120,7 @@ class XelaServerLink(Link):
                 for _ in range(64):  # later messages wait for the next read
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
-                    self._received_ns, self._pong = self._clock_ns(), None
+                    self._received_ns, self._pong = time.monotonic_ns(), None
                     with self._counting:
                         self._received_bytes += len(message)
                         scans += self._scans.feed(message, self._received_ns)
@@ -139,7 +137,7 @@ class XelaServerLink(Link):
 
     def _watch(self, connection: ClientConnection) -> None:
         """Ping a server that sends no message: a connection can be dead without being closed."""
-        now_ns = self._clock_ns()
+        now_ns = time.monotonic_ns()
         if self._pong is None:
             if now_ns - self._received_ns >= SERVER_QUIET_S * NS_PER_S:
                 self._pong = connection.ping(), now_ns

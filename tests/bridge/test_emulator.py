@@ -9,8 +9,7 @@ from bridge_samples import make_counts, make_recording, read_until_lost, stacked
 from can.interfaces.slcan import slcanBus
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline
+from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track

@@ -13,7 +13,7 @@ from edge.pipeline.cadence import Pace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
 from firmware_bridge.scans.slcan_scans import SlcanScans
 

@@ -16,9 +16,9 @@ from link_rigs import PulledBus, message_of
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import trigger_frame
 
 
@@ -243,7 +243,7 @@ def test_a_network_that_is_not_there_or_down(networks, channel, words):
     with pytest.raises(DeviceError, match=words) as refused:
         CanBusLink("socketcan", channel).__enter__()
     if channel == "can0":  # `edge-sr devices` advises the same
-        listed = can_interfaces(networks, lambda name: None)[0]
+        listed = can_interfaces(networks)[0]
         assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
 
 

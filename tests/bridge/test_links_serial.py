@@ -17,11 +17,10 @@ from bridge_samples import SilentDevice, read_scans
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.emulation.pty_port import PseudoPort
-from firmware_bridge.emulation.xela_controller import FRAME_S
+from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links import fd_reader, slcan_serial
-from firmware_bridge.links.fd_reader import PortReader
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.links import slcan_serial
+from firmware_bridge.links.slcan_serial import PortReader, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
@@ -38,7 +37,7 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
 
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         os.write(device.device_fd, b"x")  # which shows that there is something to read
-        monkeypatch.setattr(fd_reader.os, "read", read)
+        monkeypatch.setattr(slcan_serial.os, "read", read)
         got = link.read(0.0), link.counters()["received_bytes"], link.counters()["replies"]
         with pytest.raises(LinkLostError):
             link.read(0.0)
@@ -82,14 +81,13 @@ def test_few_looks_make_a_scan(monkeypatch):
         while port.unread_bytes() < 22 * sent[0] - sum(len(piece.data) for piece in takes):
             time.sleep(0.001)  # the kernel delivers them late
 
-    monkeypatch.setattr(fd_reader, "time", SimpleNamespace(sleep=sleep, monotonic_ns=time.monotonic_ns))
-    monkeypatch.setattr(PortReader, "take", lambda reader: takes.append(take(reader)) or takes[-1])
     port = PseudoPort()
     port.plug()
-    with SlcanSerialLink(port.path):
+    with SlcanSerialLink(port.path), monkeypatch.context() as patched:
+        patched.setattr(slcan_serial, "time", SimpleNamespace(sleep=sleep))
+        patched.setattr(PortReader, "take", lambda reader: takes.append(take(reader)) or takes[-1])
         descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
         reader = PortReader(descriptor, clock_ns=lambda: round(1e9 * now_s[0]))
-        takes.clear()
         sleep(0.0)
         assert reader.read(1.0, 22 * 16).data == b"".join(LINES)
         os.close(descriptor)
@@ -109,7 +107,7 @@ def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
 
     with SilentDevice() as device, monkeypatch.context() as patched:
         reader = PortReader(device.client_fd, clock_ns=lambda: now_ns[0])
-        patched.setattr(fd_reader.os, "read", stands_still)
+        patched.setattr(slcan_serial.os, "read", stands_still)
         assert reader.take() == (b"", half_s, 0)
         assert reader.take() == (b"", 2 * half_s, half_s)
         os.write(device.device_fd, b"z\r")
