@@ -100,11 +100,6 @@ class AdapterStatus:
         """Forget the flags reported last, since the adapter no longer answers."""
         self._flags = frozenset()
 
-    @property
-    def answers(self) -> int:
-        """Number of answers to `F`."""
-        return self.counts["status_answers"]
-
     def _count(self, names: Iterable[str]) -> None:
         for name in names:
             key = f"adapter_{name}"
@@ -131,11 +126,11 @@ class StatusQuestions:
     def answered_in_silence(self) -> bool:
         """True where no scan comes, and flags were requested and answered since the last one."""
         before = self._answers_before_silence
-        return before is not None and self._status.answers > before
+        return before is not None and self._status.counts["status_answers"] > before
 
     def reopened(self) -> None:
         """Allow requests again after the channel was reopened, if the adapter has ever answered."""
-        if self._status.answers:
+        if self._status.counts["status_answers"]:
             self._unanswered = 0
 
     def due(self, scans: int, refusals: int, now_ns: int) -> bool:
@@ -147,7 +142,7 @@ class StatusQuestions:
             self._scan_ns, self._due_ns = now_ns, now_ns + INTERVAL_NS
         if scans:
             self._scan_ns, self._answers_before_silence = now_ns, None
-        answers = self._status.answers
+        answers = self._status.counts["status_answers"]
         if self._answers_before_silence is None and now_ns - self._scan_ns >= ADAPTER_ASKED_NS:
             self._answers_before_silence = answers
         elif now_ns < self._due_ns:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import serial
 
@@ -55,12 +55,8 @@ LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
 
 
-class Piece(NamedTuple):
-    """Bytes received together at `time_ns`, and the latest time before at which the port was empty, in [ns]."""
-
-    data: bytes
-    time_ns: int
-    empty_ns: int
+Piece = tuple[bytes, int, int]
+"""Bytes received together, the time of that, and the latest time before at which the port was empty, in [ns]."""
 
 
 class PortReader:
@@ -89,18 +85,17 @@ class PortReader:
         while not self._poll.poll(math.ceil(1000 * min(max((end_ns - now_ns) / 1e9, 0.0), LONGEST_LOOK_S))):
             self._empty_ns, now_ns = now_ns, self._clock_ns()  # from before the look: it may return long after it
             if now_ns >= end_ns:
-                return Piece(b"", now_ns, self._empty_ns)
-        piece = self.take()
-        data, now_ns = piece.data, piece.time_ns
+                return b"", now_ns, self._empty_ns
+        data, now_ns, empty_ns = self.take()
         end_ns = now_ns + round(LONGEST_WAIT_S * 1e9)
         while 0 < len(data) < wanted_bytes and now_ns < end_ns:
             time.sleep(max((wanted_bytes - len(data)) * BYTE_S, SHORTEST_SLEEP_S))
             try:
-                more = self.take()
+                more, now_ns, _ = self.take()
             except OSError:
                 break  # left to the next call
-            data, now_ns = data + more.data, more.time_ns
-        return Piece(data, now_ns, piece.empty_ns)
+            data += more
+        return data, now_ns, empty_ns
 
     def take(self) -> Piece:
         """Return the bytes there, without waiting for more; raises as `read` does."""
@@ -122,7 +117,7 @@ class PortReader:
                 break
         if len(data) < MOST_BYTES:
             self._empty_ns = begun_ns  # from before the read: this thread may not run for long after it
-        return Piece(data, self._clock_ns(), empty_ns if data else self._empty_ns)
+        return data, self._clock_ns(), empty_ns if data else self._empty_ns
 
 
 class SlcanSerialLink(Link):
@@ -192,7 +187,7 @@ class SlcanSerialLink(Link):
         self._drop_fetched()
         with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
             _send(port, *((CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,)))
-            self._counts["dropped_bytes"] += len(reader.take().data)  # pyserial's next opening would not count them
+            self._counts["dropped_bytes"] += len(reader.take()[0])  # pyserial's next opening would not count them
         with suppress(*_PORT_ERRORS):
             if port.out_waiting:  # bytes that a dead device does not accept would delay the closing
                 port.reset_output_buffer()
@@ -214,7 +209,7 @@ class SlcanSerialLink(Link):
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
         decoder = self._scans.decoder
-        if self._questions.due(len(scans), decoder.refusals, pieces[-1].time_ns):
+        if self._questions.due(len(scans), decoder.refusals, pieces[-1][1]):
             with suppress(*_PORT_ERRORS):  # an adapter that accepts no bytes would not answer either
                 if not self._serial.out_waiting:
                     os.write(self._serial.fileno(), STATUS_FLAGS)
@@ -237,11 +232,11 @@ class SlcanSerialLink(Link):
             return
         with suppress(*_PORT_ERRORS):  # the next read reports it
             piece = self._reader.take()
-            if piece.data:
+            if piece[0]:
                 self._fetched.append(piece)
 
     def _drop_fetched(self) -> None:
-        self._counts["dropped_bytes"] += sum(len(piece.data) for piece in self._fetched)
+        self._counts["dropped_bytes"] += sum(len(data) for data, _, _ in self._fetched)
         self._fetched = []
 
     def counters(self) -> dict[str, int]:
@@ -301,7 +296,7 @@ class SlcanSerialLink(Link):
         quiet_s, end_s = now_s + QUIET_S, now_s + LONGEST_SETTLE_S
         while now_s < min(quiet_s, end_s):
             time.sleep(0.002)
-            dropped = len(reader.take().data)
+            dropped = len(reader.take()[0])
             self._counts["dropped_bytes"] += dropped
             now_s = time.monotonic()
             if dropped:

@@ -9,13 +9,7 @@ from types import MappingProxyType
 from typing import Final, Self
 from urllib.parse import urlsplit
 
-from websockets.exceptions import (
-    ConnectionClosed,
-    InvalidHandshake,
-    InvalidMessage,
-    InvalidStatus,
-    WebSocketException,
-)
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
@@ -204,12 +198,8 @@ def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> 
 def _no_handshake(error: Exception, opening_s: float) -> str:
     if isinstance(error, TimeoutError):
         return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is not an xela_server"
-    if isinstance(error, InvalidStatus):
-        return f"answers with HTTP status {error.response.status_code}: not the xela_server, but another program"
-    if isinstance(error, InvalidMessage):
-        return "does not answer as a WebSocket does: another program, or one that expects TLS, is at this port"
     if isinstance(error, InvalidHandshake):
-        return f"is not an xela_server: {error}"
+        return f"is not an xela_server, but another program, or one that expects TLS: {error}"
     return f"the connection broke while it was opened: {error}"
 
 

@@ -6,13 +6,12 @@ import sys
 import threading
 from functools import partial
 from math import inf
-from pathlib import Path
 
 import can
 import pytest
 from bridge_samples import frames_of
 from can.interfaces.virtual import VirtualBus
-from link_rigs import PulledBus, message_of
+from link_rigs import PulledBus, make_network, message_of
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
@@ -89,17 +88,6 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
 
 
 # Errors of the bus.
-
-
-def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
-    network = root / "class/net" / name
-    network.mkdir(parents=True)
-    (network / "flags").write_text("0x40081\n" if up else "0x40080\n")
-    (network / "type").write_text(f"{kind}\n")
-    if driver:
-        (root / driver).mkdir()
-        (network / "device").mkdir()
-        (network / "device/driver").symlink_to(root / driver)
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import tty
 from pathlib import Path
 
 import pytest
+from link_rigs import make_network
 
 from edge.cli import main as cli
 from edge.cli.listings import NOTHING, SERVER_HINT
@@ -69,15 +70,6 @@ def test_who_holds_a_port():
     os.close(master), os.close(slave)
 
 
-def interface(sys_root: Path, name: str, *, kind: str = "280", up: bool, driver: str | None = None) -> None:
-    write(sys_root / f"class/net/{name}/type", kind + "\n")
-    write(sys_root / f"class/net/{name}/flags", f"{0x40080 | up:#x}\n")
-    if driver:
-        (sys_root / f"drivers/{driver}").mkdir(parents=True)
-        (sys_root / f"class/net/{name}/device").mkdir()
-        (sys_root / f"class/net/{name}/device/driver").symlink_to(sys_root / f"drivers/{driver}")
-
-
 @pytest.fixture
 def ip(tmp_path, monkeypatch):
     """Function that writes what `ip` says of a network."""
@@ -96,10 +88,10 @@ def bitrate(rate):
 
 def test_can_interfaces(tmp_path, ip):
     assert can_interfaces(tmp_path) == []
-    interface(tmp_path, "can0", up=False, driver="gs_usb")
-    interface(tmp_path, "can1", up=True, driver="peak_usb")
-    interface(tmp_path, "slcan0", up=False)
-    interface(tmp_path, "eth0", up=True, kind="1")
+    make_network(tmp_path, "can0", up=False, driver="gs_usb")
+    make_network(tmp_path, "can1", up=True, driver="peak_usb")
+    make_network(tmp_path, "slcan0", up=False)
+    make_network(tmp_path, "eth0", up=True, kind="1")
     ip(can0=bitrate(0), can1=bitrate(500_000))
     can0, can1, slcan0 = can_interfaces(tmp_path)
     assert (can0.path, can0.source, can0.looks_like) == ("can0", "can:socketcan:can0", "CAN interface, driver gs_usb")
@@ -112,7 +104,7 @@ def test_can_interfaces(tmp_path, ip):
     "said", [bitrate(1_000_000), '[{"linkinfo": {"info_kind": "vcan"}}]', "[]", "Option is unknown"]
 )
 def test_a_bitrate_that_is_right_or_not_known_is_no_problem(tmp_path, ip, said, monkeypatch):
-    interface(tmp_path, "can0", up=True)
+    make_network(tmp_path, "can0", up=True)
     ip(can0=said)
     assert can_interfaces(tmp_path)[0].problems == ()
     monkeypatch.setenv("PATH", "")
