@@ -47,11 +47,6 @@ def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
     ]
 
 
-def is_pretended(name: str) -> bool:
-    """Return True if a network of this name has no wire, so that every device on it is emulated."""
-    return name.startswith(("vcan", "vxcan"))
-
-
 def _text(path: Path) -> str | None:
     try:
         return path.read_text().strip()

@@ -201,18 +201,6 @@ class GsUsbLink(FrameLink):
         usb.util.dispose_resources(device)
 
 
-def usb_backend() -> IBackend:
-    """Return libusb: that of the package libusb-package, else the system's; raises DeviceError if none works."""
-    try:
-        from libusb_package import get_libusb1_backend
-    except ImportError:
-        from usb.backend.libusb1 import get_backend as get_libusb1_backend
-    backend = get_libusb1_backend()
-    if backend is None:
-        raise DeviceError("libusb cannot be loaded: pip install libusb-package, or apt install libusb-1.0-0")
-    return backend
-
-
 def gs_usb_devices(backend: IBackend | None = None) -> list[GsUsbDevice]:
     """List all gs_usb adapters of this machine, by bus and address; raises DeviceError if USB cannot be read."""
     return [described for described, _ in _found(backend)]
@@ -239,21 +227,17 @@ def find_gs_usb(
     if len(fitting) == 1:
         known.learn(fitting[0], present)
         return found[present.index(fitting[0])]
-    named = next((name for one in present if (name := source_name(one, present))), "gs_usb:SERIAL")
-    if placed:
-        raise NoDeviceError(f"no gs_usb adapter at {wanted}: plug it in there. {seen}")
-    if wanted is not None:
-        unread = [one.usb_id for one in present if one.serial_number is None]
-        hint = f"; a serial number that is not shown could not be read: {udev_rule(unread[0])}" if unread else ""
-        several = f": name one by its place, such as --source {named}" if len(fitting) > 1 else ""
-        if known.device is not None and wanted in [one.serial_number for one in present]:
-            several = f", and others have the same: plug it in where it was, at {known.device.place}"
-        raise NoDeviceError(
-            f"{len(fitting) or 'no'} gs_usb adapter with serial number {wanted}, expected one{several}. {seen}{hint}"
-        )
-    if not found:
-        raise NoDeviceError(f"no gs_usb adapter found: plug one in, or name another source. {seen}")
-    raise NoDeviceError(f"{len(found)} gs_usb adapters found: name one, such as --source {named}. {seen}")
+    which = "" if wanted is None else f" at {wanted}" if placed else f" with serial number {wanted}"
+    what = f"no gs_usb adapter{which}: plug it in, or name another source"
+    if len(fitting) > 1:
+        named = next((name for one in present if (name := source_name(one, present))), "gs_usb:SERIAL")
+        what = f"{len(fitting)} gs_usb adapters{which}: name one, such as --source {named}"
+    elif known.device is not None and wanted in [one.serial_number for one in present]:
+        what = f"no gs_usb adapter{which} that is surely the one: plug it in where it was, at {known.device.place}"
+    named_by_serial = wanted is not None and not placed
+    unread = [one.usb_id for one in present if named_by_serial and one.serial_number is None]
+    hint = f"; a serial number that is not shown could not be read: {udev_rule(unread[0])}" if unread else ""
+    raise NoDeviceError(f"{what}. {seen}{hint}")
 
 
 def source_name(device: GsUsbDevice, present: Sequence[GsUsbDevice]) -> str | None:
@@ -298,8 +282,14 @@ def _reason(error: Exception, described: GsUsbDevice) -> str:
 
 
 def _found(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.Device]]:
+    if backend is None:  # that of the package libusb-package, else the system's
+        try:
+            from libusb_package import get_libusb1_backend
+        except ImportError:
+            from usb.backend.libusb1 import get_backend as get_libusb1_backend
+        backend = get_libusb1_backend()
     if backend is None:
-        backend = usb_backend()
+        raise DeviceError("libusb cannot be loaded: pip install libusb-package, or apt install libusb-1.0-0")
     try:
         found = list(usb.core.find(find_all=True, backend=backend) or ())
     except (usb.core.USBError, NotImplementedError) as error:
