@@ -25,7 +25,7 @@ from edge.terminal.progress_bar import drawn, progress, rewritable
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge import in_place
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S

@@ -18,7 +18,7 @@ from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan

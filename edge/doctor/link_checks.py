@@ -68,7 +68,7 @@ class LineFacts:
 def line_facts(link: Link) -> LineFacts:
     """Return the facts of an open link."""
     line = link.serial_line()
-    return LineFacts() if line is None else LineFacts(line.port, line.baud, latency_timer_ms(line.port))
+    return LineFacts() if line is None else LineFacts(*line, latency_timer_ms(line[0]))
 
 
 def check_link(counters: Mapping[str, int], duration_s: float) -> Finding | None:

@@ -13,8 +13,7 @@ from edge.errors import UsageError
 from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind, one_origin
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S

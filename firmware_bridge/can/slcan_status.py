@@ -100,11 +100,6 @@ class AdapterStatus:
         """Forget the flags reported last, since the adapter no longer answers."""
         self._flags = frozenset()
 
-    @property
-    def answers(self) -> int:
-        """Number of answers to `F`."""
-        return self.counts["status_answers"]
-
     def _count(self, names: Iterable[str]) -> None:
         for name in names:
             key = f"adapter_{name}"
@@ -123,23 +118,19 @@ class StatusQuestions:
     def __init__(self, status: AdapterStatus) -> None:
         """Prepare requests to the adapter whose lines `status` receives."""
         self._status = status
-        self._refusals = 0
-        self._answers = 0
-        self._unanswered = 0
-        self._due_ns: int | None = None
-        self._asked = False
-        self._scan_ns: int | None = None
+        self._asked = self._answers = self._refusals = self._unanswered = 0
+        self._due_ns = self._scan_ns = 0
         self._answers_before_silence: int | None = None
 
     @property
     def answered_in_silence(self) -> bool:
         """True where no scan comes, and flags were requested and answered since the last one."""
         before = self._answers_before_silence
-        return before is not None and self._status.answers > before
+        return before is not None and self._status.counts["status_answers"] > before
 
     def reopened(self) -> None:
         """Allow requests again after the channel was reopened, if the adapter has ever answered."""
-        if self._status.answers:
+        if self._status.counts["status_answers"]:
             self._unanswered = 0
 
     def due(self, scans: int, refusals: int, now_ns: int) -> bool:
@@ -147,23 +138,21 @@ class StatusQuestions:
 
         `scans` is the number of scans that this read returned at `now_ns`, and `refusals` that of BELs so far.
         """
+        if not self._due_ns:  # the first read of all: silent from here on
+            self._scan_ns, self._due_ns = now_ns, now_ns + INTERVAL_NS
         if scans:
             self._scan_ns, self._answers_before_silence = now_ns, None
-        if self._scan_ns is None or self._due_ns is None:  # the first read of all: silent from here on
-            self._scan_ns, self._due_ns = now_ns, now_ns + INTERVAL_NS
+        answers = self._status.counts["status_answers"]
         if self._answers_before_silence is None and now_ns - self._scan_ns >= ADAPTER_ASKED_NS:
-            self._answers_before_silence = self._status.answers
+            self._answers_before_silence = answers
         elif now_ns < self._due_ns:
             return False
         self._due_ns = now_ns + INTERVAL_NS
-        return self._ask(refusals)
-
-    def _ask(self, refusals: int) -> bool:
         if self._asked:
-            answered = self._status.answers > self._answers
-            refused = refusals > self._refusals
-            self._unanswered = 0 if answered else MOST_UNANSWERED if refused else self._unanswered + 1
+            self._unanswered = 0 if answers > self._answers else self._unanswered + 1
+            if self._unanswered and refusals > self._refusals:
+                self._unanswered = MOST_UNANSWERED
             if self._unanswered >= MOST_UNANSWERED:
                 self._status.forget()
-        self._asked, self._answers, self._refusals = True, self._status.answers, refusals
+        self._asked, self._answers, self._refusals = 1, answers, refusals
         return self._unanswered < MOST_UNANSWERED

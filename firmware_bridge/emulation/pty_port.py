@@ -93,17 +93,12 @@ def listen(ports: Iterable[PseudoPort], timeout_s: float) -> dict[PseudoPort, by
 
 
 class Playing(Protocol):
-    """Emulator as its thread sees it.
-
-    Attributes:
-        line: port of its client.
-    """
+    """Emulator as its thread sees it; its client is at the port `line`."""
 
     line: PseudoPort
 
     def plug(self) -> None:
         """Put the cable in."""
-        ...
 
     def course(self) -> Generator[float, None, None]:
         """Play; yield the monotonic time, in [s], at which to go on, or earlier when the client has written."""
@@ -111,7 +106,6 @@ class Playing(Protocol):
 
     def obey(self, received: bytes) -> None:
         """Process what the client has written."""
-        ...
 
 
 class EmulatorThread:

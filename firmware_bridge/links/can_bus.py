@@ -12,8 +12,9 @@ from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.extras import how_to_install
-from firmware_bridge.links.base import FrameLink, SourceKind, not_open
-from firmware_bridge.links.discovery import can_networks, is_pretended
+from firmware_bridge.links.base import SourceKind, not_open
+from firmware_bridge.links.discovery import can_networks
+from firmware_bridge.links.frame_link import FrameLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.frame_scans import FrameScans
 from firmware_bridge.scans.scan import Scan
@@ -50,8 +51,8 @@ class CanBusLink(FrameLink):
         self._scans = FrameScans(model)
         super().__init__(self._scans, triggers, clock_ns)
         self.name = f"can:{interface}:{channel}"
-        pretended = interface in PRETENDED or (interface == "socketcan" and is_pretended(channel))
-        self.kind: SourceKind = "emulated" if pretended else "device"
+        no_wire = interface == "socketcan" and channel.startswith(("vcan", "vxcan"))  # every device there is emulated
+        self.kind: SourceKind = "emulated" if no_wire or interface in PRETENDED else "device"
         if interface in _NOT_THROUGH_PYTHON_CAN:
             raise SourceError(f"source is {self.name!r}: {_NOT_THROUGH_PYTHON_CAN[interface]}")
         self._can = _python_can()

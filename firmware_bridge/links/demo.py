@@ -120,7 +120,7 @@ class DemoLink(Link):
         self._model = model
         self._robot: Robot | None = None
         self._link: SlcanSerialLink | None = None
-        self._counts: dict[str, int] = {}
+        self._open = False
 
     def __enter__(self) -> Self:
         try:
@@ -132,7 +132,7 @@ class DemoLink(Link):
             raise DeviceError(f"the emulator did not start: {error}") from error
         emulator.__enter__()
         self._robot, self.emulator = robot, emulator
-        self._link = SlcanSerialLink(emulator.port, model=self._model)
+        self._link, self._open = SlcanSerialLink(emulator.port, model=self._model), True
         try:
             self._link.__enter__()
         except BaseException:
@@ -141,18 +141,17 @@ class DemoLink(Link):
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        link, self._link = self._link, None
-        if link is None or self.emulator is None:
+        if not self._open or self._link is None or self.emulator is None:
             return
+        self._open = False
         try:
-            link.__exit__(*exc_info)
-            self._counts = link.counters()
+            self._link.__exit__(*exc_info)
         finally:
             self.emulator.hang_up()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
-        if self._link is None or self.emulator is None:
+        if not self._open or self._link is None or self.emulator is None:
             raise not_open()
         if self.ended:
             return []
@@ -180,4 +179,4 @@ class DemoLink(Link):
 
     def counters(self) -> dict[str, int]:
         """Return the counts of the serial link, the last ones after it was closed."""
-        return self._link.counters() if self._link else dict(self._counts)
+        return self._link.counters() if self._link else {}

@@ -5,14 +5,12 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, latency_timer_ms, serial_ports
-from firmware_bridge.links.usb_devices import holders
+from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, holders, latency_timer_ms, serial_ports
 
 SYS_ROOT: Final = Path("/sys")
 
@@ -49,11 +47,6 @@ def can_networks(sys_root: Path = SYS_ROOT) -> list[CanNetwork]:
     ]
 
 
-def is_pretended(name: str) -> bool:
-    """Return True if a network of this name has no wire, so that every device on it is emulated."""
-    return name.startswith(("vcan", "vxcan"))
-
-
 def _text(path: Path) -> str | None:
     try:
         return path.read_text().strip()
@@ -88,24 +81,18 @@ def devices() -> tuple[list[Found], list[str]]:
 def serial_devices(
     ports: Sequence[Port],
     sys_root: Path = SYS_ROOT,
-    proc_root: Path = Path("/proc"),
     may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
-    by_path: Path = Path("/dev/serial/by-path"),
 ) -> list[Found]:
     """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
     serials = [port.serial_number for port in ports]
     found: list[Found] = []
     for port in ports:
-        if port.adapter is not None:
-            looks_like = port.adapter
-        else:
-            words = " by ".join(word for word in (port.product or port.description, port.manufacturer) if word)
-            looks_like = f"{words}: no known adapter"
+        words = " by ".join(word for word in (port.product or port.description, port.manufacturer) if word)
         alone = port.serial_number is not None and serials.count(port.serial_number) == 1
         problems: list[str] = []
         if not may_open(port.path):
             problems.append(NO_PERMISSION)
-        if held := holders(port.path, proc_root):
+        if held := holders(port.path):
             problems.append(f"held by {', '.join(held)}: end it first")
         latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
         if latency_ms >= 16:
@@ -118,23 +105,22 @@ def serial_devices(
                 port.path,
                 None if port.usb_id is None else _usb_id(port.usb_id),
                 port.serial_number,
-                looks_like,
+                port.adapter or f"{words}: no known adapter",
                 port.adapter is not None,
-                f"slcan:serial={port.serial_number}" if alone else f"slcan:{_by_place(port.path, by_path)}",
+                f"slcan:serial={port.serial_number}" if alone else f"slcan:{_by_place(port.path)}",
                 tuple(problems),
             )
         )
     return found
 
 
-def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | None] | None = None) -> list[Found]:
-    """List the CAN interfaces of the kernel, by name; `bitrate_hz` returns the bitrate of one, by default from `ip`."""
-    bitrate_hz = bitrate_hz or _bitrate_hz
+def can_interfaces(sys_root: Path = SYS_ROOT) -> list[Found]:
+    """List the CAN interfaces of the kernel, by name."""
     found: list[Found] = []
     for network in can_networks(sys_root):
         name, driver = network.name, network.driver
-        bitrate = bitrate_hz(name)
         problems = [] if network.problem is None else [network.problem]
+        bitrate = _bitrate_hz(name)
         if bitrate not in (None, 0, BITRATE_BIT_S):
             problems.append(f"runs at {bitrate} bit/s, the sensor at {BITRATE_BIT_S}")
         looks_like = f"CAN interface, {f'driver {driver}' if driver else 'virtual or of slcand'}"
@@ -143,8 +129,7 @@ def can_interfaces(sys_root: Path = SYS_ROOT, bitrate_hz: Callable[[str], int | 
 
 
 def _gs_usb_adapters() -> list[Found]:
-    # Imported here, since only this needs libusb.
-    from firmware_bridge.links.gs_usb_devices import gs_usb_devices, source_name, udev_rule
+    from firmware_bridge.links.gs_usb_link import gs_usb_devices, source_name, udev_rule  # only this needs libusb
 
     present = gs_usb_devices()
     return [
@@ -162,13 +147,10 @@ def _gs_usb_adapters() -> list[Found]:
     ]
 
 
-def _by_place(path: str, by_path: Path) -> str:
+def _by_place(path: str) -> str:
     """Return the link to a port that is named by its place; its path where there is none."""
-    with suppress(OSError):
-        for link in sorted(by_path.iterdir()):
-            if link.resolve() == Path(path).resolve():
-                return str(link)
-    return path
+    links = sorted(Path("/dev/serial/by-path").glob("*"))
+    return next((str(link) for link in links if link.resolve() == Path(path).resolve()), path)
 
 
 def _usb_id(usb_id: tuple[int, int]) -> str:

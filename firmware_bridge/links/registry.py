@@ -87,52 +87,42 @@ def open_source(
         NoDeviceError: no adapter, or several without a choice.
         RecordingError: a recording that cannot be used.
     """
-    link = _link_of(text, rate_hz, demo_recording, placed_map(model, mountings, prefix), mountings, prefix)
-    link.prefix = prefix
-    return link
-
-
-def _link_of(
-    text: str | None,
-    rate_hz: float | None,
-    demo_recording: str | Path | None,
-    model: ModelMap,
-    mountings: Mapping[str, Mounting],
-    prefix: str,
-) -> Link:
     scheme, _, rest = (text or "").partition(":")
+    interface, _, channel = rest.partition(":")
+    placed = placed_map(model, mountings, prefix)
+    link: Link
     if text is None or scheme == "slcan":
         from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
 
         port, baud = (find_adapter(serial_ports()).path, None) if text is None else _port_and_baud(text, rest)
-        link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=model, triggers=trigger_frames(model))
+        link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=placed, triggers=trigger_frames(placed))
         link.name = text or link.name
-        return link
-    if scheme == "xela-server" and rest:
+    elif scheme == "xela-server" and rest:
         from firmware_bridge.links.xela_server import XelaServerLink
 
-        return XelaServerLink(rest, geometry=model.geometry, prefix=prefix, mountings=mountings)
-    if text == "gs_usb" or (scheme == "gs_usb" and rest):
+        link = XelaServerLink(rest, geometry=placed.geometry, prefix=prefix, mountings=mountings)
+    elif text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
-        return GsUsbLink(rest or None, model=model, triggers=trigger_frames(model))
-    interface, _, channel = rest.partition(":")
-    if scheme == "can" and channel:
+        link = GsUsbLink(rest or None, model=placed, triggers=trigger_frames(placed))
+    elif scheme == "can" and channel:
         from firmware_bridge.links.can_bus import CanBusLink
 
-        return CanBusLink(interface, channel, model=model, triggers=trigger_frames(model))
-    if scheme == "replay" and rest:
+        link = CanBusLink(interface, channel, model=placed, triggers=trigger_frames(placed))
+    elif scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
         from firmware_bridge.recording.formats import load_recording
 
-        replay = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
-        place_recordings(replay, mountings)
-        return replay
-    if text in ("demo", DEMO_LOOP) and demo_recording is not None:
+        link = ReplayLink([_named(load_recording(path), prefix) for path in recording_paths(rest)], rate_hz)
+        place_recordings(link, mountings)
+    elif text in ("demo", DEMO_LOOP) and demo_recording is not None:
         from firmware_bridge.links.demo import DemoLink
 
-        return DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP, model=placed_map(USPA44_MAP, {}, prefix))
-    raise _refusal(text)
+        link = DemoLink(demo_recording, rate_hz, loop=text == DEMO_LOOP, model=placed_map(USPA44_MAP, {}, prefix))
+    else:
+        raise _refusal(text)
+    link.prefix = prefix
+    return link
 
 
 def recording_paths(text: str) -> list[str]:

@@ -1,16 +1,16 @@
-"""List of the serial ports of this machine, and recognition of a sensor's adapter among them."""
+"""Serial ports of this machine: a sensor's adapter among them, the same one plugged in again, and who holds one."""
 
+import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError
-from firmware_bridge.links.usb_devices import Recognised
 
 FTDI_X: Final = (0x0403, 0x6015)  # id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables
 
@@ -120,6 +120,44 @@ def find_by_serial(serial_number: str, ports: Sequence[Port]) -> Port:
     return found[0]
 
 
+class _UsbDevice(Protocol):
+    @property
+    def identity(self) -> tuple[object, ...] | None: ...  # None without a serial number
+
+    @property
+    def place(self) -> str | None: ...  # its socket, or what comes next to it
+
+
+_Device = TypeVar("_Device", bound=_UsbDevice)
+
+
+class Recognised(Generic[_Device]):
+    """Device that a link has opened, known by its identity, or by its place once two were seen to share that.
+
+    Attributes:
+        device: as it was seen last; None before, and without an identity.
+    """
+
+    def __init__(self) -> None:
+        self.device: _Device | None = None
+        self._shared = False
+
+    def learn(self, device: _Device, present: Sequence[_Device]) -> None:
+        """Remember a device among all that are present."""
+        self.device = None if device.identity is None else device
+        self._shared |= [one.identity for one in present].count(device.identity) > 1
+
+    def find(self, present: Sequence[_Device]) -> _Device | None:
+        """Return the remembered device among those that are present; None if it is missing, or cannot be told."""
+        known = self.device
+        same = [one for one in present if known is not None and one.identity == known.identity]
+        self._shared |= len(same) > 1
+        if self._shared and known is not None:
+            same = [one for one in same if one.place == known.place]
+        self.device = same[0] if len(same) == 1 else known
+        return same[0] if len(same) == 1 else None
+
+
 class PluggedAdapter:
     """Adapter that is found again at any port by its USB serial number, unless the user named its place.
 
@@ -157,6 +195,29 @@ class PluggedAdapter:
         return port.path
 
 
+def holders(path: str) -> list[str]:
+    """List the other processes that have it open; those of other users are visible to root alone."""
+    real_path = Path(path).resolve()
+    return [
+        f"{_name(process)} ({process.name})"
+        for process in sorted(Path("/proc").glob("[0-9]*"), key=lambda process: int(process.name))
+        if process.name != str(os.getpid()) and real_path in _opened(process)
+    ]
+
+
+def in_use(path: str) -> str:
+    """Return who holds a serial port, and what to do.
+
+    ModemManager is root's, so that nobody else sees what it holds; it tries each new port for some seconds.
+    """
+    held = ", ".join(holders(path)) or "this program, or one of another user"
+    return (
+        f"in use by {held}: end the program that holds it, such as slcand, xela_server or another edge-sr. After a "
+        "plug-in it may be ModemManager, which lets go after some seconds: try again, or keep it away by the udev rule "
+        'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6015", ENV{ID_MM_DEVICE_IGNORE}="1" with the adapter\'s own ids'
+    )
+
+
 def _example(port: Port) -> str:
     named = f"serial={port.serial_number}" if port.serial_number else port.path
     return f"such as --source slcan:{named}, or try --source demo"
@@ -164,3 +225,18 @@ def _example(port: Port) -> str:
 
 def _seen(ports: Sequence[Port]) -> str:
     return f"Serial ports seen: {'; '.join(map(str, ports)) or 'none'}"
+
+
+def _name(process: Path) -> str:
+    with suppress(OSError):
+        return (process / "comm").read_text(errors="replace").strip()
+    return "a process"
+
+
+def _opened(process: Path) -> set[Path]:
+    opened: set[Path] = set()
+    with suppress(OSError):  # the process has gone, or is another user's
+        for descriptor in (process / "fd").iterdir():
+            with suppress(OSError):  # closed meanwhile
+                opened.add(descriptor.readlink())
+    return opened

@@ -1,10 +1,16 @@
-"""Link over an slcan adapter on a serial port."""
+"""Link over an slcan adapter on a serial port, which wakes up seldom: at the first bytes of a scan, and at its end.
+
+A scan comes in many small pieces over some 2 ms, and waking Python up for each costs more than decoding them. A frame
+takes its time on the bus, so it is known when the last one can have come: until then the reader sleeps.
+"""
 
 import errno
+import math
 import os
+import select
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
@@ -19,10 +25,8 @@ except ImportError:
 from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
 from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
 from firmware_bridge.errors import DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SerialLine, SourceKind, Unread, not_open
-from firmware_bridge.links.fd_reader import Piece, PortReader
-from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, serial_ports
-from firmware_bridge.links.usb_devices import in_use
+from firmware_bridge.links.base import Link, SourceKind, Unread, not_open
+from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, in_use, serial_ports
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
@@ -37,11 +41,83 @@ MOST_SILENT_OPENINGS: Final = 10
 """Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
 MOST_LATE_STAMPS: Final = 4
 """Lines lost to stamps that are no milliseconds of a minute, after which stamps of this adapter are switched off."""
-LATE_STAMPS_FRAMES: Final = 1000
-"""Frames within which those lines must come: an occasional flipped digit is no evidence on the adapter's clock."""
+FRAMES_A_LATE_STAMP: Final = 250
+"""Frames for each of those lines beyond which they are no evidence on the adapter's clock, but flipped digits."""
+
+MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
+BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
+SHORTEST_SLEEP_S: Final = 0.0003
+LONGEST_WAIT_S: Final = 0.004
+"""Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
+LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing, in [s]: `Unread` tells stalls by them
 
 # pyserial lets termios.error through, which is no OSError; Windows has no termios.
 _PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
+
+
+Piece = tuple[bytes, int, int]
+"""Bytes received together, the time of that, and the latest time before at which the port was empty, in [ns]."""
+
+
+class PortReader:
+    """Reader of bytes from the descriptor of a serial port that is in raw mode and does not block."""
+
+    def __init__(self, descriptor: int, *, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        """Begin with a port that is empty; it raises OSError, or termios.error, if the port is gone."""
+        self._descriptor, self._clock_ns = descriptor, clock_ns
+        self._empty_ns = clock_ns()
+        self._poll = select.poll()
+        self._poll.register(descriptor, select.POLLIN)
+        os.set_blocking(descriptor, False)
+        if termios is not None:  # with fewer, a port that is empty reads like one that is gone
+            attributes = termios.tcgetattr(descriptor)
+            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
+            termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+
+    def read(self, timeout_s: float, wanted_bytes: int) -> Piece:
+        """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
+
+        Raises:
+            OSError: the port is gone, and all earlier bytes have been returned.
+        """
+        now_ns = self._clock_ns()
+        end_ns = now_ns + round(timeout_s * 1e9)
+        while not self._poll.poll(math.ceil(1000 * min(max((end_ns - now_ns) / 1e9, 0.0), LONGEST_LOOK_S))):
+            self._empty_ns, now_ns = now_ns, self._clock_ns()  # from before the look: it may return long after it
+            if now_ns >= end_ns:
+                return b"", now_ns, self._empty_ns
+        data, now_ns, empty_ns = self.take()
+        end_ns = now_ns + round(LONGEST_WAIT_S * 1e9)
+        while 0 < len(data) < wanted_bytes and now_ns < end_ns:
+            time.sleep(max((wanted_bytes - len(data)) * BYTE_S, SHORTEST_SLEEP_S))
+            try:
+                more, now_ns, _ = self.take()
+            except OSError:
+                break  # left to the next call
+            data += more
+        return data, now_ns, empty_ns
+
+    def take(self) -> Piece:
+        """Return the bytes there, without waiting for more; raises as `read` does."""
+        begun_ns, empty_ns = self._clock_ns(), self._empty_ns
+        data = b""
+        while len(data) < MOST_BYTES:
+            try:
+                part = os.read(self._descriptor, MOST_BYTES - len(data))
+                if not part:
+                    raise OSError(errno.EIO, "hung up")
+            except BlockingIOError:
+                break
+            except OSError:
+                if data:
+                    break
+                raise
+            data += part
+            if len(part) < 64:  # the kernel returns 64 bytes a call, and fewer only if no more are there
+                break
+        if len(data) < MOST_BYTES:
+            self._empty_ns = begun_ns  # from before the read: this thread may not run for long after it
+        return data, self._clock_ns(), empty_ns if data else self._empty_ns
 
 
 class SlcanSerialLink(Link):
@@ -83,10 +159,9 @@ class SlcanSerialLink(Link):
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
-        self._late_stamps_from = (0, 0)
+        self._late_stamps_before = 0
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
-        self._received_bytes = 0
-        self._dropped_bytes = 0
+        self._counts = {"received_bytes": 0, "dropped_bytes": 0}
         self._unread = Unread()
         self._serial: serial.Serial | None = None
         self._reader: PortReader | None = None
@@ -106,16 +181,13 @@ class SlcanSerialLink(Link):
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        port, self._serial, self._reader = self._serial, None, None
-        if port is None:
+        port, reader, self._serial, self._reader = self._serial, self._reader, None, None
+        if port is None or reader is None:
             return
         self._drop_fetched()
         with suppress(*_PORT_ERRORS):  # gone already: no adapter to stop
-            _wait_until_sent(port)
-            for command in (CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,):
-                port.write(command)
-                _wait_until_sent(port)
-            self._dropped_bytes += _take_waiting(port.fileno())  # pyserial's next opening would drop them uncounted
+            _send(port, *((CLOSE, STAMPS_OFF) if self._stamps_on else (CLOSE,)))
+            self._counts["dropped_bytes"] += len(reader.take()[0])  # pyserial's next opening would not count them
         with suppress(*_PORT_ERRORS):
             if port.out_waiting:  # bytes that a dead device does not accept would delay the closing
                 port.reset_output_buffer()
@@ -126,20 +198,26 @@ class SlcanSerialLink(Link):
         if self._reader is None or self._serial is None:
             raise not_open()
         try:
-            pieces = self._take_fetched() or [self._reader.read(timeout_s, self._scans.bytes_until_scan())]
+            pieces = self._fetched or [self._reader.read(timeout_s, self._scans.bytes_until_scan())]
         except _PORT_ERRORS as error:
             raise LinkLostError(f"{self.port}: link lost, the cable or the adapter is gone: {error}") from error
+        self._fetched = []
         scans: list[Scan] = []
         for data, time_ns, self._unread.empty_ns in pieces:
             with self._counting:
-                self._received_bytes += len(data)
+                self._counts["received_bytes"] += len(data)
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
-        if self._questions.due(len(scans), self._scans.decoder.refusals, pieces[-1].time_ns):
-            _ask(self._serial, STATUS_FLAGS)
+        decoder = self._scans.decoder
+        if self._questions.due(len(scans), decoder.refusals, pieces[-1][1]):
+            with suppress(*_PORT_ERRORS):  # an adapter that accepts no bytes would not answer either
+                if not self._serial.out_waiting:
+                    os.write(self._serial.fileno(), STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
-        self.trouble = self._scans.decoder.status.trouble(self._scans.decoder.frames, flags_of_a_silence=silence)
-        if self._stamps_on and (self._stamps_are_none() or self._scans.clock.dropped):
+        self.trouble = decoder.status.trouble(decoder.frames, flags_of_a_silence=silence)
+        late, frames = decoder.late_stamps - self._late_stamps_before, decoder.frames - self._frames_at_opening
+        no_stamps = late >= MOST_LATE_STAMPS and frames < late * FRAMES_A_LATE_STAMP
+        if self._stamps_on and (no_stamps or self._scans.clock.dropped):
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
             self._open_anew(self._serial, STAMPS_OFF)
@@ -154,29 +232,25 @@ class SlcanSerialLink(Link):
             return
         with suppress(*_PORT_ERRORS):  # the next read reports it
             piece = self._reader.take()
-            if piece.data:
+            if piece[0]:
                 self._fetched.append(piece)
 
-    def _take_fetched(self) -> list[Piece]:
-        pieces, self._fetched = self._fetched, []
-        return pieces
-
     def _drop_fetched(self) -> None:
-        self._dropped_bytes += sum(len(piece.data) for piece in self._take_fetched())
+        self._counts["dropped_bytes"] += sum(len(data) for data, _, _ in self._fetched)
+        self._fetched = []
 
     def counters(self) -> dict[str, int]:
         """Return the counts of bytes received, and dropped on opening or closing, and the stages' counters."""
         with self._counting:
-            sizes = {"received_bytes": self._received_bytes, "dropped_bytes": self._dropped_bytes}
-            return sizes | self._scans.counters()
+            return self._counts | self._scans.counters()
 
     def can_ids(self) -> frozenset[int]:
         """Return the standard CAN ids received so far."""
         return self._scans.can_ids
 
-    def serial_line(self) -> SerialLine:
-        """Return the port and its speed."""
-        return SerialLine(self.port, self.baudrate)
+    def serial_line(self) -> tuple[str, int]:
+        """Return the port and its speed in [bit/s]."""
+        return self.port, self.baudrate
 
     def _open_port(self) -> serial.Serial:
         try:
@@ -194,77 +268,47 @@ class SlcanSerialLink(Link):
         frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_from = self._scans.decoder.late_stamps, frames
+        self._late_stamps_before = self._scans.decoder.late_stamps
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
-        # One write for each command: some adapters obey only the first one in a USB packet.
-        for command in (CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M):
-            port.write(command)
-            _wait_until_sent(port)
-        self._drop_old_bytes(port)
-        self._reader = PortReader(port.fileno())  # empty from here on: this thread may not run for long after OPEN
-        port.write(OPEN)
-        for frame in self._triggers:
-            _wait_until_sent(port)
-            port.write(encode_frame(frame))
-
-    def _stamps_are_none(self) -> bool:
-        late_before, frames_before = self._late_stamps_from
-        if self._scans.decoder.late_stamps - late_before >= MOST_LATE_STAMPS:
-            return True
-        if self._scans.decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
-            self._late_stamps_from = self._scans.decoder.late_stamps, self._scans.decoder.frames
-        return False
+        _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M)))
+        self._reader = PortReader(port.fileno())
+        self._drop_old_bytes(self._reader)
+        _send(port, OPEN, *map(encode_frame, self._triggers))
 
     def _open_anew(self, port: serial.Serial, stamps: bytes) -> None:
         """Reopen the channel with time stamps on or off, on a quiet line: of two forms at once most would be lost."""
-        for command in (CLOSE, stamps):
-            _say(port, command)
-        with suppress(*_PORT_ERRORS):  # gone, which the next read reports
-            self._drop_old_bytes(port)
+        with suppress(*_PORT_ERRORS):  # gone, which the next read reports, or full: then no answer would come
+            _send(port, CLOSE, stamps)
             if self._reader is not None:
-                self._reader = PortReader(port.fileno())
+                self._drop_old_bytes(self._reader)
         self._begin_anew()
-        _say(port, OPEN)
+        with suppress(*_PORT_ERRORS):
+            _send(port, OPEN)
 
     def _begin_anew(self) -> None:
         with self._counting:
             self._scans.begin_anew()
             self._drop_fetched()
 
-    def _drop_old_bytes(self, port: serial.Serial) -> None:
+    def _drop_old_bytes(self, reader: PortReader) -> None:
         """Drop and count the bytes that arrive before the line falls silent."""
         now_s = time.monotonic()
         quiet_s, end_s = now_s + QUIET_S, now_s + LONGEST_SETTLE_S
         while now_s < min(quiet_s, end_s):
             time.sleep(0.002)
-            dropped = _take_waiting(port.fileno())
-            self._dropped_bytes += dropped
+            dropped = len(reader.take()[0])
+            self._counts["dropped_bytes"] += dropped
             now_s = time.monotonic()
             if dropped:
                 quiet_s = now_s + QUIET_S
 
 
-def _say(port: serial.Serial, command: bytes) -> None:
-    with suppress(*_PORT_ERRORS):  # gone, which the next read reports, or full: then no answer would come
+def _send(port: serial.Serial, *commands: bytes) -> None:
+    """Send commands, one write for each: some adapters obey only the first one in a USB packet."""
+    _wait_until_sent(port)
+    for command in commands:
+        port.write(command)
         _wait_until_sent(port)
-        os.write(port.fileno(), command)
-        _wait_until_sent(port)
-
-
-def _take_waiting(descriptor: int) -> int:
-    """Read the waiting bytes, a bounded number of them, and return their count."""
-    taken = 0
-    with suppress(BlockingIOError):  # all bytes are read
-        for _ in range(1024):
-            taken += len(os.read(descriptor, 4096))
-    return taken
-
-
-def _ask(port: serial.Serial, question: bytes) -> None:
-    """Send a request without waiting for the output; an adapter that accepts no bytes would not answer either."""
-    with suppress(*_PORT_ERRORS):
-        if not port.out_waiting:
-            os.write(port.fileno(), question)
 
 
 def _wait_until_sent(port: serial.Serial) -> None:

@@ -3,19 +3,13 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from threading import Event
 from types import MappingProxyType
 from typing import Final, Self
 from urllib.parse import urlsplit
 
-from websockets.exceptions import (
-    ConnectionClosed,
-    InvalidHandshake,
-    InvalidMessage,
-    InvalidStatus,
-    WebSocketException,
-)
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
@@ -52,7 +46,6 @@ class XelaServerLink(Link):
         geometry: SensorGeometry = USPA44,
         prefix: str = "",
         mountings: Mapping[str, Mounting] = MappingProxyType({}),
-        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Prepare a link to ws://HOST[:PORT], for sensors of this geometry; raises SourceError for another URL.
 
@@ -63,7 +56,6 @@ class XelaServerLink(Link):
         self.kind: SourceKind = "device"
         self.url = self._address[2]
         self._scans = ServerScans(geometry, prefix, mountings)
-        self._clock_ns = clock_ns
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._connection: ClientConnection | None = None
@@ -81,7 +73,7 @@ class XelaServerLink(Link):
         self._scans.begin()
         self._pong = None
         self._connection = self._connect()
-        self._received_ns = self._clock_ns()
+        self._received_ns = time.monotonic_ns()
         try:
             self._first = self._take(self._connection, 0.5)  # a server greets at once; no message is no error
         except BaseException:
@@ -122,7 +114,7 @@ class XelaServerLink(Link):
                 for _ in range(64):  # later messages wait for the next read
                     message = connection.recv(timeout_s, decode=False)
                     timeout_s = 0
-                    self._received_ns, self._pong = self._clock_ns(), None
+                    self._received_ns, self._pong = time.monotonic_ns(), None
                     with self._counting:
                         self._received_bytes += len(message)
                         scans += self._scans.feed(message, self._received_ns)
@@ -139,7 +131,7 @@ class XelaServerLink(Link):
 
     def _watch(self, connection: ClientConnection) -> None:
         """Ping a server that sends no message: a connection can be dead without being closed."""
-        now_ns = self._clock_ns()
+        now_ns = time.monotonic_ns()
         if self._pong is None:
             if now_ns - self._received_ns >= SERVER_QUIET_S * NS_PER_S:
                 self._pong = connection.ping(), now_ns
@@ -206,12 +198,8 @@ def _unreachable(host: str, error: OSError | UnicodeError, opening_s: float) -> 
 def _no_handshake(error: Exception, opening_s: float) -> str:
     if isinstance(error, TimeoutError):
         return f"took the connection, and has not answered for {opening_s:g} s: it hangs, or is not an xela_server"
-    if isinstance(error, InvalidStatus):
-        return f"answers with HTTP status {error.response.status_code}: not the xela_server, but another program"
-    if isinstance(error, InvalidMessage):
-        return "does not answer as a WebSocket does: another program, or one that expects TLS, is at this port"
     if isinstance(error, InvalidHandshake):
-        return f"is not an xela_server: {error}"
+        return f"is not an xela_server, but another program, or one that expects TLS: {error}"
     return f"the connection broke while it was opened: {error}"
 
 

@@ -14,7 +14,7 @@ from wire_faults import READERS as LINE_READERS
 
 from firmware_bridge.can import gs_usb
 from firmware_bridge.can.slcan import encode_frame
-from firmware_bridge.emulation.xela_controller import Controller, bus_timeline
+from firmware_bridge.emulation.slcan_emulator import Controller, bus_timeline
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.frame_scans import GsUsbScans

@@ -9,29 +9,19 @@ from bridge_samples import make_counts, make_recording, read_until_lost, stacked
 from can.interfaces.slcan import slcanBus
 
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import FRAME_S, Controller, SlcanAdapter, bus_timeline
+from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.recording.tracks import Track
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 
 
-def timeline(rate_hz, jitter_s):
-    controller = Controller(Track("x", make_counts(50, 0), None), 4, rate_hz)
-    return [time_s for time_s, _ in bus_timeline([controller], jitter_s=jitter_s, seed=0, loop=False)]
-
-
 def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
-    assert timeline(100.0, 0.0)[::16] == pytest.approx([n / 100 for n in range(50)])
-    too_fast = timeline(1000.0, 0.0)
-    assert np.diff(too_fast) == pytest.approx([FRAME_S] * (len(too_fast) - 1))
-    times = timeline(100.0, 0.003)
-    assert times == sorted(times)
-    off = np.array(times[::16]) - np.arange(50) / 100
-    assert abs(off).max() <= 0.003 and abs(off[1:]).max() > 0.002 and off.min() < 0 < off.max()
-    gaps = np.diff(times).reshape(-1)[:15]
-    assert gaps == pytest.approx([FRAME_S] * 15)
+    for rate_hz, jitter_s, period_s in ((100.0, 0.0, 0.01), (1000.0, 0.0, 16 * FRAME_S), (100.0, 0.003, 0.01)):
+        controller = Controller(Track("x", make_counts(50, 0), None), 4, rate_hz)
+        times_s = [time_s for time_s, _ in bus_timeline([controller], jitter_s=jitter_s, seed=0, loop=False)]
+        assert abs(np.array(times_s[::16]) - period_s * np.arange(50)).max() <= jitter_s + 1e-9
+        assert np.diff(times_s[:16]) == pytest.approx([FRAME_S] * 15)
 
 
 # Answers of the adapter.

@@ -13,7 +13,7 @@ from firmware_bridge.can import gs_usb
 from firmware_bridge.can.bus_errors import LOST_RECENTLY_NS, BusErrors
 from firmware_bridge.can.gs_usb import BitTimingLimits, GsUsbDecoder, HostFrame, bit_timing
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.xela_controller import scan_frames
+from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.scans.frame_scans import GsUsbScans
 
 SCAN = scan_frames(make_counts(1)[0], 4, random.Random(0))

@@ -6,19 +6,18 @@ import sys
 import threading
 from functools import partial
 from math import inf
-from pathlib import Path
 
 import can
 import pytest
 from bridge_samples import frames_of
 from can.interfaces.virtual import VirtualBus
-from link_rigs import PulledBus, message_of
+from link_rigs import PulledBus, make_network, message_of
 
 from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
 from firmware_bridge.links import can_bus
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.links.reconnecting import LinkReader
 from firmware_bridge.scans.can_id_maps import trigger_frame
 
 
@@ -89,17 +88,6 @@ def test_stamps_that_count_from_the_opening_make_nothing_old(bus, begun_us):
 
 
 # Errors of the bus.
-
-
-def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
-    network = root / "class/net" / name
-    network.mkdir(parents=True)
-    (network / "flags").write_text("0x40081\n" if up else "0x40080\n")
-    (network / "type").write_text(f"{kind}\n")
-    if driver:
-        (root / driver).mkdir()
-        (network / "device").mkdir()
-        (network / "device/driver").symlink_to(root / driver)
 
 
 @pytest.fixture
@@ -243,7 +231,7 @@ def test_a_network_that_is_not_there_or_down(networks, channel, words):
     with pytest.raises(DeviceError, match=words) as refused:
         CanBusLink("socketcan", channel).__enter__()
     if channel == "can0":  # `edge-sr devices` advises the same
-        listed = can_interfaces(networks, lambda name: None)[0]
+        listed = can_interfaces(networks)[0]
         assert str(refused.value) == f"CAN network can0 {listed.problems[0]}"
 
 

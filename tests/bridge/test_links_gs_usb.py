@@ -15,9 +15,9 @@ from usb.backend import libusb1
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
-from firmware_bridge.links import gs_usb_devices, gs_usb_link
-from firmware_bridge.links.gs_usb_devices import gs_usb_devices as list_devices
+from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.gs_usb_link import GsUsbLink
+from firmware_bridge.links.gs_usb_link import gs_usb_devices as list_devices
 from firmware_bridge.scans.can_id_maps import trigger_frame
 
 
@@ -162,9 +162,9 @@ def test_the_adapters_of_this_machine():
 @pytest.mark.parametrize(
     ("ports", "wanted", "words"),
     [
-        ([], None, r"no gs_usb adapter found: .* seen: none"),
-        (["AB"], "XY", r"no gs_usb adapter with serial number XY, .*serial=AB"),
-        (["AB", "CD"], None, r"2 gs_usb adapters found: .*--source gs_usb:AB.*serial=CD"),
+        ([], None, r"no gs_usb adapter: plug it in, .* seen: none"),
+        (["AB"], "XY", r"no gs_usb adapter with serial number XY: .*serial=AB"),
+        (["AB", "CD"], None, r"2 gs_usb adapters: .*--source gs_usb:AB.*serial=CD"),
         (["AB", "AB"], None, r"2 gs_usb adapter.*--source gs_usb:1-2\b"),
         (["AB", "AB"], "AB", r"2 gs_usb adapter.*--source gs_usb:1-2\b"),
         (["AB"], "1-5", r"no gs_usb adapter at 1-5: .* at 1-2"),
@@ -187,7 +187,7 @@ def test_one_that_was_unplugged_is_told_from_others():
         link.__enter__()
     known.plug()
     with link:
-        assert link.serial_number == known.serial_number and known.adapter.started and not other.adapter.started
+        assert known.adapter.started and not other.adapter.started
 
 
 def test_of_two_with_one_serial_number_each_has_its_place():
@@ -209,7 +209,7 @@ def test_a_serial_number_that_was_seen_twice_identifies_nothing():
     with link:
         assert known.adapter.started
     known.adapter.unplug()
-    with pytest.raises(NoDeviceError, match="others have the same: plug it in where it was, at 1-2"):
+    with pytest.raises(NoDeviceError, match="surely the one: plug it in where it was, at 1-2"):
         link.__enter__()
     known.plug()
     with link:
@@ -278,10 +278,10 @@ def test_usb_that_cannot_be_read_or_without_libusb(get_backend, monkeypatch):
     backend = GsUsbBackend()
     get_backend(lambda: backend)
     monkeypatch.setitem(sys.modules, "libusb_package", None)
-    assert gs_usb_devices.usb_backend() is backend, "the system's"
+    assert len(list_devices()) == 1, "by the system's"
     get_backend(lambda: None)
     with pytest.raises(DeviceError, match="libusb cannot be loaded: pip install libusb-package"):
-        gs_usb_devices.usb_backend()
+        list_devices()
 
 
 def test_python_can_reads_it(get_backend):

@@ -9,19 +9,15 @@ import termios
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import serial
 from bridge_samples import SilentDevice, read_scans
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.pty_port import PseudoPort
-from firmware_bridge.emulation.xela_controller import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links import fd_reader, slcan_serial
-from firmware_bridge.links.fd_reader import PortReader
-from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.links import slcan_serial
+from firmware_bridge.links.slcan_serial import PortReader, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
@@ -38,7 +34,7 @@ def test_what_came_before_the_loss_is_not_lost(monkeypatch):
 
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
         os.write(device.device_fd, b"x")  # which shows that there is something to read
-        monkeypatch.setattr(fd_reader.os, "read", read)
+        monkeypatch.setattr(slcan_serial.os, "read", read)
         got = link.read(0.0), link.counters()["received_bytes"], link.counters()["replies"]
         with pytest.raises(LinkLostError):
             link.read(0.0)
@@ -70,33 +66,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
 # The reader of the port.
 
 
-def test_few_looks_make_a_scan(monkeypatch):
-    """A plain loop wakes for every piece that comes; this one sleeps until the end of the scan can have come."""
-    now_s, sent, takes, take = [0.0], [0], [], PortReader.take
-
-    def sleep(time_s):
-        now_s[0] += time_s
-        while sent[0] < 16 and sent[0] * FRAME_S <= now_s[0]:
-            port.write(LINES[sent[0]])
-            sent[0] += 1
-        while port.unread_bytes() < 22 * sent[0] - sum(len(piece.data) for piece in takes):
-            time.sleep(0.001)  # the kernel delivers them late
-
-    monkeypatch.setattr(fd_reader, "time", SimpleNamespace(sleep=sleep, monotonic_ns=time.monotonic_ns))
-    monkeypatch.setattr(PortReader, "take", lambda reader: takes.append(take(reader)) or takes[-1])
-    port = PseudoPort()
-    port.plug()
-    with SlcanSerialLink(port.path):
-        descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
-        reader = PortReader(descriptor, clock_ns=lambda: round(1e9 * now_s[0]))
-        takes.clear()
-        sleep(0.0)
-        assert reader.read(1.0, 22 * 16).data == b"".join(LINES)
-        os.close(descriptor)
-    port.unplug()
-    assert len(takes) <= 4 and now_s[0] < 15 * FRAME_S + 0.0005
-
-
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
     """Otherwise bytes that arrive meanwhile would look new."""
     now_ns, half_s, read = [0], 500_000_000, os.read
@@ -109,7 +78,7 @@ def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
 
     with SilentDevice() as device, monkeypatch.context() as patched:
         reader = PortReader(device.client_fd, clock_ns=lambda: now_ns[0])
-        patched.setattr(fd_reader.os, "read", stands_still)
+        patched.setattr(slcan_serial.os, "read", stands_still)
         assert reader.take() == (b"", half_s, 0)
         assert reader.take() == (b"", 2 * half_s, half_s)
         os.write(device.device_fd, b"z\r")

@@ -45,12 +45,6 @@ def test_the_ports_of_this_machine(monkeypatch):
     assert serial_ports()[1].interface is None
 
 
-def test_what_a_port_says():
-    assert str(VSCOM) == "/dev/ttyUSB0 0403:6015 serial=D30BL366 (VScom USB-CAN Plus)"
-    assert str(BUILT_IN) == "/dev/ttyS0 (n/a)"
-    assert OTHER.adapter is None and CANABLE.adapter == "CANable, slcan firmware"
-
-
 @pytest.mark.parametrize(
     ("product", "manufacturer", "adapter"),
     [

@@ -7,7 +7,7 @@ from bridge_samples import REAL_RECORDINGS
 from hostile_samples import one_line
 
 from firmware_bridge.can.slcan import encode_frame
-from firmware_bridge.emulation.xela_controller import scan_frames
+from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.csv_reader import CSV_HEADER

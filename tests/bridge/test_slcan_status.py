@@ -36,7 +36,7 @@ def test_every_flag_by_itself_and_all_together():
         expected = {"status_answers": 1} | ({f"adapter_{name}": 1} if name != "-" else {})
         assert counted(told(b"F%02X" % (1 << bit))) == expected
     assert set(counted(told(b"Fff", b"F00"))) == {"status_answers", *(f"adapter_{name}" for name in FLAGS.values())}
-    assert told(b"Fff", b"F00").answers == 2
+    assert told(b"Fff", b"F00").counts["status_answers"] == 2
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from edge.doctor.link_checks import LineFacts, check_baud, check_id_map, check_l
 from edge.doctor.taxel_checks import Samples
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import LinkLostError
-from firmware_bridge.links.reconnecting import LinkReader
+from firmware_bridge.links.base import LinkReader
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP, XR1944_MAP
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.slcan_scans import SlcanScans

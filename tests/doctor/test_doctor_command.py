@@ -21,8 +21,7 @@ from edge.cli import main as cli
 from edge.cli.main import parser
 from edge.doctor import command, examine
 from edge.doctor.guided_press import CORNERS, orders
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import SlcanAdapter
+from firmware_bridge.emulation.slcan_emulator import Emulator, SlcanAdapter
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting

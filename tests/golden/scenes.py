@@ -20,8 +20,7 @@ from golden_runs import EDGE_SR, brief, differences, edge_sr, environment, short
 
 from edge.api import demo_recording
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import SlcanAdapter
+from firmware_bridge.emulation.slcan_emulator import Emulator, SlcanAdapter
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import ABSENT
 

@@ -10,15 +10,16 @@ import tty
 from pathlib import Path
 
 import pytest
+from link_rigs import make_network
 
 from edge.cli import main as cli
 from edge.cli.listings import NOTHING, SERVER_HINT
 from edge.pipeline.run_statistics import silence_hint
 from firmware_bridge.errors import DeviceError
 from firmware_bridge.links import discovery as devices
-from firmware_bridge.links import gs_usb_devices
+from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.discovery import Found, can_interfaces, serial_devices
-from firmware_bridge.links.gs_usb_devices import GsUsbDevice
+from firmware_bridge.links.gs_usb_link import GsUsbDevice
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 
@@ -33,16 +34,8 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-@pytest.fixture
-def roots(tmp_path):
-    """An empty /sys and an empty /proc."""
-    (tmp_path / "sys").mkdir()
-    (tmp_path / "proc").mkdir()
-    return tmp_path / "sys", tmp_path / "proc"
-
-
-def test_serial_ports_and_what_to_write_for_them(roots):
-    vscom, gripper, other = serial_devices([VSCOM, GRIPPER, BUILT_IN], *roots, may_open=lambda path: True)
+def test_serial_ports_and_what_to_write_for_them(tmp_path):
+    vscom, gripper, other = serial_devices([VSCOM, GRIPPER, BUILT_IN], tmp_path, may_open=lambda path: True)
     assert vscom == Found(
         "serial", "/dev/ttyUSB0", "0403:6015", "D30BL366", "VScom USB-CAN Plus", True, "slcan:serial=D30BL366", ()
     )
@@ -50,18 +43,18 @@ def test_serial_ports_and_what_to_write_for_them(roots):
     assert (other.usb_id, other.source, other.looks_like) == (None, "slcan:/dev/ttyS0", "n/a: no known adapter")
 
 
-def test_ports_that_share_a_serial_number_are_named_by_path_and_may_not_be_permitted(roots):
+def test_ports_that_share_a_serial_number_are_named_by_path_and_may_not_be_permitted(tmp_path):
     second = VSCOM._replace(path="/dev/ttyUSB1", interface="1.1")
-    found = serial_devices([VSCOM, second], *roots, may_open=lambda path: path == VSCOM.path)
+    found = serial_devices([VSCOM, second], tmp_path, may_open=lambda path: path == VSCOM.path)
     assert [one.source for one in found] == ["slcan:/dev/ttyUSB0", "slcan:/dev/ttyUSB1"]
     (problem,) = found[0].problems + found[1].problems
     assert "no permission" in problem and "dialout" in problem
 
 
-def test_a_latency_timer_that_was_left_alone(roots):
+def test_a_latency_timer_that_was_left_alone(tmp_path):
     for text, told in (("16\n", True), ("1\n", False), ("", False), ("x", False)):
-        write(roots[0] / "bus/usb-serial/devices/ttyUSB0/latency_timer", text)
-        (found,) = serial_devices([VSCOM], *roots, may_open=lambda path: True)
+        write(tmp_path / "bus/usb-serial/devices/ttyUSB0/latency_timer", text)
+        (found,) = serial_devices([VSCOM], tmp_path, may_open=lambda path: True)
         assert ("latency timer at 16 ms" in " ".join(found.problems)) == told
 
 
@@ -77,49 +70,45 @@ def test_who_holds_a_port():
     os.close(master), os.close(slave)
 
 
-def interface(sys_root: Path, name: str, *, kind: str = "280", up: bool, driver: str | None = None) -> None:
-    write(sys_root / f"class/net/{name}/type", kind + "\n")
-    write(sys_root / f"class/net/{name}/flags", f"{0x40080 | up:#x}\n")
-    if driver:
-        (sys_root / f"drivers/{driver}").mkdir(parents=True)
-        (sys_root / f"class/net/{name}/device").mkdir()
-        (sys_root / f"class/net/{name}/device/driver").symlink_to(sys_root / f"drivers/{driver}")
+@pytest.fixture
+def ip(tmp_path, monkeypatch):
+    """Function that writes what `ip` says of a network."""
+
+    def write_program(**said):
+        cases = "".join(f"'-json -details link show {name}') echo '{text}';; " for name, text in said.items())
+        write(tmp_path / "bin/ip", f'#!/bin/sh\ncase "$*" in {cases} *) exit 1;; esac').chmod(0o755)
+        monkeypatch.setenv("PATH", f"{tmp_path}/bin:{os.environ['PATH']}")
+
+    return write_program
 
 
-def test_can_interfaces(roots):
-    sys_root, _ = roots
-    assert can_interfaces(sys_root) == []
-    interface(sys_root, "can0", up=False, driver="gs_usb")
-    interface(sys_root, "can1", up=True, driver="peak_usb")
-    interface(sys_root, "slcan0", up=False)
-    interface(sys_root, "eth0", up=True, kind="1")
-    rates = {"can0": 0, "can1": 500_000, "slcan0": None}
-    can0, can1, slcan0 = can_interfaces(sys_root, rates.__getitem__)
+def bitrate(rate):
+    return json.dumps([{"linkinfo": {"info_kind": "can", "info_data": {"bittiming": {"bitrate": rate}}}}])
+
+
+def test_can_interfaces(tmp_path, ip):
+    assert can_interfaces(tmp_path) == []
+    make_network(tmp_path, "can0", up=False, driver="gs_usb")
+    make_network(tmp_path, "can1", up=True, driver="peak_usb")
+    make_network(tmp_path, "slcan0", up=False)
+    make_network(tmp_path, "eth0", up=True, kind="1")
+    ip(can0=bitrate(0), can1=bitrate(500_000))
+    can0, can1, slcan0 = can_interfaces(tmp_path)
     assert (can0.path, can0.source, can0.looks_like) == ("can0", "can:socketcan:can0", "CAN interface, driver gs_usb")
     assert can0.problems == ("is down: sudo ip link set can0 up type can bitrate 1000000 restart-ms 100",)
     assert can1.problems == ("runs at 500000 bit/s, the sensor at 1000000",)
     assert slcan0.problems == ("is down: sudo ip link set slcan0 up",) and "slcand" in slcan0.looks_like
-    (right,) = [one for one in can_interfaces(sys_root, lambda name: 1_000_000) if one.path == "can1"]
-    assert right.problems == ()
 
 
 @pytest.mark.parametrize(
-    ("says", "bitrate"),
-    [
-        ('[{"linkinfo": {"info_kind": "can", "info_data": {"bittiming": {"bitrate": 500000}}}}]', 500_000),
-        ('[{"linkinfo": {"info_kind": "vcan"}}]', None),
-        ("[]", None),
-        ("Option is unknown", None),
-    ],
+    "said", [bitrate(1_000_000), '[{"linkinfo": {"info_kind": "vcan"}}]', "[]", "Option is unknown"]
 )
-def test_the_bitrate_is_asked_of_ip(roots, tmp_path, monkeypatch, says, bitrate):
-    program = write(tmp_path / "ip", f"#!/bin/sh\n[ \"$*\" = '-json -details link show can0' ] && echo '{says}'\n")
-    program.chmod(0o755)
-    interface(roots[0], "can0", up=True)
-    for path, known in ((f"{tmp_path}:{os.environ['PATH']}", bitrate), ("", None)):
-        monkeypatch.setenv("PATH", path)
-        (found,) = can_interfaces(roots[0])
-        assert found.problems == (() if known is None else (f"runs at {known} bit/s, the sensor at 1000000",))
+def test_a_bitrate_that_is_right_or_not_known_is_no_problem(tmp_path, ip, said, monkeypatch):
+    make_network(tmp_path, "can0", up=True)
+    ip(can0=said)
+    assert can_interfaces(tmp_path)[0].problems == ()
+    monkeypatch.setenv("PATH", "")
+    assert can_interfaces(tmp_path)[0].problems == ()
 
 
 @pytest.fixture
@@ -127,7 +116,7 @@ def gs_usb(plugged, monkeypatch):
     """Adapters on USB, to be filled by a test, on a machine without a CAN network."""
     there: list[GsUsbDevice] = []
     monkeypatch.setattr(devices, "can_interfaces", list)
-    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", lambda: there)
+    monkeypatch.setattr(gs_usb_link, "gs_usb_devices", lambda: there)
     monkeypatch.setenv("COLUMNS", "200")
     return there
 
@@ -183,7 +172,7 @@ def test_usb_that_cannot_be_read_hides_no_port(plugged, gs_usb, capsys, monkeypa
     def fail():
         raise DeviceError(why)
 
-    monkeypatch.setattr(gs_usb_devices, "gs_usb_devices", fail)
+    monkeypatch.setattr(gs_usb_link, "gs_usb_devices", fail)
     plugged[:] = [VSCOM]
     assert cli.main(["devices"]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [why, SERVER_HINT]

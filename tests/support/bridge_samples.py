@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.emulation.xela_controller import scan_frames
+from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
 from firmware_bridge.recording.csv_reader import CSV_HEADER

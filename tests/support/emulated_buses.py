@@ -13,8 +13,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from firmware_bridge.emulation.pty_port import EmulatorThread
-from firmware_bridge.emulation.slcan_emulator import Emulator
-from firmware_bridge.emulation.xela_controller import FRAME_S
+from firmware_bridge.emulation.slcan_emulator import FRAME_S, Emulator
 from firmware_bridge.recording.formats import load_recording
 
 _POLL_S = 0.05

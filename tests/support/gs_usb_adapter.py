@@ -9,7 +9,6 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import Final
 
 from firmware_bridge.can import gs_usb
@@ -47,14 +46,8 @@ class GsUsbAdapter:
         mute: true once it sends no more.
     """
 
-    def __init__(
-        self,
-        limits: BitTimingLimits = CANDLELIGHT,
-        *,
-        channels: int = 1,
-        clock_us: Callable[[], int] = lambda: time.monotonic_ns() // 1000,
-    ) -> None:
-        """Plug it in; `clock_us` is its own clock, of which it gives the last 32 bits."""
+    def __init__(self, limits: BitTimingLimits = CANDLELIGHT, *, channels: int = 1) -> None:
+        """Plug it in."""
         self.started = False
         self.right_bitrate = False
         self.sent: list[CanFrame] = []
@@ -62,7 +55,6 @@ class GsUsbAdapter:
         self.mute = False
         self._limits = limits
         self._channels = channels
-        self._clock_us = clock_us
         self._stamped = False
         self._overflowed = False
         self._queue: deque[bytes] = deque()
@@ -156,7 +148,7 @@ class GsUsbAdapter:
         self._overflowed = self._overflowed and not flags
         data = _FRAME.pack(echo_id, raw_id, dlc, channel, flags, 0, payload)
         if self._stamped:
-            data += struct.pack("<I", (self._clock_us() if stamp_us is None else stamp_us) & 0xFFFFFFFF)
+            data += struct.pack("<I", (time.monotonic_ns() // 1000 if stamp_us is None else stamp_us) & 0xFFFFFFFF)
         self._queue.append(data)
         self._hand_over()
         self._changed.notify_all()

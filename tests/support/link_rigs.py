@@ -244,6 +244,18 @@ def message_of(frame: CanFrame, **settings) -> can.Message:
     return can.Message(arbitration_id=frame.can_id, data=frame.data, **settings)
 
 
+def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: str | None = None) -> None:
+    """Make a CAN network, or another one, of a pretended /sys."""
+    network = root / "class/net" / name
+    network.mkdir(parents=True)
+    (network / "flags").write_text("0x40081\n" if up else "0x40080\n")
+    (network / "type").write_text(f"{kind}\n")
+    if driver:
+        (root / driver).mkdir()
+        (network / "device").mkdir()
+        (network / "device/driver").symlink_to(root / driver)
+
+
 class ServerRig(Rig):
     """The vendor's server, emulated."""
 

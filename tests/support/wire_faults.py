@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from edge.bench.provenance import provenance
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.emulation.xela_controller import FRAME_S
+from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 
-from firmware_bridge.emulation.xela_controller import playing_rate_hz
+from firmware_bridge.emulation.slcan_emulator import playing_rate_hz
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track

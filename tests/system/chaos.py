@@ -39,7 +39,7 @@ from edge.terminal.argument_types import whole
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import EmulatorThread
-from firmware_bridge.emulation.xela_controller import FRAME_S
+from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import EmulatorThread, PseudoPort
-from firmware_bridge.emulation.xela_controller import SlcanAdapter, bus_timeline, controllers_of
+from firmware_bridge.emulation.slcan_emulator import SlcanAdapter, bus_timeline, controllers_of
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 

@@ -10,7 +10,7 @@ from chaos_wire import NAMES, FaultyBus, Sent, numbered, stretches
 
 from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.emulation.pty_port import EmulatorThread
-from firmware_bridge.emulation.xela_controller import bus_timeline, controllers_of
+from firmware_bridge.emulation.slcan_emulator import bus_timeline, controllers_of
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 

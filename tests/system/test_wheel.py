@@ -96,7 +96,7 @@ def test_it_holds_the_runtime_alone_and_tells_a_users_type_checker(fresh):
     assert {path.parent.name for path in packages.glob("*/py.typed") if path.parent.name in OURS} == IN_THE_WHEEL
     assert not (packages / "edge" / "bench").exists()
     emulation = {path.stem for path in (packages / "firmware_bridge" / "emulation").glob("[!_]*.py")}
-    assert emulation == {"pty_port", "slcan_emulator", "xela_controller"}, "what the demo needs"
+    assert emulation == {"pty_port", "slcan_emulator"}, "what the demo needs"
     assert {path.name for path in (packages / "edge" / "models").iterdir()} == {
         *("mtsr-int8.onnx", "stsr-int8.onnx", "stsr-small-int8.onnx"),
         *("contacts.npz", "demo.npz", "grip.npz", "taxels.npz"),
