@@ -13,14 +13,11 @@ from edge.pipeline.source_setup import sensor_settings, unmapped
 from edge.terminal.progress_bar import progress
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
-from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
-from firmware_bridge.scans.scan import Scan
 from firmware_bridge.sensor_file.model import SensorEntry
 
-_ENDINGS: Final = (".mcap", ".npz", ".csv")
 _WITHOUT: Final = {
     (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
     (".mcap", ".csv"): "all but counts, times and poses: patterns, events, baselines and the mounting",
@@ -37,11 +34,11 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     """
     source, target = Path(options.recording), Path(options.new)
     was, ending = ".mcap" if source.is_dir() else source.suffix.lower(), target.suffix.lower()
-    if ending not in _ENDINGS:
-        raise UsageError(f"{target}: expected a name that ends in {', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}")
+    if ending not in _WRITERS:
+        raise UsageError(f"{target}: expected a name that ends in .mcap, .npz or .csv")
     if was == ending:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
-    if was in _ENDINGS and (was, ending) not in _WITHOUT:
+    if was in _WRITERS and (was, ending) not in _WITHOUT:
         made = source.with_suffix(".mcap").name
         raise UsageError(
             f"{source} becomes no {ending}: edge-sr convert {source} {made}; edge-sr convert {made} {target}"
@@ -89,16 +86,6 @@ def _write(replay: ReplayLink, path: Path, sensor: str | None) -> Iterator[str]:
         yield f"{expected - scans} scans are left out: a taxel gave no reading, for which a CSV has no cell"
 
 
-def _scans(replay: ReplayLink) -> Iterator[tuple[Scan, list[TimedPose]]]:
-    """Yield the scans of a recording, each with the poses that it was made with first."""
-    total = sum(len(track.counts) for track in replay.recordings[0].tracks)
-    with progress("convert", total, "scan") as bar:
-        while not replay.ended:
-            for scan in replay.read(0.0):
-                bar.update()
-                yield scan, replay.poses()
-
-
 def _write_npz(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     from edge.sinks.converted_files import recorded_rows, write_npz
 
@@ -116,14 +103,17 @@ def _write_mcap(replay: ReplayLink, path: Path, *, sensor: str | None) -> None:
     entries = {name: SensorEntry(mounting) for name, mounting in recording.mountings.items()}
     to = McapScans(path, replace(known, sensors=entries), 0)  # the time of recording is unknown
     try:
-        for scan, poses in _scans(replay):
-            baseline = recording.baselines.get(scan.sensor)
-            age_s = None if baseline is None else scan.time_ns / 1e9 - baseline.created_unix_s
-            to.drain()
-            to.add_poses(poses)
-            frame = scan.sensor if kind == "device" else f"{kind}/{scan.sensor}"
-            to.add_scan(scan, kind, frame, baseline, age_s)
-            to.look()
+        with progress("convert", sum(len(track.counts) for track in recording.tracks), "scan") as bar:
+            while not replay.ended:
+                (scan,) = replay.read(0.0)
+                bar.update()
+                baseline = recording.baselines.get(scan.sensor)
+                age_s = None if baseline is None else scan.time_ns / 1e9 - baseline.created_unix_s
+                to.drain()
+                to.add_poses(replay.poses())
+                frame = scan.sensor if kind == "device" else f"{kind}/{scan.sensor}"
+                to.add_scan(scan, kind, frame, baseline, age_s)
+                to.look()
     except BaseException:
         to.abandon()
         raise

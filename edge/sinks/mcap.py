@@ -44,7 +44,7 @@ from edge.sinks.ros2.messages import (
 )
 from firmware_bridge.links.base import SourceKind
 from firmware_bridge.poses import TimedPose
-from firmware_bridge.recording.cdr import MessageType
+from firmware_bridge.recording.cdr import MessageType, stamp
 from firmware_bridge.recording.scan_messages import (
     POSE,
     SENSOR,
@@ -52,7 +52,6 @@ from firmware_bridge.recording.scan_messages import (
     encode_baseline,
     encode_pose,
     encode_scan,
-    encode_sensor,
     mounting_text,
     scan_type,
 )
@@ -86,7 +85,6 @@ class McapScans:
         sensors: SensorFile,
         offset_ns: int | None,
         facts: Mapping[str, Mapping[str, str]] | None = None,
-        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin the file; one that exists is left alone.
 
@@ -98,7 +96,6 @@ class McapScans:
         """
         self.offset_ns = time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns
         self.scans = self.messages = 0
-        self._clock_s = clock_s
         taxels = sensors.geometry.taxel_count
         self._scan, self._baseline = scan_type(taxels), baseline_type(taxels)
         self._facts = {
@@ -157,7 +154,9 @@ class McapScans:
             facts = self._facts | {SOURCE_METADATA: source}
             if sensor in self._mountings:
                 facts[MOUNTING_METADATA] = self._mountings[sensor]
-            self.add(sensor, "sensor", SENSOR, unix_ns, encode_sensor(sensor, frame, json.dumps(facts), unix_ns))
+            header = {"stamp": stamp(unix_ns), "frame_id": frame}
+            data = SENSOR.encode({"header": header, "sensor": sensor, "facts": json.dumps(facts)})
+            self.add(sensor, "sensor", SENSOR, unix_ns, data)
         if baseline is not None and (repeat or self._baselines.get(sensor) is not baseline):
             data = encode_baseline(baseline, frame, baseline_age_s, unix_ns)
             self.add(sensor, "baseline", self._baseline, unix_ns, data)
@@ -192,7 +191,7 @@ class McapScans:
             channel = self._channels[sensor, name] = len(self._channels) + 1
             self._jobs.append(partial(self._writer.register_channel, topic, "cdr", self._schemas[kind.name], about))
         if self._due_s is None:
-            self._due_s = self._clock_s() + CHUNK_S
+            self._due_s = time.monotonic() + CHUNK_S
         sequence = self._sequences[channel] & 0xFFFFFFFF
         self._jobs.append(partial(self._writer.add_message, channel, unix_ns, data, unix_ns, sequence))
         self._sequences[channel] += 1
@@ -209,7 +208,7 @@ class McapScans:
     def look(self) -> None:
         """Close the chunk if it is due."""
         self._look_back()
-        if self._due_s is not None and self._clock_s() >= self._due_s:
+        if self._due_s is not None and time.monotonic() >= self._due_s:
             self._hand_over()
 
     def close(self) -> None:
@@ -296,9 +295,7 @@ class McapSink(Sink):
     waits for it.
     """
 
-    def __init__(
-        self, path: Path, contract: Contract, source: Source, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, path: Path, contract: Contract, source: Source) -> None:
         """Begin the file, as McapScans does; the contract is that of the model that the run begins with."""
         self._path, self._geometry = path, source.sensor_file.geometry
         self._origin: SourceKind | None = source.origin
@@ -307,7 +304,7 @@ class McapSink(Sink):
         self.unwritten = 0
         self._failed = False
         facts = {"contract": {key: json.dumps(value) for key, value in asdict(contract).items()}}
-        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, facts, clock_s)
+        self._file = McapScans(path, source.sensor_file, source.unix_offset_ns, facts)
 
     @property
     def scans(self) -> int:

@@ -5,6 +5,8 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import Self
 
@@ -19,32 +21,6 @@ from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep_until
-
-
-class PoseLane:
-    """Poses of one recording, in their order, each at the scan that it served first."""
-
-    def __init__(self, poses: Sequence[TimedPose], first_ns: int, sensors: Sequence[str] = ()) -> None:
-        """Begin before the first pose of a recording whose first scan has this time in [ns].
-
-        `sensors` are those for which poses of all sensors are meant, where others are played as well.
-        """
-        self._poses = poses
-        self._first_ns = first_ns
-        self._sensors = sensors
-        # A file of another program does not state which scan a pose served. There each pose comes early, so that it is
-        # interpolated; one that comes earlier than the longest gap would not be used earlier.
-        used_from_ns = (one.time_ns - GAP_NS if one.used_from_ns is None else one.used_from_ns for one in poses)
-        self._due_ns = np.fromiter(used_from_ns, np.int64, len(poses)) - first_ns
-        self._row = 0
-
-    def up_to(self, due_ns: int, start_ns: int) -> Iterator[TimedPose]:
-        """Yield the next poses that a scan uses, at `due_ns` [ns] after the first, which is played at `start_ns`."""
-        while self._row < len(self._poses) and self._due_ns[self._row] <= due_ns:
-            pose = self._poses[self._row].later(start_ns - self._first_ns)
-            self._row += 1
-            for sensor in (pose.sensor,) if pose.sensor is not None or not self._sensors else self._sensors:
-                yield replace(pose, sensor=sensor)
 
 
 class ReplayLink(Link):
@@ -109,9 +85,10 @@ class ReplayLink(Link):
         if len(set(sensors)) < len(sensors):
             raise SourceError(f"recordings of sensors {', '.join(sensors)}: expected each sensor once")
         self._series = [ScanSeries(track.sensor, track.geometry) for track in self._tracks]
-        pose_lanes = [self._pose_lane(recording, rate_hz) for recording in self.recordings]
-        self._pose_lanes = [one for one in pose_lanes if one is not None]
-        self.states_poses = bool(self._pose_lanes)
+        lasting = [one for one in self.recordings if one.poses and self._has_pose_times(one, rate_hz)]
+        self.states_poses = bool(lasting)
+        self._poses_to_come = merge(*map(self._posed, lasting), key=itemgetter(0))
+        self._next_pose = next(self._poses_to_come, None)
         self._poses: list[TimedPose] = []
         due_ns = np.concatenate([times_ns for _, times_ns in lanes])
         lane = np.concatenate([np.full(len(times_ns), number) for number, (_, times_ns) in enumerate(lanes)])
@@ -175,22 +152,32 @@ class ReplayLink(Link):
         """Return the counts of scans, and of the torn and repeated ones among them, as in the recording."""
         return dict(self._counts)
 
-    def _pose_lane(self, recording: Recording, rate_hz: float | None) -> PoseLane | None:
-        """Return the poses of a recording, None where it has none whose times hold."""
-        poses, first_ns = recording.poses, _first_ns(recording)
-        if not poses:
-            return None
-        sensors = [track.sensor for track in recording.tracks] if len(self.recordings) > 1 else ()
-        if recording.poses_by_row:
-            times_ns = self.times_ns[recording.tracks[0].sensor].tolist()
-            timed = [replace(one, time_ns=times_ns[one.time_ns], used_from_ns=times_ns[one.time_ns]) for one in poses]
-            return PoseLane(timed, 0, sensors)
-        if rate_hz is not None or first_ns is None:
-            self.notes.append(
-                f"{recording.path}: its {len(poses)} poses are left out, since --rate-hz replaces the times"
-            )
-            return None
-        return PoseLane(poses, first_ns, sensors)
+    def _has_pose_times(self, recording: Recording, rate_hz: float | None) -> bool:
+        """Return False, and note it, where the times of a recording's poses do not hold."""
+        if recording.poses_by_row or (rate_hz is None and _first_ns(recording) is not None):
+            return True
+        left_out = (
+            f"{recording.path}: its {len(recording.poses)} poses are left out, since --rate-hz replaces the times"
+        )
+        self.notes.append(left_out)
+        return False
+
+    def _posed(self, recording: Recording) -> Iterator[tuple[int, TimedPose]]:
+        """Yield poses in their order, timed from the first scan, each with the time of the scan that it served first.
+
+        Beside other recordings, a pose of all sensors is one of this recording's sensors each.
+        """
+        first_ns = 0 if recording.poses_by_row else _first_ns(recording) or 0
+        sensors = [track.sensor for track in recording.tracks] if len(self.recordings) > 1 else [None]
+        for pose in recording.poses:
+            if recording.poses_by_row:
+                row_ns = int(self.times_ns[recording.tracks[0].sensor][pose.time_ns])
+                pose = replace(pose, time_ns=row_ns, used_from_ns=row_ns)
+            # A file of another program does not state which scan a pose served. There each pose comes early, so that
+            # it is interpolated; one that comes earlier than the longest gap would not be used earlier.
+            used_from_ns = pose.time_ns - GAP_NS if pose.used_from_ns is None else pose.used_from_ns
+            for sensor in sensors if pose.sensor is None else [pose.sensor]:
+                yield used_from_ns - first_ns, replace(pose.later(-first_ns), sensor=sensor)
 
     def _next_ns(self) -> int | None:
         """Return the time of the next scan, in [ns]; None after the last."""
@@ -199,8 +186,9 @@ class ReplayLink(Link):
     def _take(self) -> Scan:
         """Return the next scan."""
         due_ns, lane, row = (int(one[self._place]) for one in (self._due_ns, self._lane, self._row))
-        for poses in self._pose_lanes:
-            self._poses += poses.up_to(due_ns, self.first_ns)
+        while self._next_pose is not None and self._next_pose[0] <= due_ns:
+            self._poses.append(self._next_pose[1].later(self.first_ns))
+            self._next_pose = next(self._poses_to_come, None)
         self._place += 1
         self.ended = self._place == len(self._due_ns)
         time_ns = self.first_ns + due_ns

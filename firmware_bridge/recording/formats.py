@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from firmware_bridge.errors import RecordingError
-from firmware_bridge.recording.csv_reader import load_csv
-from firmware_bridge.recording.npz_recording import load_npz
 from firmware_bridge.recording.tracks import Recording
 
 
@@ -16,10 +14,16 @@ def load_recording(path: str | Path) -> Recording:
         RecordingError: the file cannot be read, is no recording, or a value in it is impossible.
     """
     path = Path(path)
-    readers = {".csv": load_csv, ".npz": load_npz, ".mcap": _load_mcap}
-    reader = _load_mcap if path.is_dir() else readers.get(path.suffix.lower())
-    if reader is None:
-        raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap, or is a folder of a rosbag2")
+    # Each reader is imported where it is needed: that of MCAP loads a package.
+    match ".mcap" if path.is_dir() else path.suffix.lower():
+        case ".csv":
+            from firmware_bridge.recording.csv_reader import load_csv as reader
+        case ".npz":
+            from firmware_bridge.recording.npz_recording import load_npz as reader
+        case ".mcap":
+            from firmware_bridge.recording.mcap_reader import load_mcap as reader
+        case _:
+            raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap, or is a folder of a rosbag2")
     try:
         recording = reader(path)
     except OSError as error:
@@ -27,9 +31,3 @@ def load_recording(path: str | Path) -> Recording:
     if recording.origin != "emulated":
         return recording
     return replace(recording, notes=(*recording.notes, f"{path} was recorded from an emulated sensor"))
-
-
-def _load_mcap(path: Path) -> Recording:
-    from firmware_bridge.recording.mcap_reader import load_mcap  # imported here, since it loads the mcap package
-
-    return load_mcap(path)

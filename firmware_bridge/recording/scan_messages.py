@@ -85,8 +85,6 @@ def baseline_type(taxel_count: int) -> MessageType:
     return MessageType(BASELINE_NAME, _BASELINE_TEXT.format(counts=len(AXES) * taxel_count), STD_HEADER)
 
 
-SCAN: Final = scan_type(USPA44.taxel_count)
-BASELINE: Final = baseline_type(USPA44.taxel_count)
 SENSOR: Final = MessageType("tactile_edge_sr/msg/Sensor", _SENSOR_TEXT, STD_HEADER)
 POSE: Final = MessageType("tactile_edge_sr/msg/PadPose", _POSE_TEXT, STD_HEADER)
 
@@ -194,11 +192,6 @@ def decode_baseline(data: bytes | memoryview, geometry: SensorGeometry = USPA44)
     counts.setflags(write=False)
     origin: Origin = fields["origin"] if fields["origin"] in get_args(Origin) else "file"
     return Baseline(sensor, counts, created_unix_s, scans, origin, fields["id"])
-
-
-def encode_sensor(sensor: str, frame: str, facts: str, unix_ns: int) -> bytes:
-    """Encode what the scans of a sensor mean, as JSON, at `unix_ns` [ns] since 1970."""
-    return SENSOR.encode({"header": _header(frame, unix_ns), "sensor": sensor, "facts": facts})
 
 
 def encode_pose(timed: TimedPose, unix_ns: int) -> bytes:

@@ -30,7 +30,7 @@ from edge.pipeline.commands import CommandLines, Commands
 from firmware_bridge.errors import RecordingError, SensorFileError
 from firmware_bridge.recording.csv_reader import CSV_HEADER
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.scan_messages import BASELINE, SCAN, encode_baseline, encode_scan
+from firmware_bridge.recording.scan_messages import baseline_type, encode_baseline, encode_scan, scan_type
 from firmware_bridge.recording.tracks import HIGHEST_COUNT
 from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.sensor_file.model import load_sensor_file
@@ -189,13 +189,13 @@ def mcap_seeds() -> list[bytes]:
     """Return plain records, without chunks and sums, so that a change is not mere damage."""
     fresh, plain = np.ones((4, 4), dtype=bool), RecordBuilder()
     scans = [Scan("4", n, n, np.int32(REST + n), fresh, fresh) for n in range(2)]
-    messages = [(BASELINE, encode_baseline(Baseline.of("4", REST, 1000.0, 100, "file"), "4", 1.0, 5))]
-    messages += [(SCAN, encode_scan(scan, "4", 5, 0xFFFF, 0xFFFF)) for scan in scans]
-    for number, kind in enumerate((BASELINE, SCAN), 1):
+    messages = [(baseline_type(16), encode_baseline(Baseline.of("4", REST, 1000.0, 100, "file"), "4", 1.0, 5))]
+    messages += [(scan_type(16), encode_scan(scan, "4", 5, 0xFFFF, 0xFFFF)) for scan in scans]
+    for number, kind in enumerate((baseline_type(16), scan_type(16)), 1):
         Schema(number, kind.definition.encode(), "ros2msg", kind.name).write(plain)
         Channel(number, "/x", "cdr", {}, number).write(plain)
     for kind, message in messages:
-        Message(1 + (kind is SCAN), 5, message, 5, 0).write(plain)
+        Message(1 + (kind is scan_type(16)), 5, message, 5, 0).write(plain)
     return [MCAP0_MAGIC + plain.end()]
 
 

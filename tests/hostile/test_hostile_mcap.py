@@ -20,9 +20,10 @@ from firmware_bridge.errors import RecordingError
 from firmware_bridge.recording import mcap_reader as mcap_recording
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.mcap_records import MOST_RECORD_BYTES
-from firmware_bridge.recording.scan_messages import BASELINE, SCAN, SENSOR
+from firmware_bridge.recording.scan_messages import SENSOR, baseline_type, scan_type
 
 pytestmark = pytest.mark.usefixtures("bounded_memory")
+SCAN, BASELINE = scan_type(16), baseline_type(16)
 GOOD = {
     "header": {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "4"},
     "sensor": "4",
