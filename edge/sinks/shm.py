@@ -13,7 +13,7 @@ import re
 import struct
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,7 @@ from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS, PLACE_IN_HEADER, Column, Columns
 from edge.pipeline.sink import Sink
 
+FOLDER: Final = Path("/dev/shm")
 MAGIC: Final = b"TESR-SHM"
 SLOTS: Final = 32
 LINE_BYTES: Final = 64
@@ -123,19 +124,13 @@ _WORD: Final = 8
 class SharedMemorySink(Sink):
     """Writer of the layout; readers cost it nothing, however many and slow they are."""
 
-    def __init__(
-        self,
-        name: str,
-        contract: Contract,
-        folder: Path = Path("/dev/shm"),
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """Make the segment in a folder of shared memory; one that a crash left over is replaced."""
+    def __init__(self, name: str, contract: Contract) -> None:
+        """Make the segment; one that a crash left over is replaced."""
         if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name):
             raise SinkError(f"shm:{name} cannot be a name: expected letters, digits, '_', '.' and '-', 100 at most")
-        if not folder.is_dir():
-            raise SinkError(f"no {folder} here: shm: needs Linux")
-        self._path, self._clock_ns = folder / name, clock_ns
+        if not FOLDER.is_dir():
+            raise SinkError(f"no {FOLDER} here: shm: needs Linux")
+        self._path = FOLDER / name
         self._layout = Layout(contract.rows, contract.cols, *contract.pattern_shape, contract.traction_shape)
         try:
             self._file, self._memory = self._create(contract.output_unit)
@@ -176,7 +171,7 @@ class SharedMemorySink(Sink):
 
     def wait(self) -> None:
         """Store the heartbeat, which shows that the writer lives while no scan comes."""
-        self._words[HEARTBEAT_AT // _WORD] = self._clock_ns()
+        self._words[HEARTBEAT_AT // _WORD] = time.monotonic_ns()
 
     def close(self) -> None:
         """Free the name; readers that still see the memory see that the run ended."""
@@ -208,7 +203,7 @@ class SharedMemorySink(Sink):
             memory = mmap.mmap(descriptor, self._layout.total_bytes)
             header = self._layout.header(os.getpid(), pattern_unit)
             memory[: len(header)] = header
-            memory[HEARTBEAT_AT : HEARTBEAT_AT + _WORD] = self._clock_ns().to_bytes(_WORD, "little")
+            memory[HEARTBEAT_AT : HEARTBEAT_AT + _WORD] = time.monotonic_ns().to_bytes(_WORD, "little")
             while True:
                 try:
                     self._path.hardlink_to(draft)

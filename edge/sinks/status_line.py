@@ -26,16 +26,9 @@ class StatusSink(Sink):
 
     patience_s = SHOWN_AT_REST_S
 
-    def __init__(
-        self,
-        stream: TextIO | None = None,
-        *,
-        clock_s: Callable[[], float] = time.monotonic,
-        columns: Callable[[], int] = lambda: shutil.get_terminal_size().columns,
-    ) -> None:
+    def __init__(self, stream: TextIO | None = None, *, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._stream = sys.stderr if stream is None else stream
         self._clock_s = clock_s
-        self._columns = columns
         self._terminal = rewritable(self._stream)
         self._latest: dict[str, Result] = {}
         self._cadences: defaultdict[str, Cadence] = defaultdict(Cadence)
@@ -78,7 +71,7 @@ class StatusSink(Sink):
     def _show(self, end: str = "") -> None:
         # The last column stays free: some terminals wrap as soon as it is filled.
         try:
-            drawn(self._stream).write("\r" + self._fitted(self._columns() - 1) + CLEAR_TO_END + end)
+            drawn(self._stream).write("\r" + self._fitted(shutil.get_terminal_size().columns - 1) + CLEAR_TO_END + end)
             self._stream.flush()
         except OSError:
             self._terminal = False  # the window was closed; that ends no recording

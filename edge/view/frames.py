@@ -1,9 +1,10 @@
-"""Snapshot of a run for its viewers, who look at it now and then, and the frames that it is packed into for them.
+"""Snapshot of a run, the frames that it is packed into, and the viewers: what each has seen, is sent and asks for.
 
 The loop writes and never waits; viewers read meanwhile. A value is replaced as a whole or appended to a bounded deque,
 and a deque is copied in one step, so no reader sees half of anything, and no lock is needed.
 """
 
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,6 +15,9 @@ from edge.mapping.sink import MapState
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.cadence import Cadence
+from edge.pipeline.commands import FORMS, WAITING, Commands, runtime_command
+from edge.pipeline.pose_queue import json_object
+from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import event_record, pack, record
 from firmware_bridge.errors import harmless
@@ -26,6 +30,9 @@ TRACE_POINTS: Final = 1200
 RECENT_SCANS: Final = 256
 EVENTS: Final = 20
 MAX_FPS: Final = 25  # most result frames a second of one sensor: more is not visible to the eye
+MOST_VIEWERS: Final = 8
+LATE_S: Final = 0.5
+"""Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 _PERIOD_NS: Final = round(1e9 / MAX_FPS)
 
 
@@ -167,20 +174,6 @@ class _Trace:
         return [point for point in past if point.time_ns > from_ns] + [newest]
 
 
-class Run(NamedTuple):
-    """Facts that do not change during a run: of its source, and of the model that it begins with.
-
-    A viewer that reconnects notices by the `id` that this is another run. `length_s` is that of a recording, in [s].
-    """
-
-    name: str
-    kind: SourceKind
-    model: str
-    contract: Contract
-    length_s: float | None
-    id: str
-
-
 class Frames:
     """Frames of one moment; viewers at the same state get the same bytes.
 
@@ -252,17 +245,16 @@ class Frames:
         return pack(header, {name: values for name, values in maps.items() if values is not None})
 
 
-def hello(run: Run) -> bytes:
-    """Return the first frame that a viewer gets."""
-    contract = run.contract
+def hello(source: Source, model: str, contract: Contract) -> bytes:
+    """Return the first frame that a viewer gets; one that reconnects notices by its `run` that this is another run."""
     height, width = contract.pattern_shape
     header = {
         "kind": "hello",
         "version": 1,
-        "run": run.id,
-        "name": harmless(run.name),
-        "source": run.kind,
-        "model": run.model,
+        "run": secrets.token_hex(8),
+        "name": harmless(source.name),
+        "source": source.kind,
+        "model": model,
         "taps": contract.taps,
         "pattern_unit": contract.output_unit,
         "full_scale": contract.output_full_scale,
@@ -275,7 +267,7 @@ def hello(run: Run) -> bytes:
         "width": width,
         "wrench": contract.traction_scale is not None,
         "checks": bool(contract.trust),
-        "length_s": run.length_s,
+        "length_s": source.length_s,
     }
     return pack(header, {})
 
@@ -301,3 +293,71 @@ def _drawn(point: Point, first_ns: int) -> list[float | None]:
 
 def _seconds(ns: int) -> float:
     return round(ns / 1e9, 3)
+
+
+class Viewer:
+    """Viewer of the page; every frame holds the newest values, however long ago the frame before was sent.
+
+    Attributes:
+        paused: no results meanwhile; events go on.
+        pinged_s: time since which a ping is unanswered, in [s]; None while none is.
+    """
+
+    def __init__(self) -> None:
+        self.paused = False
+        self.pinged_s: float | None = None
+        self._seen: dict[str, int] = {}
+        self._sent_number = 0
+        self._seen_map: MapState | None = None
+
+    def keeps_up(self, now_s: float) -> bool:
+        """Return whether the viewer has read what it was sent, as an answered ping shows."""
+        return self.pinged_s is None or now_s - self.pinged_s < LATE_S
+
+    def due(self, frames: Frames) -> list[bytes]:
+        """Return the frames that are new since the last call.
+
+        These are events, and unless the viewer has paused one frame a sensor and one of the map.
+        """
+        due: list[bytes] = []
+        for number, frame in frames.events(self._sent_number):
+            self._sent_number = number
+            due.append(frame)
+        if self.paused:
+            return due
+        for sensor, number in frames.numbers.items():
+            seen = self._seen.get(sensor, 0)
+            if number > seen:
+                due.append(frames.result(sensor, seen))
+                self._seen[sensor] = number
+        if frames.map is not None and frames.map is not self._seen_map:
+            due.append(frames.of_map(frames.map))
+            self._seen_map = frames.map
+        return due
+
+
+def execute(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+    """Queue the command in a viewer's message, JSON as on stdin, or pause the viewer.
+
+    Returns the reason if it is refused.
+    """
+    why = _refusal(message, viewer, commands)
+    if why is not None:
+        commands.refuse()
+    return why
+
+
+def _refusal(message: str | bytes, viewer: Viewer, commands: Commands) -> str | None:
+    parsed = json_object(message) if isinstance(message, str) else None
+    if parsed is not None and parsed.get("cmd") == "pause" and isinstance(parsed.get("on"), bool):
+        viewer.paused = parsed["on"]
+        return None
+    command = None if parsed is None else runtime_command(parsed)
+    if command is None:
+        shown = repr(message[:60])
+        shown = shown if len(message) <= 60 else f"{shown[:-1]}...{shown[-1]}"
+        return f'{shown} is not a command: expected {FORMS}, or {{"cmd": "pause", "on": true}}'
+    if commands.full:
+        return f"{WAITING} commands are waiting: repeat it when the run has executed them"
+    commands.put(command)
+    return None

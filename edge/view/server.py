@@ -9,7 +9,6 @@ import contextlib
 import errno
 import gc
 import hashlib
-import secrets
 import socket
 import sys
 import threading
@@ -35,9 +34,8 @@ from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
-from edge.view.access import SOCKET, Access, grant, is_everything, own_addresses
-from edge.view.frames import Frames, Run, RunSnapshot, hello, refused, state
-from edge.view.viewers import MOST_VIEWERS, Viewer, execute
+from edge.view.access import SOCKET, grant, is_everything, own_addresses
+from edge.view.frames import MOST_VIEWERS, Frames, RunSnapshot, Viewer, execute, hello, refused, state
 from firmware_bridge.links.base import SourceKind
 
 FOLDER: Final = Path(__file__).with_name("page")
@@ -87,6 +85,7 @@ def _policy(script: bytes) -> str:
     )
 
 
+LOOPBACK: Final = "127.0.0.1"
 STATE_S: Final = 1.0
 OPEN_S: Final = 5.0
 GONE_S: Final = 10.0
@@ -117,49 +116,44 @@ class Connection(ServerConnection):
             self.loop.call_soon(gc.collect)
 
 
-class Server:
-    """Server that shows a run to its viewers.
+class LiveView:
+    """Live page of a run; the port is taken at once, and pages are answered from `begin` on.
 
     Attributes:
-        port: that it listens at.
+        sinks: sinks that the loop writes to; they never fail.
+        url: the page's address.
+        other_urls: more addresses of it, where it listens at all addresses of this machine.
     """
 
-    def __init__(
-        self,
-        snapshot: RunSnapshot,
-        commands: Commands,
-        access: Access,
-        port: int,
-        failed: Callable[[str], object] = lambda text: None,
-    ) -> None:
-        """Take the port, 0 for any free one; pages are answered from `begin` to `close`.
+    def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
+        """Take the port, 0 for any free one, where `host` leads.
 
-        `failed` is called with the reason when the page ends early, from the server's thread. Raises SinkError where
-        the page cannot be served.
+        Requests must carry the token; None makes one where other machines can reach `host`. Raises UsageError where the
+        token is not valid, SinkError where the port cannot be taken.
         """
-        self._watched = False
-        self._snapshot, self._commands, self._access = snapshot, commands, access
-        self._failed = failed
+        self._access = grant(host, socket.gethostname(), token)
+        self._contract, self._commands = contract, commands
+        self._messages: Callable[[Event], object] = lambda event: None
         self._page = load_page()
-        self._socket = listen(access.host, port)
-        self.port: int = self._socket.getsockname()[1]
+        self._socket = listen(host, port)
         self._thread: threading.Thread | None = None
         self._viewers: dict[ServerConnection, Viewer] = {}
+        self._watched = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._news = asyncio.Event()
         self._ending = False
         self._source: SourceKind | None = None
         self._looked_at = threading.Event()
+        self._snapshot = RunSnapshot()
+        self._snapshot.wake = self._wake_if_watched
+        self.sinks: list[Sink] = [self._snapshot]
+        addresses = own_addresses(host) if is_everything(host) else []
+        self.url, *self.other_urls = self._access.urls(self._socket.getsockname()[1], addresses)
 
-    def begin(self, run: Run, looked_at: threading.Event) -> None:
-        """Answer pages and sockets; `run` is what a viewer gets first, and the first viewer sets `looked_at`."""
-        self._source, self._looked_at = run.kind, looked_at
-        ready = threading.Event()
-        self._thread = threading.Thread(target=self._serve, args=(run, ready), name="live-view")
-        self._thread.start()
-        ready.wait()
+    def __enter__(self) -> Self:
+        return self
 
-    def close(self) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         """Inform viewers that the run has ended, and free the port."""
         self._ending = True
         self._wake()
@@ -167,8 +161,32 @@ class Server:
             self._thread.join()
         self._socket.close()
 
-    def wake(self) -> None:
-        """Wake the server, because there is something new for its viewers. Never waits."""
+    def begin(
+        self,
+        source: Source,
+        model: str,
+        messages: Callable[[Event], object],
+        looked_at: threading.Event | None = None,
+    ) -> None:
+        """Answer requests from now on, about an open source and the model that the run begins with.
+
+        `messages` is called with an event if the page ends early, from the page's thread, and `looked_at` is set with
+        the first viewer.
+        """
+        self._messages, self._source = messages, source.kind
+        self._looked_at = looked_at or self._looked_at
+        ready = threading.Event()
+        first = hello(source, model, self._contract)
+        self._thread = threading.Thread(target=self._serve, args=(first, ready), name="live-view")
+        self._thread.start()
+        ready.wait()
+
+    def show_map(self, state: MapState) -> None:
+        """Show a state of the map. Never waits."""
+        self._snapshot.map = state
+        self._wake_if_watched()
+
+    def _wake_if_watched(self) -> None:
         if self._watched:
             self._wake()
 
@@ -178,19 +196,20 @@ class Server:
             with contextlib.suppress(RuntimeError):  # it has ended at that moment
                 loop.call_soon_threadsafe(self._news.set)
 
-    def _serve(self, run: Run, ready: threading.Event) -> None:
+    def _serve(self, first: bytes, ready: threading.Event) -> None:
         try:
-            asyncio.run(self._show(run, ready))
+            asyncio.run(self._show(first, ready))
         finally:  # also after an unforeseen error, which ends this thread and not the run
             self._loop, self._watched = None, False
             ready.set()
             if not self._ending:
-                self._failed(f"the live page has ended: {sys.exception()!r}; the run continues")
+                why = f"the live page has ended: {sys.exception()!r}; the run continues"
+                self._messages(Event(time.monotonic_ns(), "trouble", None, why))
 
-    async def _show(self, run: Run, ready: threading.Event) -> None:
+    async def _show(self, first: bytes, ready: threading.Event) -> None:
         self._loop = asyncio.get_running_loop()
         async with serve(
-            partial(self._attend, hello(run)),
+            partial(self._attend, first),
             sock=self._socket,
             process_request=self._answer,
             create_connection=Connection,
@@ -291,61 +310,3 @@ def listen(host: str, port: int) -> socket.socket:
         elif isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
             what, remedy = f"{host} is not an address of this machine", "name one with --view-host, or leave it out"
         raise SinkError(f"no live page: {what}; {remedy}") from error
-
-
-LOOPBACK: Final = "127.0.0.1"
-
-
-class LiveView:
-    """Live page of a run; the port is taken at once, and pages are answered from `begin` on.
-
-    Attributes:
-        sinks: sinks that the loop writes to; they never fail.
-        url: the page's address.
-        other_urls: more addresses of it, where it listens at all addresses of this machine.
-    """
-
-    def __init__(self, host: str, port: int, token: str | None, contract: Contract, commands: Commands) -> None:
-        """Take the port, 0 for any free one, where `host` leads.
-
-        Requests must carry the token; None makes one where other machines can reach `host`. Raises UsageError where the
-        token is not valid, SinkError where the port cannot be taken.
-        """
-        access = grant(host, socket.gethostname(), token)
-        snapshot = self._snapshot = RunSnapshot()
-        self._messages: Callable[[Event], object] = lambda event: None
-        self._server = Server(snapshot, commands, access, port, failed=self._failed)
-        snapshot.wake = self._server.wake
-        self._contract = contract
-        self.sinks: list[Sink] = [snapshot]
-        addresses = own_addresses(host) if is_everything(host) else []
-        self.url, *self.other_urls = access.urls(self._server.port, addresses)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        self._server.close()
-
-    def begin(
-        self,
-        source: Source,
-        model: str,
-        messages: Callable[[Event], object],
-        looked_at: threading.Event | None = None,
-    ) -> None:
-        """Answer requests from now on, about an open source and the model that the run begins with.
-
-        `messages` is called with an event if the page ends early, and `looked_at` is set with the first viewer.
-        """
-        self._messages = messages
-        run = Run(source.name, source.kind, model, self._contract, source.length_s, secrets.token_hex(8))
-        self._server.begin(run, threading.Event() if looked_at is None else looked_at)
-
-    def show_map(self, state: MapState) -> None:
-        """Show a state of the map. Never waits."""
-        self._snapshot.map = state
-        self._server.wake()
-
-    def _failed(self, why: str) -> None:
-        self._messages(Event(time.monotonic_ns(), "trouble", None, why))

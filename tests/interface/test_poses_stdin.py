@@ -14,7 +14,7 @@ from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wai
 from pose_samples import make_posed_contract
 
 from edge.api import PadPose, Runtime, Source, TimedPose, pump
-from edge.mapping.map_files import check_npz
+from edge.mapping.sink import check_npz
 from edge.pipeline.commands import RESET, CommandLines, Commands
 from edge.pipeline.pose_queue import (
     FURTHEST_AHEAD_NS,

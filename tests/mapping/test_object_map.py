@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from edge.api import Event, PadPose, SinkError, UsageError
-from edge.mapping import map_files
+from edge.mapping import sink as map_sink
 from edge.mapping.object_map import STEP_MM, MapLayers, ObjectMap
 from edge.mapping.sink import SHOW_NS, MapSink
 
@@ -305,7 +305,7 @@ def test_a_disk_that_is_full_leaves_no_half_of_a_file(tmp_path, monkeypatch):
         Path(path).write_bytes(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(map_files.np, "savez_compressed", full)
+    monkeypatch.setattr(map_sink.np, "savez_compressed", full)
     with pytest.raises(SinkError, match="No space left"):
         sink.close()
     assert list(tmp_path.iterdir()) == []

@@ -63,10 +63,14 @@ def test_a_pattern_that_is_not_believed_is_told_of_once_a_contact():
 
 
 class TestStatus:
-    def make(self, columns=200, **settings):
+    @pytest.fixture(autouse=True)
+    def wide(self, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "200")
+
+    def make(self):
         self.now_s = 0.0
         self.stream = Terminal()
-        return StatusSink(self.stream, clock_s=lambda: self.now_s, columns=lambda: columns, **settings)
+        return StatusSink(self.stream, clock_s=lambda: self.now_s)
 
     def shown(self):
         return [line.removesuffix("\x1b[K") for line in self.stream.getvalue().split("\r")[1:]]
@@ -85,11 +89,13 @@ class TestStatus:
             (20, "EMULATED ..."),
             (10, " ..."),
             (4, " .."),
-            (0, ""),
         ],
     )
-    def test_the_line_says_all_of_it_and_on_a_narrow_terminal_fewer_words_and_none_cut(self, columns, line):
-        sink = self.make(columns)
+    def test_the_line_says_all_of_it_and_on_a_narrow_terminal_fewer_words_and_none_cut(
+        self, columns, line, monkeypatch
+    ):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        sink = self.make()
         ticks = iter(range(0, 10**9, 250_000))
         for result in make_results(8, clock_ns=lambda: next(ticks)):
             sink.write(result, RUN)
@@ -163,7 +169,7 @@ class TestStatus:
         self.now_s = 0.0
         leader, follower = os.openpty()
         stream = os.fdopen(follower, "w")
-        sink = StatusSink(stream, clock_s=lambda: self.now_s, columns=lambda: 80)
+        sink = StatusSink(stream, clock_s=lambda: self.now_s)
         sink.write(make_results(1)[0], {})
         os.close(leader)
         self.now_s = 1.0

@@ -10,7 +10,7 @@ from edge.errors import UsageError
 from edge.pipeline.commands import WAITING, Command, Commands
 from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.view.access import grant, is_loopback
-from edge.view.viewers import Viewer, execute
+from edge.view.frames import Viewer, execute
 
 TOKEN = "correct-horse-battery"
 OURS = "127.0.0.1:8077"

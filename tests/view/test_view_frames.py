@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from edge_samples import PERIOD_NS
+from edge_samples import PERIOD_NS, fake_source
 from view_samples import CONTRACT, Press
 
 from edge.perception.event import Event, Note
@@ -18,11 +18,10 @@ from edge.view.frames import (
     TRACE_POINTS,
     TRACE_S,
     Frames,
-    Run,
     RunSnapshot,
+    Viewer,
     hello,
 )
-from edge.view.viewers import Viewer
 
 
 class Clock:
@@ -155,7 +154,9 @@ def test_an_event_between_sampled_results_is_not_lost(heard, clock):
 
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     path = Path(os.fsdecode(b"\xff.mcap"))
-    header, _ = unpack(hello(Run(f"replay:{path}", "replay", "mtsr4", CONTRACT, 6.7, "c0ffee")))
+    source = fake_source()
+    source.name, source.length_s = f"replay:{path}", 6.7
+    header, _ = unpack(hello(source, "mtsr4", CONTRACT))
     assert (header["name"], header["length_s"]) == (r"replay:\xff.mcap", 6.7)
     heard.tell(Event(1, "sink", None, f"recording into {path} stopped"), {})
     assert look(Viewer(), heard, clock)[0][0]["note"] == r"recording into \xff.mcap stopped"

@@ -34,7 +34,7 @@ from browser_samples import (
 from edge_samples import wait_for
 from websockets.sync.client import connect
 
-from edge.view.server import MOST_VIEWERS
+from edge.view.frames import MOST_VIEWERS
 
 __all__ = ["browser", "demo", "folder", "open_page"]
 

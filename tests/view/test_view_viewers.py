@@ -12,10 +12,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from edge.pipeline.result_stream import uncollected
-from edge.view import server
-from edge.view import viewers as attended
+from edge.view import frames, server
+from edge.view.frames import MOST_VIEWERS
 from edge.view.server import TIDY_CONNECTIONS, Connection
-from edge.view.viewers import MOST_VIEWERS
 
 __all__ = ["page"]
 
@@ -41,7 +40,7 @@ def answer(stranger):
 
 
 def test_who_never_reads_costs_little_and_harms_nobody(page, limits):
-    limits(attended, LATE_S=0.1)
+    limits(frames, LATE_S=0.1)
     with page.viewer() as other, page.stranger(HANDSHAKE) as blocked:
         with page.playing():
             shown = [frame(other, "result") for _ in range(30)]
@@ -86,7 +85,7 @@ def test_as_many_are_admitted_as_there_is_room_for(page):
 
 
 def test_behind_a_pause_in_reading_comes_the_newest(page, limits):
-    limits(attended, LATE_S=0.05)
+    limits(frames, LATE_S=0.05)
     with page.viewer(max_queue=2) as viewer, page.playing():
         headers = [frame(viewer, "result")[0]]
         end = page.press.number + 100
