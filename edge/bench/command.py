@@ -2,7 +2,6 @@
 
 import argparse
 import csv
-import itertools
 import json
 import os
 import signal
@@ -12,22 +11,20 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TextIO
+from typing import Any, Final, TextIO, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edge.bench import contenders
+from edge.bench.accuracy import FORCE_RANGE_N, ErrorRow, error_rows, force_floor_percent
+from edge.bench.contenders import Subject
 from edge.bench.provenance import provenance, this_machine, with_head
-from edge.bench.timing import CLASSICAL_FILE, FROZEN_FILE, Subject, chosen, subjects
-from edge.errors import EdgeError, ModelError, UsageError
-from edge.evaluation.classical_methods import CONTACT_LEVEL, fit_gain, fitted_methods
-from edge.evaluation.metrics import volume_mm3
-from edge.evaluation.test_set import FrozenSet, infer_with_intervals, judge, load_frozen_set, mean_error
-from edge.inference.onnx_session import ModelSession
-from firmware_bridge.pad_geometry import USPA44
+from edge.errors import EdgeError, UsageError
+from edge.evaluation.test_set import FrozenSet, load_frozen_set
+from edge.terminal.progress_bar import progress
 
 _FIGURES: Final = {"p50_us": "p50 us", "p99_us": "p99 us", "p999_us": "p99.9 us", "max_us": "max us"}
-FORCE_RANGE_N: Final = 5.0  # force at which every tap of a frozen set ends, unless the sensor's depth limit comes first
+_Thing = TypeVar("_Thing")
 
 
 class BenchError(EdgeError, RuntimeError):
@@ -35,16 +32,17 @@ class BenchError(EdgeError, RuntimeError):
 
 
 class Page:
-    """Page of `lines` that are shown at once and kept."""
+    """Page of `lines` that are shown at once and kept; a progress bar makes room for them."""
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
         self.lines: list[str] = []
         self._out, self._err = out, err
+        self._bar: Any = None
 
     def say(self, text: str) -> None:
         """Show a line, or several, and keep it."""
         self.lines.append(text)
-        print(text, file=self._out, flush=True)
+        self._write(self._out, text)
 
     def row(self, cells: Iterable[str]) -> None:
         """Show a row of the table, and keep it."""
@@ -58,57 +56,21 @@ class Page:
 
     def warn(self, text: str) -> None:
         """Show a line on stderr."""
-        print(f"edge-sr: {text}", file=self._err, flush=True)
+        self._write(self._err, f"edge-sr: {text}")
 
+    def tracked(self, things: Sequence[_Thing], what: str) -> Iterator[_Thing]:
+        """Yield the things, one after the other, with a progress bar."""
+        with progress(what, len(things), "row", stream=self._err) as self._bar:
+            for thing in things:
+                yield thing
+                self._bar.update()
+        self._bar = None
 
-class ErrorRow(NamedTuple):
-    """Errors of a subject that is given its newest taps: the mean of each metric over all frames, and of the force."""
-
-    name: str
-    given: int
-    error: dict[str, float]
-
-
-def error_rows(subject: Subject, frozen: FrozenSet) -> Iterator[ErrorRow]:
-    """Yield the error of a classical method with the newest tap, of a model with one tap and with all it takes.
-
-    Raises:
-        ModelError: the model cannot be used, or was made for another scale than the test set.
-        FrozenSetError: the model takes more taps than the test set has.
-    """
-
-    def row(
-        given: int, patterns: NDArray[np.floating], level: float, half_width_mm: NDArray[np.floating] | None = None
-    ) -> ErrorRow:
-        error = mean_error(judge(patterns, frozen, level, half_width_mm))
-        force_percent = round(force_error_percent(patterns, frozen), 4)
-        return ErrorRow(subject.name, given, error | {"force_percent": force_percent})
-
-    if subject.path is None:
-        method = fitted_methods(CLASSICAL_FILE, frozen.scale)[subject.name]
-        yield row(1, method(frozen.newest.astype(np.float32)), CONTACT_LEVEL)
-        return
-    session = ModelSession(Path(subject.path))
-    contract = session.contract
-    if contract.scale != frozen.scale:
-        raise ModelError(f"{subject.path}: contract key 'scale' is {contract.scale}, the test set's is {frozen.scale}")
-    for given in sorted({1, contract.taps}):
-        patterns, half_width_mm = infer_with_intervals(session, frozen, given)
-        yield row(given, patterns, contract.contact_level, half_width_mm)
-
-
-def force_error_percent(patterns: NDArray[np.floating], frozen: FrozenSet) -> float:
-    """Return the RMS error of the force that patterns (n, H, W) in [mm] sum up to, in [% of FORCE_RANGE_N].
-
-    A pattern's deformation summed over its area becomes newtons by one factor, the same for every subject: the one that
-    brings the true patterns nearest to the true forces, least squares, no offset. It is not fitted to the evaluated
-    patterns: a pattern that is too deep on the whole is an error. Shapes have factors of their own, so true patterns
-    are off too, which is the floor of the error.
-    """
-    pixel_mm = USPA44.pixel_pitch_mm(frozen.scale)
-    newtons_per_mm3 = fit_gain(volume_mm3(frozen.patterns(), pixel_mm), frozen.force_n)
-    error_n = newtons_per_mm3 * volume_mm3(patterns, pixel_mm) - frozen.force_n
-    return 100 * float(np.sqrt(np.mean(np.square(error_n, dtype=np.float64)))) / FORCE_RANGE_N
+    def _write(self, stream: TextIO, text: str) -> None:
+        if self._bar is not None:
+            self._bar.clear()
+        stream.write(text + "\n")
+        stream.flush()
 
 
 def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
@@ -125,8 +87,8 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     except OSError as error:
         where = f"--out {options.out}"
         raise UsageError(f"{where}: cannot be made: {error.strerror}: name a folder to write in") from error
-    frozen = load_frozen_set(FROZEN_FILE)
-    everyone = chosen(subjects(frozen.scale, options.models, page.warn), options.only)
+    frozen = load_frozen_set(contenders.FROZEN_FILE)
+    everyone = contenders.chosen(contenders.subjects(frozen.scale, options.models, page.warn), options.only)
     threads = sorted(set(options.threads))
     # With fewer p99.9 rests on the longest few.
     few = "" if options.ticks >= 3000 else " (fewer than 3000: p99.9 and misses mean little)"
@@ -155,12 +117,12 @@ def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str
     text = (
         f"Frozen test set, means over all frames. Force error is RMS in % of {FORCE_RANGE_N:g} N, of what patterns sum "
         f"up to, by the one factor that suits true patterns best: those themselves are "
-        f"{force_error_percent(frozen.patterns(), frozen):.2f} % off."
+        f"{force_floor_percent(frozen):.2f} % off."
     )
     columns = ("method", "taps given", "PSNR dB", "RMSE %", "SSIM", "global SSIM", "IoU", "edge mm", "covered %")
     page.section("Error", text, (*columns, "force error %"))
     rows: list[ErrorRow] = []
-    for subject in everyone:
+    for subject in page.tracked(everyone, "error"):
         try:
             for row in error_rows(subject, frozen):
                 rows.append(row)
@@ -199,16 +161,16 @@ def _run_times(
     )
     page.section("Run time", text, (*columns, "start-up ms", "MB"))
     window = frozen.windows(1 + frozen.earlier.shape[1])[0].tolist()
-    for count, subject in itertools.product(threads, everyone):
+    for subject, count in page.tracked([(subject, count) for count in threads for subject in everyone], "run times"):
         job = {"subject": subject._asdict(), "threads": count}
         starts = 5 if options.ticks >= 300 else 1
         start_up_ms, resident_mb = start_up(job | {"do": "first", "window": window}, count, starts)
         answer = measured(job | {"do": "time", "rate_hz": options.rate_hz, "ticks": options.ticks}, count)
-        paced = answer["paced"]
-        cells = [cell for times in answer.values() for cell in _percentiles(times)]
+        paced, both = answer["paced"], {"back_to_back": answer["back_to_back"], "paced": answer["paced"]["times"]}
+        cells = [cell for times in both.values() for cell in _percentiles(times)]
         cells += [f"{paced['missed']} of {paced['ticks']}", f"{paced['cpu_percent']:.1f}", f"{start_up_ms:.0f}"]
         page.row((subject.name, str(count), *cells, "-" if resident_mb is None else f"{resident_mb:.0f}"))
-        figures = {f"{how}_{figure}": times[figure] for how, times in answer.items() for figure in _FIGURES}
+        figures = {f"{how}_{figure}": times[figure] for how, times in both.items() for figure in _FIGURES}
         figures |= {"missed": paced["missed"], "cpu_percent": paced["cpu_percent"]}
         about = {"method": subject.name, "threads": count, "start_up_ms": start_up_ms, "resident_mb": resident_mb}
         lines.append(about | figures)
@@ -274,8 +236,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def _write(folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path]) -> None:
-    sources = ("edge/bench/command.py", "edge/bench/timing.py")
-    made = provenance(command, sources, [*models, FROZEN_FILE])
+    sources = ("edge/bench/accuracy.py", "edge/bench/timing.py")
+    made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)
     try:
         with (folder / "bench.csv").open("w", newline="") as file:

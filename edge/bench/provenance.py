@@ -18,6 +18,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -30,52 +31,74 @@ UNKNOWN: Final = "unknown"
 _BLOCK: Final = re.compile(r"^```toml\n(command = .*?)^```\n", re.DOTALL | re.MULTILINE)
 
 
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Provenance of a report: how it was made, and the hash, or UNKNOWN, of each model or set and each source it is of.
+
+    The tree is "clean" or "changed" since the commit, or a note on the origin of its id; the seed is None where each
+    source has its own.
+    """
+
+    command: str
+    date: str
+    commit: str
+    tree: str
+    machine: str
+    seed: int | None
+    models: dict[str, str]
+    sources: dict[str, str]
+
+    def __str__(self) -> str:
+        """Return the block of TOML that stands at the head of the page."""
+        lines = ["```toml"]
+        for key, value in asdict(self).items():
+            if isinstance(value, dict):
+                lines += ["", f"[{key}]", *(f"{json.dumps(path)} = {json.dumps(value[path])}" for path in value)]
+            elif value is not None:
+                lines.append(f"{key} = {json.dumps(value)}")
+        return "\n".join([*lines, "```"])
+
+    def stale(self) -> Iterator[str]:
+        """Yield why the report is stale; nothing where it is fresh."""
+        for name, before in {**self.models, **self.sources}.items():
+            if not (ROOT / name).exists():
+                yield f"{name} is not here"
+            elif before == UNKNOWN:
+                yield f"of {name} no hash was kept"
+            elif file_hash(ROOT / name) != before:
+                yield f"{name} has changed"
+
+
 def provenance(
     command: str, sources: Sequence[str | Path], models: Iterable[Path] = (), seed: int | None = None
-) -> str:
-    """Return the block of TOML at the head of a report; its sources are those by which its figures would change.
-
-    It has the hash of each model or set, and of each source. The tree is "clean" or "changed" since the commit, or
-    UNKNOWN; the seed is left out where each source has its own.
-    """
+) -> Provenance:
+    """Return the head of a report that is being made; its sources are those by which its figures would change."""
     changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!reports")
-    values = {
-        "command": command,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": _git("rev-parse", "--short=10", "HEAD") or UNKNOWN,
-        "tree": UNKNOWN if changes is None else "changed" if changes else "clean",
-        "machine": this_machine(),
-        "seed": seed,
-    }
-    lines = ["```toml", *(f"{key} = {json.dumps(value)}" for key, value in values.items() if value is not None)]
-    for title, paths in (("models", sorted({path.resolve() for path in models})), ("sources", sources)):
-        hashes = {_below_root(ROOT / path): file_hash(ROOT / path) for path in paths}
-        lines += ["", f"[{title}]", *(f"{json.dumps(name)} = {json.dumps(value)}" for name, value in hashes.items())]
-    return "\n".join([*lines, "```"])
+    return Provenance(
+        command=command,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        commit=_git("rev-parse", "--short=10", "HEAD") or UNKNOWN,
+        tree=UNKNOWN if changes is None else "changed" if changes else "clean",
+        machine=this_machine(),
+        seed=seed,
+        models={_below_root(path): file_hash(path) for path in sorted({path.resolve() for path in models})},
+        sources={_below_root(ROOT / source): file_hash(ROOT / source) for source in sources},
+    )
 
 
-def read_provenance(page: str) -> dict[str, Any] | None:
-    """Return what the head of a page states, or None where it has none that can be read."""
+def read_provenance(page: str) -> Provenance | None:
+    """Return the head of a page, or None where it has none that can be read."""
     block = _BLOCK.search(page)
-    try:
-        made = tomllib.loads(block[1]) if block is not None else {}
-    except tomllib.TOMLDecodeError:
+    if block is None:
         return None
-    return made if {"date", "commit", "models", "sources"} <= made.keys() else None
+    try:
+        values: dict[str, Any] = {"seed": None, "models": {}, "sources": {}} | tomllib.loads(block[1])
+        return Provenance(**{field.name: values[field.name] for field in fields(Provenance)})
+    except (tomllib.TOMLDecodeError, KeyError):
+        return None
 
 
-def why_stale(made: dict[str, Any]) -> Iterator[str]:
-    """Yield why a report with this head is stale; nothing where it is fresh."""
-    for name, before in {**made["models"], **made["sources"]}.items():
-        if not (ROOT / name).exists():
-            yield f"{name} is not here"
-        elif before == UNKNOWN:
-            yield f"of {name} no hash was kept"
-        elif file_hash(ROOT / name) != before:
-            yield f"{name} has changed"
-
-
-def with_head(page: str, made: str) -> str:
+def with_head(page: str, made: Provenance) -> str:
     """Return a page with the head below its title."""
     title, _, rest = page.partition("\n")
     return f"{title}\n\n{made}\n{rest}"
@@ -144,8 +167,8 @@ def main(arguments: list[str] | None = None) -> None:
         made = read_provenance(path.read_text(encoding="utf-8"))
         verdict = "no head: make it again with its command"
         if made is not None:
-            why = "; ".join(why_stale(made))
-            verdict = f"stale, of {made['date'][:10]} ({made['commit']}): {why}" if why else f"fresh ({made['commit']})"
+            why = "; ".join(made.stale())
+            verdict = f"stale, of {made.date[:10]} ({made.commit}): {why}" if why else f"fresh ({made.commit})"
         sys.stdout.write(f"{path.relative_to(folder).as_posix()}: {verdict}\n")
 
 

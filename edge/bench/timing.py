@@ -1,92 +1,54 @@
-"""Subjects of a bench, their run times, back to back and at the sensor's rate, and the process that takes them.
+"""Run times, back to back and at the sensor's rate, on an injected clock, and the process that they are measured in.
 
-The process takes one job as JSON on stdin, and writes the result as JSON on stdout.
+It takes one job as JSON on stdin, and writes the result as JSON on stdout.
 """
 
 import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edge.errors import EdgeError, ModelError, UsageError
-from edge.evaluation.classical_methods import fitted_methods
-from edge.inference.bundled import BUNDLE_DIR, bundled_models
-from edge.inference.onnx_session import ModelSession
+from edge.bench.contenders import FROZEN_FILE, Subject, opened
+from edge.errors import EdgeError
 from firmware_bridge.schedule import Clock, Sleep, Ticker
-
-FROZEN_FILE: Final = BUNDLE_DIR / "frozen.npz"
-CLASSICAL_FILE: Final = BUNDLE_DIR / "classical.npz"
-
-Infer = Callable[[NDArray[np.float32]], object]
-"""Inference on a window (K, 3, rows, cols) in zeroed counts, of as many taps as it takes or more."""
-
-
-class Subject(NamedTuple):
-    """Method or model that can be measured: the path of a model, or the scale of a method without a network."""
-
-    name: str
-    path: str | None = None
-    scale: int = 10
-
-
-def subjects(scale: int, folder: Path | None, refused: Callable[[str], object]) -> list[Subject]:
-    """Return the methods without a network, the bundled models, and the user's own in a folder, named FOLDER/NAME.
-
-    `refused` gets a line for each file in it that is no usable model; `scale` is that of the test set. Raises
-    UsageError where there is no such folder, or no .onnx in it.
-    """
-    everyone = [Subject(name, None, scale) for name in fitted_methods(CLASSICAL_FILE, scale)]
-    everyone += [Subject(path.stem, str(path)) for path in bundled_models()]
-    if folder is None:
-        return everyone
-    if not folder.is_dir():
-        raise UsageError(f"--models {folder}: not a folder: name the one that holds your .onnx files")
-    paths = sorted(folder.glob("*.onnx"))
-    if not paths:
-        raise UsageError(f"--models {folder}: holds no .onnx file: export one with 'python -m export.to_onnx'")
-    for path in paths:
-        try:
-            ModelSession(path)
-        except ModelError as error:
-            refused(f"left out: {' '.join(str(error).split())}")
-        else:
-            everyone.append(Subject(f"{folder.resolve().name}/{path.stem}", str(path.resolve())))
-    return everyone
-
-
-def chosen(everyone: list[Subject], names: list[str] | None) -> list[Subject]:
-    """Return the subjects of these names, or all if there are no names; raises UsageError for an unknown one."""
-    if names is None:
-        return everyone
-    known = {subject.name for subject in everyone}
-    for name in names:
-        if name not in known:
-            raise UsageError(f"--only {name}: not one of {', '.join(sorted(known))}")
-    return [subject for subject in everyone if subject.name in names]
-
-
-def opened(subject: Subject, threads: int) -> Infer:
-    """Return the subject ready to run."""
-    if subject.path is None:
-        method = fitted_methods(CLASSICAL_FILE, subject.scale)[subject.name]
-        return lambda window: method(window[None, 0])
-    model = ModelSession(Path(subject.path), threads)
-    taps, scale_window = model.contract.taps, model.contract.scale_window
-    return lambda window: model.run(scale_window(window[:taps]))
-
 
 Run = Callable[[int], object]  # one inference; its argument is a number that selects the input
 
 
-def summary(took_ns: Sequence[int]) -> dict[str, Any]:
-    """Return how many run times in [ns] there are, and their percentiles in [us]."""
-    percentiles_us = np.percentile(np.asarray(took_ns, dtype=np.float64) / 1e3, [50, 99, 99.9, 100]).tolist()
-    return {"runs": len(took_ns)} | dict(zip(("p50_us", "p99_us", "p999_us", "max_us"), percentiles_us, strict=True))
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Percentiles of run times in [us]; of fewer than 1000 runs `p999_us` is the longest."""
+
+    runs: int
+    p50_us: float
+    p99_us: float
+    p999_us: float
+    max_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Run times at a rate; missed are ticks whose run was not done, or not begun, when the next was due.
+
+    The CPU is of the whole process, in [% of one core].
+    """
+
+    times: Times
+    ticks: int
+    missed: int
+    cpu_percent: float
+
+
+def summary(took_ns: Sequence[int]) -> Times:
+    """Return the percentiles of run times in [ns]."""
+    took_us = np.asarray(took_ns, dtype=np.float64) / 1e3
+    p50, p99, p999 = np.percentile(took_us, [50, 99, 99.9])
+    return Times(len(took_us), float(p50), float(p99), float(p999), float(took_us.max()))
 
 
 def _timed(run: Run, numbers: Sequence[int], clock: Clock) -> list[int]:
@@ -99,7 +61,7 @@ def _timed(run: Run, numbers: Sequence[int], clock: Clock) -> list[int]:
     return took_ns
 
 
-def back_to_back(run: Run, most_runs: int, clock: Clock = time.perf_counter_ns) -> dict[str, Any]:
+def back_to_back(run: Run, most_runs: int, clock: Clock = time.perf_counter_ns) -> Times:
     """Time as many runs as fit into two seconds, 90 at least and `most_runs` at most, one right after the other."""
     estimate_ns = max(1, min(_timed(run, range(5), clock)))
     runs = min(most_runs, max(90, 2_000_000_000 // estimate_ns))
@@ -113,12 +75,8 @@ def paced(
     clock: Clock = time.monotonic_ns,
     sleep: Sleep = time.sleep,
     cpu_clock: Clock = time.process_time_ns,
-) -> dict[str, Any]:
-    """Time one run at each tick from 1 on, idle between; ticks that pass during a longer run have none.
-
-    Missed are ticks whose run was not done, or not begun, when the next was due; the CPU is of the whole process, in [%
-    of one core].
-    """
+) -> Pace:
+    """Time one run at each tick from 1 on, idle between; ticks that pass during a longer run have none."""
     took_ns: list[int] = []
     in_time = 0
     cpu_before_ns, before_ns = cpu_clock(), clock()
@@ -133,7 +91,7 @@ def paced(
         tick = ticker.wait()
     wall_ns = clock() - before_ns
     cpu_percent = 100 * (cpu_clock() - cpu_before_ns) / wall_ns
-    return summary(took_ns) | {"ticks": ticks, "missed": ticks - in_time, "cpu_percent": cpu_percent}
+    return Pace(summary(took_ns), ticks, ticks - in_time, cpu_percent)
 
 
 def main() -> int:
@@ -169,7 +127,7 @@ def _time(subject: dict[str, Any], threads: int, rate_hz: float, ticks: int) -> 
     def run(number: int) -> object:
         return infer(windows[number % len(windows)])
 
-    return {"back_to_back": back_to_back(run, ticks), "paced": paced(run, rate_hz, ticks)}
+    return {"back_to_back": asdict(back_to_back(run, ticks)), "paced": asdict(paced(run, rate_hz, ticks))}
 
 
 JOBS: Final = {"first": _first, "time": _time}

@@ -202,9 +202,9 @@ def run(
         with ThreadPoolExecutor(1) as apart:
             opening = apart.submit(source.open)  # its links open while the model loads
             model = load_model(name, stop=stop)
-        opening.result()
         with (
             _open_view(options, model.contract, commands) as view,
+            contextlib.nullcontext(opening.result()),  # a port of the page that is taken is reported before a lost link
             _summary(statistics, source),
             contextlib.closing(source),
             contextlib.ExitStack() as closing,

@@ -55,9 +55,9 @@ def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, mi
     clock = Clock()
     run, numbers = clock.work(*took_ms)
     found = pace(clock, run, ticks)
-    assert (numbers, found["missed"], found["ticks"], found["runs"]) == ([*done], missed, ticks, len(numbers))
-    assert found["cpu_percent"] == pytest.approx(25)
-    assert found["max_us"] == 1e3 * max(took_ms)
+    assert (numbers, found.missed, found.ticks, found.times.runs) == ([*done], missed, ticks, len(numbers))
+    assert found.cpu_percent == pytest.approx(25)
+    assert found.times.max_us == 1e3 * max(took_ms)
 
 
 def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
@@ -71,7 +71,8 @@ def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
         return clock.now_ns
 
     found = paced(run, 100.0, 10, stalls, clock.sleep, cpu_clock=lambda: 0)
-    assert (found["runs"], found["missed"], numbers) == (1, 10, [10])
+    assert (found.times.runs, numbers) == (1, [10])
+    assert found.missed == 10
 
 
 @pytest.mark.parametrize(
@@ -81,7 +82,8 @@ def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
     clock = Clock()
     run, _ = clock.work(took_ms)
     found = back_to_back(run, most, clock)
-    assert (found["runs"], found["p50_us"]) == (runs, pytest.approx(took_ms * 1000))
+    assert found.runs == runs
+    assert found.p50_us == took_ms * 1000
 
 
 def test_the_front_is_who_is_not_beaten():
@@ -116,6 +118,12 @@ def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
     weather = np.random.default_rng(3).uniform(1, 3, 30)
     paired = ratio_of(2 * weather, weather)
     assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2)) and str(paired) == "2 (2..2)"
+
+
+def test_an_interval_holds_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(4)
+    found = [ratio_of(rng.normal(12, 1, 30), rng.normal(10, 1, 30)) for _ in range(60)]
+    assert 50 <= sum(one.low <= 1.2 <= one.high for one in found) < 60
 
 
 def test_the_cost_of_the_program_is_a_line_for_rest_and_contact_of_each_tree(limits, capsys):
