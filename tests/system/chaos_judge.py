@@ -41,8 +41,8 @@ def telling(number: int, *, touched: bool) -> NDArray[np.int64]:
 
 
 UNUSED_NS: Final = 15_000_000_000
-"""Time after which an adapter that is back must have been used, in [ns]: links look for theirs every two seconds, a
-machine that is too slow for the sensors took six, and one that came back just before the end need not have been used."""
+"""Time after which an adapter that is back must have been used, in [ns]: links look for theirs every two seconds, and a
+machine that was too slow for its sensors took six. One that came back just before the end need not have been used."""
 
 
 class Judge:
