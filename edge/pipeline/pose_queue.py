@@ -51,8 +51,8 @@ def pose_of_fields(fields: Mapping[str, Any], now_ns: int) -> TimedPose:
     numbers = {"x_mm": None, "y_mm": None, "turn_deg": 0.0} | errors
     known = {"cmd": "pose", **numbers, "sensor": None, "time_ns": now_ns, "holds": False}
     given = {**known, **fields}
-    for name in given.keys() - known.keys():
-        raise PoseError("unknown", f"it has {_shown(name)}, expected some of {', '.join(known)}")
+    if unknown := sorted(map(str, given.keys() - known.keys())):
+        raise PoseError("unknown", f"it has {_shown(unknown[0])}, expected some of {', '.join(known)}")
     values: dict[str, Any] = {name: as_float(given[name]) for name in numbers}
     sensor, time_ns, holds = given["sensor"], given["time_ns"], given["holds"]
     is_name = sensor is None or (isinstance(sensor, str) and is_sensor_name(sensor))

@@ -41,8 +41,8 @@ MOST_SILENT_OPENINGS: Final = 10
 """Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
 MOST_LATE_STAMPS: Final = 4
 """Lines lost to stamps that are no milliseconds of a minute, after which stamps of this adapter are switched off."""
-FRAMES_A_LATE_STAMP: Final = 250
-"""Frames for each of those lines beyond which they are no evidence on the adapter's clock, but flipped digits."""
+LATE_STAMPS_FRAMES: Final = 1000
+"""Frames within which those lines must come: an occasional flipped digit is no evidence on the adapter's clock."""
 
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
@@ -159,7 +159,7 @@ class SlcanSerialLink(Link):
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
-        self._late_stamps_before = 0
+        self._late_stamps_from = (0, 0)
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = {"received_bytes": 0, "dropped_bytes": 0}
         self._unread = Unread()
@@ -176,6 +176,7 @@ class SlcanSerialLink(Link):
             self._start(self._serial)
         except _PORT_ERRORS as error:
             self._serial.close()
+            self._serial = self._reader = None  # its descriptor may soon be another file's
             raise DeviceError(f"{self.port}: does not take commands: {error}") from error
         self._questions.reopened()
         return self
@@ -215,8 +216,10 @@ class SlcanSerialLink(Link):
                     os.write(self._serial.fileno(), STATUS_FLAGS)
         silence = not scans and self._questions.answered_in_silence
         self.trouble = decoder.status.trouble(decoder.frames, flags_of_a_silence=silence)
-        late, frames = decoder.late_stamps - self._late_stamps_before, decoder.frames - self._frames_at_opening
-        no_stamps = late >= MOST_LATE_STAMPS and frames < late * FRAMES_A_LATE_STAMP
+        late_before, frames_before = self._late_stamps_from
+        no_stamps = decoder.late_stamps - late_before >= MOST_LATE_STAMPS
+        if decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
+            self._late_stamps_from = decoder.late_stamps, decoder.frames
         if self._stamps_on and (no_stamps or self._scans.clock.dropped):
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
@@ -268,7 +271,7 @@ class SlcanSerialLink(Link):
         frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_before = self._scans.decoder.late_stamps
+        self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M)))
         self._reader = PortReader(port.fileno())

@@ -89,7 +89,7 @@ def test_stamps_that_are_no_clock_are_left_out(text, limits):
 
 def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(limits):
     limits(slcan_status, ADAPTER_ASKED_NS=10**12)
-    limits(slcan_serial, FRAMES_A_LATE_STAMP=15)
+    limits(slcan_serial, LATE_STAMPS_FRAMES=20)
     with SilentDevice() as device:
         link, begun_s = SlcanSerialLink(device.port), time.monotonic()
 

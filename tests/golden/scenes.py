@@ -222,7 +222,7 @@ class Adapter(SlcanAdapter):
 
     def __init__(self, *, stamped: bool, faulty: bool) -> None:
         super().__init__()
-        self._stamped, self._faulty, self._frames = stamped, faulty, 0
+        self._stamped, self._faulty, self._frames, self._held = stamped, faulty, 0, b""
 
     def feed(self, data: bytes) -> bytes:
         return super().feed(data if self._stamped else data.replace(b"Z1", b"Z?"))
@@ -231,6 +231,9 @@ class Adapter(SlcanAdapter):
         number, place = divmod(self._frames, 16)
         self._frames += 1
         line = super().encode(frame, time_s)
+        if not self._stamped:  # a scan at once, since arrivals are its times: a machine that stalls would tear it
+            self._held = line if place == 0 else self._held + line
+            return self._held if place == 15 else b""
         if self._faulty and number % 15 == 9:
             return b"garbage\r" * (place == 0) + line + b"t0048zz\r" * (place == 15)
         return b"" if self._faulty and number % 15 == 7 and place == 5 else line
@@ -245,9 +248,8 @@ def over_slcan(folder: Path, *, stamped: bool = True, faulty: bool = False) -> O
         command = [*EDGE_SR, "--source", f"slcan:{port}", "--duration-s", "4", *MODEL, *RECORDS]
         ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment())
     scans = [record for record in map(json.loads, ran.stdout.splitlines()) if record["state"] != "event"]
-    if not stamped:  # how many cycles wait for their pace to show, or are torn, depends on when they were sent and read
-        whole = sum(one["fresh"] == 0xFFFF for one in scans)
-        return {"exit": ran.returncode, "enough": whole > 20, "torn": 10 * (len(scans) - whole) > len(scans)}
+    if not stamped:  # how many cycles wait for their pace to show depends on when they were read
+        return {"exit": ran.returncode, "fresh": sorted({one["fresh"] for one in scans}), "enough": len(scans) > 20}
     kept = [{"scan": one["scan"], "counts": brief(one["counts"])} for one in scans if one["scan"] % 15 == 0]
     return {"exit": ran.returncode, "fresh": [one["fresh"] for one in scans], "records": kept}
 

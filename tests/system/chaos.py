@@ -139,6 +139,9 @@ class Chaos:
             reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
             reader.start()
             self._follow(lines, process, seconds)
+            end_s = time.monotonic() + END_TIMEOUT_S
+            while any(self.run.judge.back_ns.values()) and process.poll() is None and time.monotonic() < end_s:
+                self._judge(lines, QUIET_S)  # each adapter that is back is to be used, however slow this machine is
             self._end_s = 0.0  # the sensors are switched off, so that the accounts close
             records = -1
             while records != (records := self.run.judge.records.total()):  # a busy program is behind

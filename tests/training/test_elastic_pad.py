@@ -47,8 +47,8 @@ def test_closed_forms_and_boundary_conditions_agree(poisson, thickness_mm):
     layer, q = Layer(thickness_mm, 0.12, poisson), WAVES / thickness_mm
     compliance, (down, sideways) = surface_compliance(layer, q), inner_displacement(layer, q, thickness_mm)
     assert np.isfinite(compliance).all() and (compliance > 0).all() and np.isfinite(sideways).all()
-    # Near nu = 0.5 the long waves' compliance is a small difference of large numbers: 4e-6 is what doubles leave.
-    assert np.allclose(down, compliance, rtol=1e-5, atol=1e-12)
+    # Near nu = 0.5 the long waves' compliance is a small difference of large numbers.
+    assert np.allclose(down, compliance, rtol=5e-7, atol=1e-12)
     along, across = surface_tangential_compliance(layer, q)
     top, board = (inner_tangential(layer, q, height_mm) for height_mm in (thickness_mm, 0.0))
     assert np.allclose(top.along[:-1], along[:-1], rtol=1e-9) and np.allclose(top.across, across, rtol=1e-12)

@@ -129,5 +129,6 @@ def test_taxels_covary_as_their_readings_do(presses):
     # The press is mostly in z, since some are dragged, and of one strength in all of them.
     traces = np.trace(covariances, axis1=1, axis2=2)
     np.testing.assert_allclose(traces, 48, rtol=0.01)
-    assert (np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) / traces).mean() > 0.6
+    in_z = np.trace(covariances[:, 32:, 32:], axis1=1, axis2=2) / traces
+    assert in_z.min() > 0.38 and in_z.mean() > 0.6
     np.testing.assert_array_equal(covariances, fit_taxels(presses, windows=400)["covariances"])

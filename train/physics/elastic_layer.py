@@ -47,6 +47,9 @@ class Layer:
 Array = NDArray[np.float64]
 
 
+_LONGEST: Final = 1e-8  # q h below which a closed form is its limit: exact to a^2 / (1 - 2 nu)
+
+
 def surface_compliance(layer: Layer, q_per_mm: Array) -> Array:
     """Return the surface displacement per pressure, u_z(q) = (1-nu)/(G q) S(qh), in [mm/MPa], positive downwards.
 
@@ -54,13 +57,9 @@ def surface_compliance(layer: Layer, q_per_mm: Array) -> Array:
     u = p h (1-2nu) / (2 G (1-nu)).
     """
     nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
-    a = q_per_mm * thickness
+    a = np.maximum(q_per_mm * thickness, _LONGEST)
     numerator, denominator = _closed_form(nu, a, -1)
-    flat = thickness * (1 - 2 * nu) / (2 * shear * (1 - nu))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        wave = (1 - nu) / (shear * q_per_mm) * numerator / denominator
-    # Below a = 1e-4 the numerator is a difference of equal numbers; the limit is exact to a^2.
-    return np.where(a < 1e-4, flat, wave)
+    return (1 - nu) * thickness / (shear * a) * numerator / denominator
 
 
 def surface_tangential_compliance(layer: Layer, q_per_mm: Array) -> tuple[Array, Array]:
@@ -70,7 +69,7 @@ def surface_tangential_compliance(layer: Layer, q_per_mm: Array) -> tuple[Array,
     at q = 0.
     """
     nu, shear, thickness = layer.poisson, layer.shear_modulus_mpa, layer.thickness_mm
-    a = np.maximum(q_per_mm * thickness, 1e-8)  # both are constant here: the limit is exact to a^2
+    a = np.maximum(q_per_mm * thickness, _LONGEST)
     numerator, denominator = _closed_form(nu, a, 1)
     along = (1 - nu) * thickness / (shear * a) * numerator / denominator
     return along, thickness / shear * np.tanh(a) / a
@@ -119,7 +118,7 @@ def inner_tangential(layer: Layer, q_per_mm: Array, height_mm: float) -> Tangent
     """Return the displacement at a height inside the layer per tangential traction on its surface."""
     shear, thickness = layer.shear_modulus_mpa, layer.thickness_mm
     up, along = _inside(layer, q_per_mm, height_mm, normal_mpa=0.0, shear_mpa=1.0)
-    q = np.maximum(q_per_mm, 1e-8 / thickness)
+    q = np.maximum(q_per_mm, _LONGEST / thickness)
     # sinh(qz) / (G q cosh(qh)), with decaying exponentials alone.
     rise = np.exp(-q * (thickness - height_mm)) * -np.expm1(-2 * q * height_mm)
     return TangentialResponse(along, rise / (shear * q * (1 + np.exp(-2 * q * thickness))), up)
@@ -133,7 +132,8 @@ def _inside(
     Each wave solves four boundary conditions: no displacement on the board, and on top sigma_zz = normal exp(i q x) and
     sigma_xz = shear i exp(i q x).
     """
-    q = np.maximum(q_per_mm.ravel(), 1e-6 / layer.thickness_mm)
+    # Longer waves differ from their limit by less than the equations of nearly equal exponentials leave.
+    q = np.maximum(q_per_mm.ravel(), 1e-5 / layer.thickness_mm)
     top, bottom, inside = (_waves(layer, q, z_mm) for z_mm in (layer.thickness_mm, 0.0, height_mm))
     lame = 2 * layer.shear_modulus_mpa * layer.poisson / (1 - 2 * layer.poisson)
     normal = lame * (top.slope_w - q[:, None] * top.u) + 2 * layer.shear_modulus_mpa * top.slope_w
