@@ -108,6 +108,11 @@ class Contract:
         return 2 * len(self.pad_inputs) + self.takes_gains
 
     @property
+    def nominal_counts_per_newton(self) -> float | None:
+        """Summed z per [N] in the middle of the training's pads; None if the model does not take it."""
+        return next((middle for name, middle, _ in self.pad_inputs if name == "counts_per_newton"), None)
+
+    @property
     def traction_shape(self) -> tuple[int, int, int] | None:
         """Shape (3, h, w) of the traction x, y, z; None if the model gives none."""
         scale = self.traction_scale

@@ -265,6 +265,7 @@ def hello(source: Source, model: str, contract: Contract) -> bytes:
         "cols": contract.cols,
         "height": height,
         "width": width,
+        "nominal_counts_per_newton": contract.nominal_counts_per_newton,
         "wrench": contract.traction_scale is not None,
         "checks": bool(contract.trust),
         "length_s": source.length_s,

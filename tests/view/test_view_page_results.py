@@ -55,9 +55,14 @@ def test_force_and_torque_are_told_and_drawn(open_page):
     contract = make_pad_contract(interval_factor=1.6)
     wrench = Wrench((0.3, 0.0, 0.4), (-0.94, 0.94, -1.25), (-2.35, -2.35))
     made = replace(Press(contract=contract).next(), wrench=wrench)
-    with live_page(contract=contract) as shown, shown.playing(lambda: made):
+    shows = [made]
+    with live_page(contract=contract) as shown, shown.playing(lambda: shows[0]):
         page = open_page(shown.view.url)
         live(page)
+        newtons = made.force_counts / contract.nominal_counts_per_newton
+        playwright.expect(part(page, "force-now")).to_have_text(f"{newtons:.2f}\u202fN nominal")
+        shows[0] = replace(made, force_n=3.0)
+        playwright.expect(part(page, "force-now")).to_have_text("3.00\u202fN")
         for name, text in {
             "wrench_force": r"0\.30, 0\.00, 0\.40\sN",
             "wrench_torque": r"\u22120\.9, 0\.9\sN\smm",

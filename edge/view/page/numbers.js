@@ -66,7 +66,7 @@ function trustText({ state, trusted, untrusted_reason: reason }) {
  */
 const NUMBERS = {
   Contact: [
-    ["force", "force", "Force into the pad: z of all taxels over the baseline, in counts; in newtons where the sensor's counts per newton are known.",
+    ["force", "force", "Force into the pad: z of all taxels over the baseline. Nominal is by the average sensor's counts per newton, until the doctor has weighed this one.",
       ({ sensor }) => sensor.part["force-now"].textContent],
     ["area", "area", "Area of the touched pixels: those near enough to the pattern's largest value, by the model's own share.",
       ({ sensor }) => sensor.part["area-now"].textContent],

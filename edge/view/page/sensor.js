@@ -163,6 +163,15 @@ class Sensor {
     return page.hello.checks ? `${TOO_LIGHT} whether the pattern is to be believed` : "not checked: the model has no checks";
   }
 
+  /** Return whether forces are shown in newtons: by this sensor's own counts per newton, or by nominal ones. */
+  inNewtons() { return known(this.result?.force_n) || known(page.hello.nominal_counts_per_newton); }
+
+  forceText() {
+    const own = this.result?.force_n;
+    if (!this.inNewtons()) return amount(this.result?.force_counts, 0, "counts");
+    return known(own) ? amount(own, 2, "N") : `${amount(nominal(this.result?.force_counts), 2, "N")} nominal`;
+  }
+
   ellipse() { return this.pattern === null ? null : contactEllipse(this.pattern, page.hello.pixel_pitch_mm, page.hello.contact_level); }
 
   word() {
@@ -307,15 +316,15 @@ class Sensor {
   }
 
   paintTraces() {
-    const newtons = known(this.result?.force_n);
+    const newtons = this.inNewtons();
     const span = page.spanS;
     say(this.part.span, `last ${span}${THIN}s`);
-    paintTrace(this.part["force-plot"], this.trace, newtons ? "force_n" : "force_counts", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
+    paintTrace(this.part["force-plot"], this.trace, "force", span, newtons ? 1 : 1000, colour("force"), newtons ? "N" : "counts");
     if (page.shear && page.hello.wrench) paintTrace(this.part["area-plot"], this.trace, "shear_ratio", span, 0.5, colour("area"), "shear / force");
     else paintTrace(this.part["area-plot"], this.trace, "area_mm2", span, 50, colour("area"), "mm\u00b2");
     show(this.part.shear_toggle, page.hello.wrench);
     this.part.shear_toggle.setAttribute("aria-pressed", String(page.shear));
-    say(this.part["force-now"], newtons ? amount(this.result.force_n, 2, "N") : amount(this.result?.force_counts, 0, "counts"));
+    say(this.part["force-now"], this.forceText());
     say(this.part["area-now"], amount(this.made()?.area_mm2, 0, "mm\u00b2"));
   }
 

@@ -4,11 +4,14 @@ const STEP_S = 0.01; // closer scans share a point, which keeps the larger value
 const GAP_S = 0.3;
 const POINTS = 66 / STEP_S; // the longest span, and some more for a trace that is held
 
+/** Return the force of counts in newtons by the nominal sensitivity; as counts where the model states none. */
+const nominal = (counts) => (known(counts) ? counts / (page.hello.nominal_counts_per_newton ?? 1) : null);
+
 /** Ring buffer of the last minute of force, area and shear. */
 class Trace {
   constructor() {
     this.time = new Float64Array(POINTS);
-    this.series = { force_counts: new Float32Array(POINTS), area_mm2: new Float32Array(POINTS), force_n: new Float32Array(POINTS), shear_ratio: new Float32Array(POINTS) };
+    this.series = { force: new Float32Array(POINTS), area_mm2: new Float32Array(POINTS), shear_ratio: new Float32Array(POINTS) };
     this.next = this.count = 0;
     this.newestS = -Infinity;
     this.heldS = null;
@@ -20,10 +23,11 @@ class Trace {
   get endS() { return this.heldS ?? this.newestS; }
 
   add(points) {
-    for (const [atS, ...values] of points) {
+    for (const [atS, forceCounts, areaMm2, forceN, shearRatio] of points) {
       if (atS < this.newestS || (this.heldS !== null && atS <= this.heldS)) continue; // a new connection gets the last minute again
       const same = this.count > 0 && this.newestS !== this.heldS && atS - this.newestS < 0.5 * STEP_S;
       const place = same ? (this.next + POINTS - 1) % POINTS : this.next;
+      const values = [forceN ?? nominal(forceCounts), areaMm2, shearRatio];
       Object.values(this.series).forEach((series, which) => {
         const value = values[which] ?? NaN;
         series[place] = same && !(value > series[place]) && !Number.isNaN(series[place]) ? series[place] : value;
