@@ -262,6 +262,7 @@ Of a recording it takes the scans during which the pad is still and pressed leas
                     "--drift-s T", positive, "seconds to measure the free, still pad (default %(default)g)", default=60
                 ),
                 Option("--no-press", bool, "skip the presses on the corners"),
+                Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
                 Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
             ),
             Group(
@@ -280,6 +281,7 @@ Keep the pad still, with nothing touching it, until you are asked to press its c
 orientation in which patterns are to be drawn: it defines top and left.
 
 examples:
+  edge-sr doctor --rehearse
   edge-sr doctor
   edge-sr doctor --out sensor.toml
   edge-sr doctor --weight-g 200 \\

@@ -10,12 +10,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TextIO
 
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
+from edge.doctor.rehearsal import WATCHED_S, Rehearsal
 from edge.doctor.taxel_checks import Finding, Verdict
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
@@ -27,6 +29,7 @@ from firmware_bridge import in_place
 from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
@@ -54,20 +57,26 @@ class Visit:
     """
 
     def __init__(
-        self, options: argparse.Namespace, reader: LinkReader, known: SensorFile, err: TextIO, stop: threading.Event
+        self,
+        options: argparse.Namespace,
+        reader: LinkReader,
+        known: SensorFile,
+        err: TextIO,
+        stop: threading.Event,
+        rehearsal: Rehearsal | None,
     ) -> None:
-        """Prepare the visit; requests to a person go to `err`."""
+        """Prepare the visit; requests to a person, or to a `rehearsal`, go to `err`."""
         self.mountings: dict[str, Mounting] = {}
         self.newtons: dict[str, float] = {}
         self.unfinished = False
         self._options, self._reader, self._known = options, reader, known
         self._link = reader.link
-        self._err, self._stop = err, stop
+        self._err, self._stop, self._rehearsal = err, stop, rehearsal
         self._rewritable = rewritable(err)
 
     def watch(self, watched: Watched) -> None:
         """Watch the link while the pads are free; raises LinkLostError."""
-        length_s = self._options.drift_s
+        length_s = self._options.drift_s if self._rehearsal is None else WATCHED_S
         self._say(f"{self._link.name}: watching for {length_s:g} s; keep the pad free and still")
         with progress("watching", length_s, "s", stream=self._err) as bar:
 
@@ -107,7 +116,7 @@ class Visit:
         """Lead a person through a dialogue about one sensor."""
         baseline, mounting = examined.baselines[name], self._known.mountings.get(name)
         if not (self._stop.is_set() or self._link.ended):
-            self._say(whose + guide.first)
+            self._ask(whose, guide.first)
         received_s = asked_s = time.monotonic()
         enter_pressed()  # one of before is no answer to this request
         while not (guide.done or self._stop.is_set() or self._link.ended):
@@ -123,10 +132,15 @@ class Visit:
             if enter_pressed():
                 requests.append(guide.skip())
             for request in filter(None, requests):
-                self._say(whose + request)
+                self._ask(whose, request)
                 asked_s = time.monotonic()
             self._show_load(guide.felt, asked_s + PATIENCE_S - time.monotonic())
         self._rewrite("")
+
+    def _ask(self, whose: str, request: str) -> None:
+        self._say(whose + request)
+        if self._rehearsal is not None:
+            self._rehearsal.answer(request)
 
     def _show_load(self, felt: float, left_s: float) -> None:
         """Show the load, as a share of that of a press, in a line that is rewritten in place."""
@@ -140,6 +154,8 @@ class Visit:
             self._err.flush()
 
     def _why_no_press(self) -> str | None:
+        if self._rehearsal is not None:
+            return None
         if self._options.no_press:
             return "leave out --no-press to measure order and axes"
         if self._link.kind == "replay":
@@ -169,13 +185,16 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     if options.out is not None:
         check_writable(options.out, known)
     before = stored_baselines(options.baseline, known)
-    with stop_on_signals() as stop:
-        reader, known, watched = prepare(options.source, known, before, options.rate_hz)
+    if options.rehearse and (options.source or known.model_map.geometry != USPA44):
+        raise UsageError("--rehearse brings its own sensor, a uSPa44: leave --source and other pads out")
+    with stop_on_signals() as stop, Rehearsal(options.weight_g) if options.rehearse else nullcontext() as rehearsal:
+        sources = options.source if rehearsal is None else [f"slcan:{rehearsal.port}"]
+        reader, known, watched = prepare(sources, known, before, options.rate_hz)
         link = reader.link
         emulated = "emulated" in (link.kind, link.origin)
         if options.out is not None and emulated:
             refuse_device(options.out, known)
-        visit = Visit(options, reader, known, err, stop)
+        visit = Visit(options, reader, known, err, stop, rehearsal)
         start_s = time.monotonic()
         failed: BridgeError | None = None
         whole = False

@@ -179,6 +179,19 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     assert settled["taxel order"] == settled["axis signs"] == settled["load"] == "ok"
 
 
+def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
+    file, out, err = tmp_path / "practice.toml", io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = cli.main(["doctor", "--rehearse", "--weight-g", "200", "--out", str(file), "--json"])
+    found = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
+    assert code == 0 and found["taxel order"] == found["axis signs"] == found["force"] == "ok", out.getvalue()
+    assert err.getvalue().count("Still pressing") == 4 and "Lay 200 g" in err.getvalue()
+    (entry,) = load_sensor_file(file).sensors.values()
+    assert {"mounting", "force", "baseline"} <= entry.emulated
+    assert entry.counts_per_newton == pytest.approx(1176, rel=0.02)
+    assert cli.main(["doctor", "--rehearse", "--source", "demo"]) == 2
+
+
 def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong():
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
     with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:

@@ -1,0 +1,63 @@
+"""Rehearsal of the doctor without a sensor: an emulated pad that is pressed as each request asks, a second later."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge.doctor.guided_press import CORNERS
+from firmware_bridge.emulation.slcan_emulator import Emulator
+from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.recording.tracks import Recording, Track
+
+WATCHED_S: Final = 5.0  # for which the free pad is watched
+_LATE_S: Final = 1.0  # from a request to what a person does
+_PRESS_COUNTS: Final = 5000.0  # summed z of a press
+_COUNTS_PER_N: Final = 1176.0  # of the average sensor
+_NOISE_COUNTS: Final = 2.0
+_RATE_HZ: Final = 100.0
+
+
+class Rehearsal(Emulator):
+    """Emulated adapter on `port`, with a pad that does what is asked: no reading of it is taken for a device's."""
+
+    def __init__(self, weight_g: float | None) -> None:
+        """Prepare a pad on which a weight in [g] may be laid."""
+        self._newtons = 0.0 if weight_g is None else weight_g / 1000 * 9.80665
+        self._load = self._next = np.zeros(USPA44.scan_shape)
+        self._next_s = 0.0
+        rest = np.array([32_700, 32_800, 37_400])[:, None, None] + 37 * np.arange(16).reshape(4, 4)
+        free = Recording(Path("rehearsal"), (Track("4", rest[None].astype(np.int32), None),), _RATE_HZ)
+        super().__init__([free], played=self._scans)
+
+    def answer(self, request: str) -> None:
+        """Do what a request of the guided press asks of a person."""
+        load = np.zeros(USPA44.scan_shape)
+        corner = next((name for name in CORNERS if name in request), None)
+        if corner is not None:
+            row, col = (0.3 if side in corner else 2.7 for side in ("top", "left"))  # a little inside of it
+            load[2] = _PRESS_COUNTS * _pressed(row, col)
+        elif request.startswith("Still pressing"):
+            z = self._next[2]
+            row, col = np.unravel_index(z.argmax(), z.shape)
+            load[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
+        elif request.startswith("Lay"):
+            load[2] = self._newtons * _COUNTS_PER_N * _pressed(1.5, 1.5)
+        self._next_s, self._next = time.monotonic() + _LATE_S, load
+
+    def _scans(self, track: Track) -> Iterator[NDArray[np.int32]]:
+        noise = np.random.default_rng(0)
+        while True:
+            self._load = self._next if time.monotonic() >= self._next_s else self._load
+            reading = track.counts[0] + self._load + noise.normal(0, _NOISE_COUNTS, USPA44.scan_shape)
+            yield np.rint(reading).astype(np.int32)
+
+
+def _pressed(row: float, col: float) -> NDArray[np.float64]:
+    """Return each taxel's share (4, 4) of a press at a place of the grid; a finger is wider than a taxel."""
+    rows, cols = np.indices((USPA44.rows, USPA44.cols))
+    press = np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / 1.5)
+    return press / press.sum()
