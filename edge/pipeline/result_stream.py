@@ -263,7 +263,26 @@ class Stream(Loop):
         super().close()
 
 
-def paired(results: Iterable[Result], sensors: Sequence[str], *, apart_s: float = 0.02) -> Iterator[tuple[Result, ...]]:
+class Together(tuple[Result, ...]):
+    """Results of several sensors that belong together in time."""
+
+    @property
+    def imbalance(self) -> float | None:
+        """Difference of force between the first of two pads and the second, over the mean of both.
+
+        A grip presses both alike: on a real one it was 0.04 to 0.09 with nominal newtons. Beyond 0.1 a pad has lost its
+        zero or its scale, or something else bears on what is gripped. None unless both pads are touched and their
+        baselines not in doubt.
+        """
+        if len(self) != 2 or not all(one.contact for one in self):
+            return None
+        newtons = [one.force_n for one in self]
+        forces = [one.force_counts for one in self] if None in newtons else newtons
+        first, second = (0.0 if force is None else force for force in forces)
+        return 2 * (first - second) / (first + second) if first > 0 and second > 0 else None
+
+
+def paired(results: Iterable[Result], sensors: Sequence[str], *, apart_s: float = 0.02) -> Iterator[Together]:
     """Yield the results of several sensors that belong together in time: one of each, in the order of their names.
 
     Times are those of the scans on the bus, where the device states them. Each result is used once at most; of two that
@@ -282,7 +301,7 @@ def paired(results: Iterable[Result], sensors: Sequence[str], *, apart_s: float 
     return _pairs(results, waiting, round(apart_s * 1e9))
 
 
-def _pairs(results: Iterable[Result], waiting: dict[str, deque[Result]], apart_ns: int) -> Iterator[tuple[Result, ...]]:
+def _pairs(results: Iterable[Result], waiting: dict[str, deque[Result]], apart_ns: int) -> Iterator[Together]:
     newest_ns = 0
     missing, heard = set(waiting), Counter[str]()
     for result in results:
@@ -304,7 +323,7 @@ def _pairs(results: Iterable[Result], waiting: dict[str, deque[Result]], apart_n
         raise UsageError(f"no result of sensor {min(missing)!r}: there are those of {', '.join(sorted(heard))}")
 
 
-def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | None) -> Iterator[tuple[Result, ...]]:
+def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | None) -> Iterator[Together]:
     """Yield the pairs that nothing newer can better; `newest_ns` is None where nothing newer will come."""
     while all(waiting.values()):
         times_ns = [queue[0].scan.on_bus_ns for queue in waiting.values()]
@@ -319,7 +338,7 @@ def _matches(waiting: dict[str, deque[Result]], apart_ns: int, newest_ns: int | 
         elif len(earliest) == 1 and newest_ns is not None and newest_ns - last_ns < spread_ns:
             return  # its next one may be nearer
         else:
-            yield tuple(queue.popleft() for queue in waiting.values())
+            yield Together(queue.popleft() for queue in waiting.values())
 
 
 @contextmanager

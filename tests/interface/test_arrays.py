@@ -150,6 +150,25 @@ def test_a_silent_finger_lets_nothing_pile_up():
     assert 0 < most < 1100
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "expected"),  # contact, force in newtons, force in counts
+    [
+        ((True, None, 4400.0), (True, None, 3600.0), 0.2),
+        ((True, 3.6, 4400.0), (True, 4.4, 4400.0), -0.2),
+        ((True, 3.6, 4400.0), (True, None, 3600.0), 0.2),  # no scale of its own: counts of both
+        ((True, 4.0, 4000.0), (False, 0.0, 10.0), None),
+        ((None, 4.0, 4000.0), (True, 4.0, 4000.0), None),  # the baseline is in doubt
+        ((True, -1.0, -1000.0), (True, 4.0, 4000.0), None),
+    ],
+)
+def test_a_grip_presses_both_pads_alike(left, right, expected):
+    results = results_at(left=[0], right=[1])
+    for result, (contact, force_n, force_counts) in zip(results, (left, right), strict=True):
+        result.contact, result.force_n, result.force_counts = contact, force_n, force_counts
+    (pair,) = paired(iter(results), ["left", "right"])
+    assert pair.imbalance == (None if expected is None else pytest.approx(expected))
+
+
 @pytest.mark.parametrize("sensors", ["left", ["left"], ["left", "left"]])
 def test_a_pair_is_of_two_sensors(sensors):
     with pytest.raises(UsageError, match="expected two or more different names"):
