@@ -211,6 +211,13 @@ def _open_zenoh(target: str, contract: Contract, source: Source, options: SinkOp
     return ZenohSink(target, source)
 
 
+def _open_rerun(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
+    from edge.sinks.rerun import RerunSink
+
+    _check_unit(f"rerun:{target}", contract)
+    return RerunSink(target, contract, source)
+
+
 def _open_ros2(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
     with needs_cyclone_dds(f"ros2:{target}"):
         from edge.sinks.ros2.sink import Ros2Sink
@@ -233,6 +240,12 @@ def _check_zenoh(target: str) -> None:
     from edge.sinks.zenoh import parsed_target
 
     parsed_target(target)
+
+
+def _check_rerun(target: str) -> None:
+    from edge.sinks.rerun import check_target
+
+    check_target(target)
 
 
 def _ros2_topic(target: str) -> tuple[str, bool]:
@@ -268,5 +281,6 @@ FORMS: Final = {
         "zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh, _open_zenoh
     ),
     "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic, _open_ros2),
+    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd", _check_rerun, _open_rerun),
 }
 """Forms of sinks by their names, in the order of the help."""
