@@ -1,0 +1,88 @@
+"""README's two commands and six ways, typed literally in a bare clone and empty environments, as a new user does.
+
+They fetch gigabytes: `pytest -m night -s --timeout 0 tests/system/test_readme_ways.py` prints how long each line took.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import trimesh
+from edge_samples import ROOT
+
+ENDLESS = {
+    "make run": "http://127.0.0.1",
+    "edge-sr demo --view": "http://127.0.0.1",
+    "edge-sr replay --example --view": "http://127.0.0.1",
+    "edge-sr --source demo:loop --sink ros2:skin": "sinks",
+}
+"""Commands that go on until Ctrl-C, and what they print once they are at work."""
+LONGEST_S = 1800
+
+
+def typed() -> list[str]:
+    """Lines of README's shell blocks up to the real sensor, without comments."""
+    page = (ROOT / "README.md").read_text().partition("## A real sensor")[0]
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL)).splitlines()
+    return [line for text in lines if (line := text.partition("  #")[0].strip())]
+
+
+class Terminal:
+    """A shell in the clone, which remembers the environment that was activated."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._activated = folder, ":"
+        self._variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+
+    def type(self, line: str) -> str:
+        """Run a line until it ends, or until it is at work and Ctrl-C; return what it printed."""
+        if re.search(r"(^|&& )\. \S+/activate$", line):
+            made = self.run(f"{self._activated} && {line}")
+            self._activated = f". {line.rpartition('. ')[2]}"
+            return made
+        return self.run(f"{self._activated} && {line}", ENDLESS.get(line))
+
+    def run(self, command: str, at_work: str | None = None) -> str:
+        pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        with subprocess.Popen(
+            ["bash", "-c", command], cwd=self._folder, env=self._variables, start_new_session=True, text=True, **pipes
+        ) as process:
+            try:
+                shown = "".join(_until(process.stdout, at_work))
+                if at_work is not None:
+                    assert at_work in shown, f"{command} ended: {shown[-2000:]}"
+                    time.sleep(3)
+                    os.killpg(process.pid, signal.SIGINT)
+                rest, _ = process.communicate(timeout=LONGEST_S)
+            finally:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+        assert process.returncode in ({0} if at_work is None else {0, 130}), f"{command}: {(shown + rest)[-2000:]}"
+        return shown + rest
+
+
+def _until(lines, at_work: str | None) -> Iterator[str]:
+    for line in lines if at_work is not None else ():
+        yield line
+        if at_work in line:
+            return
+
+
+@pytest.mark.night
+def test_what_readme_types_works(tmp_path):
+    clone, *lines = typed()
+    assert clone == "git clone URL tactile && cd tactile" and len([line for line in lines if "edge-sr" in line]) >= 3
+    subprocess.run(["git", "clone", "--quiet", "--no-hardlinks", ROOT, tmp_path / "tactile"], check=True)
+    terminal = Terminal(tmp_path / "tactile")
+    bolt = trimesh.creation.cylinder(radius=3.0, height=12.0) + trimesh.creation.cylinder(radius=5.0, height=3.0)
+    bolt.export(tmp_path / "tactile" / "bolt.stl")
+    for line in lines:
+        begun_s = time.monotonic()
+        shown = terminal.type(line)
+        print(f"{time.monotonic() - begun_s:6.1f} s  {line}")
+        assert "Traceback" not in shown, f"{line}: {shown[-2000:]}"
