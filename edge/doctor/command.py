@@ -15,7 +15,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
+
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
+from edge.doctor.grip import ASK as GRIP
+from edge.doctor.grip import Grip
 from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
 from edge.doctor.rehearsal import WATCHED_S, Rehearsal
 from edge.doctor.taxel_checks import Finding, Verdict
@@ -96,6 +100,8 @@ class Visit:
             else:
                 reason = why or "the pad cannot be zeroed: correct what is wrong first"
                 examined.findings.append(Finding("guided press", "not known", "left out", "", reason, name))
+        if why is None and len(names) == 2 and set(names) <= examined.baselines.keys():
+            self._grip((names[0], names[1]), examined)
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, weight_g = self._known.geometry, self._options.weight_g
@@ -111,6 +117,22 @@ class Visit:
             self.newtons[name] = guide.counts_per_newton
         if found is not None:
             self.mountings[name] = found
+
+    def _grip(self, names: tuple[str, str], examined: Examined) -> None:
+        """Ask for a grip of two pads, in which each is the other's reference."""
+        grip = Grip(names)
+        self._say(GRIP)
+        end_s = time.monotonic() + PATIENCE_S
+        while not (grip.over or self._stop.is_set() or self._link.ended or time.monotonic() > end_s):
+            for scan in self._reader.read(POLL_S):
+                if scan.sensor in names:
+                    mounting = self._known.mountings.get(scan.sensor)
+                    zeroed = deformation(scan.counts, examined.baselines[scan.sensor], mounting)
+                    grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
+            if enter_pressed():
+                return
+        examined.findings.extend(grip.judge({**self._known.counts_per_newton, **self.newtons}))
+        self.newtons.update(grip.counts_per_newton)
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""

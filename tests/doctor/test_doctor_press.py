@@ -7,6 +7,7 @@ import pytest
 from doctor_samples import finger, visit
 
 from edge.doctor import guided_press
+from edge.doctor.grip import Grip
 from edge.doctor.guided_press import GuidedPress, Press, find_axes, find_order, judge_force, judge_press, orders
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
@@ -161,3 +162,26 @@ class TestPerson:
         script = visit(UPRIGHT, False, (1, 1, 1), rest=25)
         script[5::7, :, :2] = np.nan
         assert judged(answer_to(script)[1])[1] == Mounting()
+
+
+@pytest.mark.parametrize(
+    ("weighed", "found"),
+    [({}, {}), ({"a": 1000.0}, {"b": 1250.0}), ({"b": 1000.0}, {"a": 800.0}), ({"a": 1000.0, "b": 1250.0}, {})],
+)
+def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, found):
+    grip = Grip(("a", "b"))
+    for scan, z in enumerate([0] * 20 + [4000] * 120 + [0] * 30):
+        assert not grip.over or scan > 140
+        grip.push("a", scan / 100, z)
+        grip.push("b", scan / 100 + 0.003, -1.25 * z)
+    assert grip.over and {one.verdict for one in grip.judge(weighed)} == {"ok"}
+    assert grip.counts_per_newton == pytest.approx(found, rel=0.01)
+
+
+def test_a_grip_of_one_pad_alone_settles_nothing():
+    grip = Grip(("a", "b"))
+    for scan in range(200):
+        grip.push("a", scan / 100, 4000.0)
+        grip.push("b", scan / 100, 3.0)
+    assert not grip.over and [one.verdict for one in grip.judge({})] == ["not known"]
+    assert [one.verdict for one in Grip(("a", "b")).judge({})] == ["not known"]

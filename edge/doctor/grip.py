@@ -1,0 +1,76 @@
+"""Check of two pads against each other: a grip presses both alike, so that each is the other's reference."""
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from edge.doctor.taxel_checks import Finding, judged
+from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
+
+ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
+HELD_SCANS: Final = 100  # scans of each pad in the grip, before its end is waited for
+FREE_SCANS: Final = 20
+
+
+class Grip:
+    """Course of one grip, by the summed z of two pads in counts over their baselines.
+
+    Attributes:
+        counts_per_newton: of a pad that was not weighed, by those of its partner; empty before `judge`.
+    """
+
+    def __init__(self, names: tuple[str, str]) -> None:
+        self.counts_per_newton: dict[str, float] = {}
+        self._names = names
+        self._z: dict[str, list[tuple[float, float]]] = {name: [] for name in names}  # (time in [s], counts)
+
+    def push(self, name: str, time_s: float, z_counts: float) -> None:
+        """Take a reading of one of the pads."""
+        self._z[name].append((time_s, z_counts))
+
+    @property
+    def over(self) -> bool:
+        """True once both pads were pressed for long enough, and hardly are any more."""
+        for course in self._z.values():
+            sizes = [abs(z) for _, z in course]
+            held = sum(size >= ON_COUNTS for size in sizes)
+            if held < HELD_SCANS or max(sizes[-FREE_SCANS:]) > max(OFF_COUNTS, 0.5 * max(sizes)):
+                return False
+        return True
+
+    def judge(self, weighed: Mapping[str, float]) -> list[Finding]:
+        """Return the findings; `weighed` holds counts per newton of pads on which a weight was laid, by name."""
+        first, second = self._names
+        remedy = "grip something firm with both pads: run the doctor once more"
+        unclear = [Finding("grip", "not known", "the pads were not pressed together", "", remedy)]
+        if not all(self._z.values()):
+            return unclear
+        times, here = np.abs(np.array(self._z[first]).T)
+        there = np.interp(times, *np.abs(np.array(self._z[second]).T))
+        gripped = (here >= ON_COUNTS) & (there >= ON_COUNTS)
+        if np.count_nonzero(gripped) < HELD_SCANS // 2:
+            return unclear
+        findings: list[Finding] = []
+        for name, z in ((first, here), (second, there)):
+            rest, held = float(np.median(z[-FREE_SCANS:])), float(np.median(z[gripped]))
+            lost = "it has lost its zero: zero the free pad again, and look whether something bears on it"
+            verdict = "ok" if rest <= max(OFF_COUNTS, 0.1 * held) else "wrong"
+            norm = "under a tenth of the grip"
+            findings.append(judged("zero after a grip", verdict, f"sensor {name}: {rest:.0f} counts", norm, lost))
+        ratio = float(here[gripped] @ there[gripped] / (there[gripped] @ there[gripped]))
+        if first in weighed and second in weighed:
+            share = ratio * weighed[second] / weighed[first]
+            off = "lay the weight on both again: the one that has changed has lost its scale"
+            verdict = "ok" if 1 / 1.1 <= share <= 1.1 else "wrong"
+            measured = f"sensor {first} reads {share:.2f} of the newtons of sensor {second}"
+            return [*findings, judged("scale in a grip", verdict, measured, "alike within 10 %", off)]
+        if first in weighed:
+            self.counts_per_newton = {second: weighed[first] / ratio}
+        elif second in weighed:
+            self.counts_per_newton = {first: weighed[second] * ratio}
+        measured = f"sensor {first} reads {ratio:.2f} of the counts of sensor {second}"
+        # Sensors differ by a quarter either way.
+        off = "sensors differ less: lay a weight on each (--weight-g)"
+        verdict = "ok" if 0.6 <= ratio <= 1.67 else "look"
+        return [*findings, judged("scale in a grip", verdict, measured, "0.6 to 1.67", off)]
