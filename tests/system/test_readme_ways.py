@@ -62,7 +62,8 @@ class Terminal:
             finally:
                 if process.poll() is None:
                     os.killpg(process.pid, signal.SIGKILL)
-        assert process.returncode in ({0} if at_work is None else {0, 130}), f"{command}: {(shown + rest)[-2000:]}"
+        allowed = {0} if at_work is None else {0, 130, -signal.SIGINT}
+        assert process.returncode in allowed, f"{command}: {(shown + rest)[-2000:]}"
         return shown + rest
 
 
