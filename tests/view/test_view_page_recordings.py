@@ -140,6 +140,10 @@ def test_a_recording_begins_when_its_page_is_opened_and_ends(demo, tmp_path, ope
         word(page, "run ended")
         playwright.expect(page.locator("#origin")).to_contain_text("9.0 of 9.0")
         assert played.wait(60) == 0
+    with edge_sr("replay", "--example") as unseen:
+        time.sleep(1.0)
+        unseen.send_signal(signal.SIGINT)  # before anybody looks: no fault of the recording
+        assert unseen.wait(60) == 0
 
 
 HAND = ("4", "6", "8", "10")
