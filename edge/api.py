@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from edge.errors import (
     EdgeError,
-    MessageError,
     ModelError,
     NoResultError,
     SinkClosedError,
@@ -92,7 +91,7 @@ _ON_USE: Final = {
 __all__ = [
     "DEFAULT_MODEL", "DEMO_LOOP", "ID_MAPS", "POSED_MODEL", "USPA44", "USPA46", "Baseline", "BaselineRefusedError",
     "BridgeError", "Command", "Commands", "Contract", "DeviceError", "EdgeError", "Event", "Fan", "Latest",
-    "LinkLostError", "MapSink", "MessageError", "Model", "ModelError", "ModelMap", "NextTap", "NoDeviceError",
+    "LinkLostError", "MapSink", "Model", "ModelError", "ModelMap", "NextTap", "NoDeviceError",
     "NoResultError", "Note", "ObjectMap", "Pad", "PadPose", "Patch", "PatchEvent", "PatchEvents", "PoseQueue",
     "PoseSource", "RecordingError", "Result", "Runtime", "Scan", "SensorFile", "SensorFileError", "SensorGeometry",
     "Sink", "SinkClosedError", "SinkError", "Source", "SourceError", "SourceKind", "Statistics", "Stream",

@@ -4,7 +4,6 @@ EdgeError
 +-- ModelError (ValueError)   a model that is missing, unreadable or breaks the contract
 +-- WindowError (ValueError)  an input that cannot be inferred from: wrong shape or type, or not finite
 +-- UsageError (ValueError)   a request of the caller that cannot be met
-+-- MessageError (ValueError) bytes that are not a packed message
 +-- NoResultError (TimeoutError)  no new result in time
 +-- SinkError (OSError)       a sink that cannot be opened or written
     +-- SinkClosedError       the reader of the sink has gone
@@ -30,10 +29,6 @@ class WindowError(EdgeError, ValueError):
 
 class UsageError(EdgeError, ValueError):
     """A request of the caller that cannot be met."""
-
-
-class MessageError(EdgeError, ValueError):
-    """Bytes that are not a packed message."""
 
 
 class NoResultError(EdgeError, TimeoutError):

@@ -1,15 +1,12 @@
-"""Interface of every sink, and its options; a new one is one file and its row in `edge.sinks.registry`."""
+"""Interface of every sink; a new one is one file, and its form in `edge.sinks.registry`."""
 
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from edge.errors import SinkError
 from edge.perception.event import Event
 from edge.perception.result import Result
-from edge.pipeline.commands import Commands
 from firmware_bridge.in_place import check_writable
 from firmware_bridge.poses import TimedPose
 
@@ -52,21 +49,6 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Finish the written records, or raise a SinkError; there may be nothing to finish."""
-
-
-@dataclass(frozen=True, slots=True)
-class SinkOptions:
-    """Options of a sink that a user or the run sets.
-
-    Attributes:
-        stop: set when the run is to end: then no slow reader is waited for.
-        commands: takes those that come over a sink that was asked to accept them.
-        fields: those of JSON records, such as "force_n,pattern"; None for all.
-    """
-
-    stop: threading.Event = field(default_factory=threading.Event)
-    commands: Commands | None = None
-    fields: str | None = None
 
 
 def check_new(path: Path) -> None:

@@ -10,13 +10,13 @@ header whose "maps" lists them: [[name, [size, ...]], ...].
 
 import errno
 import fcntl
-import math
 import os
 import select
 import stat
 import struct
 import sys
 import termios
+import threading
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from io import FileIO
@@ -27,12 +27,12 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from edge.errors import MessageError, SinkClosedError, SinkError, UsageError
+from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS, MAPS, Columns, Out
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.sink import Sink, SinkOptions
+from edge.pipeline.sink import Sink
 
 ALWAYS: Final = ("time_ns", "sensor", "scan", "source", "state", "trusted", "note", "pattern_unit")
 """Fields of every record: which scan it is of, and whether a robot may act on it; `note` names old readings."""
@@ -129,27 +129,6 @@ def pack(header: Mapping[str, Any], maps: Mapping[str, NDArray[np.floating]]) ->
     return b"".join((_LENGTH.pack(len(text)), text, *arrays))
 
 
-def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Return header and maps, read-only views, of a message; a MessageError where the bytes are none."""
-    try:
-        (length,) = _LENGTH.unpack_from(message)
-        header = orjson.loads(message[_LENGTH.size : _LENGTH.size + length])
-        listed = [(str(name), tuple(map(int, shape))) for name, shape in header["maps"]]
-    except (struct.error, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise MessageError(f"{len(message)} bytes are not a packed message: expected a header with its maps") from error
-    position, maps = _LENGTH.size + length, {}
-    for name, shape in listed:
-        count = math.prod(shape)
-        end = position + count * _FLOAT32.itemsize
-        if min(shape, default=1) < 0 or end > len(message):
-            raise MessageError(f"map {name!r} is {shape}, which is not what {len(message)} bytes hold")
-        maps[name] = np.frombuffer(message, _FLOAT32, count, position).reshape(shape)
-        position = end
-    if position != len(message):
-        raise MessageError(f"{len(message) - position} bytes after the last map, expected none")
-    return header, maps
-
-
 PIPE_BYTES: Final = 1 << 20  # most that Linux gives to any user
 _WITH_MAPS: Final = RecordForm(maps=True)
 
@@ -161,11 +140,12 @@ class JsonLinesSink(Sink):
     and its next record carries the count, as of any other counter that changes. A run that ends waits for no reader.
     """
 
-    def __init__(self, target: str, source: Source, options: SinkOptions) -> None:
+    def __init__(
+        self, target: str, source: Source, *, stop: threading.Event | None = None, fields: str | None = None
+    ) -> None:
         """Open the target; a file that exists is replaced. Readers of a recording's records are waited for."""
         self._target = "stdout" if target == "-" else target
-        self._source, self._stop, self._waits = source.kind, options.stop, source.kind == "replay"
-        fields = options.fields
+        self._source, self._stop, self._waits = source.kind, stop or threading.Event(), source.kind == "replay"
         self._form = _WITH_MAPS if fields is None else RecordForm(chosen_fields(fields), maps=True)
         self.unwritten = 0
         self._turns = CountersInTurn()
@@ -175,7 +155,9 @@ class JsonLinesSink(Sink):
             if error.errno == errno.ENXIO:
                 raise SinkError(f"nobody reads {self._target}: start its reader first") from error
             raise SinkError(f"cannot write records to {self._target}: {error.strerror}") from error
-        _widen(self._file.fileno())
+        if _is_pipe(self._file.fileno()):
+            with suppress(OSError):  # other pipes have taken the pages that a user may have
+                fcntl.fcntl(self._file.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._may_be_full = not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
 
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
@@ -229,13 +211,6 @@ def has_room(descriptor: int, wanted_bytes: int) -> bool:
         return True  # the pipe may be too small for a record, and a reader that has taken everything is not slow
     # A pipe holds pages of 4 KiB, and a record may begin a new page, so up to half of their room stays empty.
     return 2 * waiting_bytes + wanted_bytes + 8192 <= fcntl.fcntl(descriptor, fcntl.F_GETPIPE_SZ)
-
-
-def _widen(descriptor: int) -> None:
-    """Enlarge a pipe to PIPE_BYTES if that is allowed; anything else stays as it is."""
-    if _is_pipe(descriptor):
-        with suppress(OSError):  # other pipes have taken the pages that a user may have
-            fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
 def _is_pipe(descriptor: int) -> bool:

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -15,12 +14,11 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
-from edge.pipeline.sink import Sink, SinkOptions
+from edge.pipeline.sink import Sink
 from edge.sinks.ros2.messages import base_topic
 from firmware_bridge.extras import how_to_install
 from firmware_bridge.poses import TimedPose
 
-UNWRITTEN: Final = attrgetter("unwritten")
 LOOK_NS: Final = 500_000_000
 """Pause between two checks of the sinks' trouble, in [ns]: discovery of a reader may take a moment."""
 
@@ -89,7 +87,7 @@ class Fan(Sink):
                 getattr(sink, act)(*given)
             except SinkError as error:
                 self._give_up(sink, error)
-        self.unwritten = self._given_up_unwritten + sum(map(UNWRITTEN, self._sinks))
+        self.unwritten = self._given_up_unwritten + sum(sink.unwritten for sink in self._sinks)
         if self._clock_ns() >= self._look_ns:
             self._look_ns = self._clock_ns() + LOOK_NS
             known, self._known_trouble = self._known_trouble, self._troubles()
@@ -121,16 +119,15 @@ class Fan(Sink):
 
 
 class Form(NamedTuple):
-    """Form of a sink: as a user writes it, what it is, the check of its target, and the function that opens it."""
+    """Form of a sink: as a user writes it, what it is, and the check of its target."""
 
     text: str
     about: str
-    check: Callable[[str], object]
-    open: Callable[[str, Contract, Source, SinkOptions], Sink]
+    check: Callable[[str], object] = str
 
 
-def check_sink(text: str) -> tuple[Form, str]:
-    """Return form and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
+def check_sink(text: str) -> tuple[str, str]:
+    """Return name and target of the sink that `text` names, or raise a UsageError; nothing is opened."""
     name, _, target = text.partition(":")
     form = FORMS.get(name)
     if name == "npz" and target:
@@ -139,7 +136,7 @@ def check_sink(text: str) -> tuple[Form, str]:
     if form is None or (text != name if form.text == name else not target):
         raise UsageError(f"no sink {text!r}; sinks are {', '.join(form.text for form in FORMS.values())}")
     form.check(target)
-    return form, target
+    return name, target
 
 
 def check_apart(texts: Sequence[str]) -> None:
@@ -173,62 +170,40 @@ def open_sink(
             a sink in metres for patterns of an unknown unit; a package is not installed.
         SinkError: it cannot be opened.
     """
-    form, target = check_sink(text)
-    return form.open(target, contract, source, SinkOptions(stop or threading.Event(), commands, fields))
-
-
-# Each is imported only where it is used, which saves start-up time and memory.
-
-
-def _open_status(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.status_line import StatusSink
-
-    return StatusSink()
-
-
-def _open_jsonl(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.json_records import JsonLinesSink
-
-    return JsonLinesSink(target, source, options)
-
-
-def _open_mcap(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.mcap import McapSink
-
-    _check_unit(f"mcap:{target}", contract)
-    return McapSink(Path(target), contract, source)
-
-
-def _open_shm(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.shm import SharedMemorySink
-
-    return SharedMemorySink(target, contract)
-
-
-def _open_zenoh(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.zenoh import ZenohSink
-
-    return ZenohSink(target, source)
-
-
-def _open_rerun(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    from edge.sinks.rerun import RerunSink
-
-    _check_unit(f"rerun:{target}", contract)
-    return RerunSink(target, contract, source)
-
-
-def _open_ros2(target: str, contract: Contract, source: Source, options: SinkOptions) -> Sink:
-    with needs_cyclone_dds(f"ros2:{target}"):
-        from edge.sinks.ros2.sink import Ros2Sink
-    _check_unit(f"ros2:{target}", contract)
-    topic, accepts = _ros2_topic(target)
-    return Ros2Sink(topic, source, options.commands if accepts else None)
-
-
-def _check_unit(text: str, contract: Contract) -> None:
-    if contract.output_unit != "mm":
+    name, target = check_sink(text)
+    if name in ("mcap", "ros2", "rerun") and contract.output_unit != "mm":
         raise UsageError(f"{text}: the model's patterns are in {contract.output_unit!r}, expected mm: use another sink")
+    # Each is imported only where it is used, which saves start-up time and memory.
+    match name:
+        case "jsonl":
+            from edge.sinks.json_records import JsonLinesSink
+
+            return JsonLinesSink(target, source, stop=stop, fields=fields)
+        case "mcap":
+            from edge.sinks.mcap import McapSink
+
+            return McapSink(Path(target), contract, source)
+        case "shm":
+            from edge.sinks.shm import SharedMemorySink
+
+            return SharedMemorySink(target, contract)
+        case "zenoh":
+            from edge.sinks.zenoh import ZenohSink
+
+            return ZenohSink(target, source)
+        case "rerun":
+            from edge.sinks.rerun import RerunSink
+
+            return RerunSink(target, contract, source)
+        case "ros2":
+            with needs_cyclone_dds(text):
+                from edge.sinks.ros2.sink import Ros2Sink
+            topic, accepts = _ros2_topic(target)
+            return Ros2Sink(topic, source, commands if accepts else None)
+        case _:
+            from edge.sinks.status_line import StatusSink
+
+            return StatusSink()
 
 
 def _check_mcap(target: str) -> None:
@@ -268,19 +243,16 @@ def needs_cyclone_dds(text: str) -> Iterator[None]:
 
 
 FORMS: Final = {
-    "status": Form("status", "one live line (default on a terminal)", str, _open_status),
-    "jsonl": Form("jsonl:FILE", "one JSON record a line; jsonl:- is stdout", str, _open_jsonl),
+    "status": Form("status", "one live line (default on a terminal)"),
+    "jsonl": Form("jsonl:FILE", "one JSON record a line; jsonl:- is stdout"),
     "mcap": Form(
         "mcap:FILE.mcap",
         "recording, for replay, Foxglove and ROS 2; edge-sr convert makes arrays for numpy of it",
         _check_mcap,
-        _open_mcap,
     ),
-    "shm": Form("shm:NAME", "latest values in shared memory", str, _open_shm),
-    "zenoh": Form(
-        "zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh, _open_zenoh
-    ),
-    "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic, _open_ros2),
-    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd", _check_rerun, _open_rerun),
+    "shm": Form("shm:NAME", "latest values in shared memory"),
+    "zenoh": Form("zenoh:KEY", "messages over zenoh; to a router with ?connect=tcp/HOST:7447", _check_zenoh),
+    "ros2": Form("ros2:TOPIC", "ROS 2 messages", _ros2_topic),
+    "rerun": Form("rerun:view", "a Rerun viewer; one that is open by HOST:PORT; FILE.rrd", _check_rerun),
 }
 """Forms of sinks by their names, in the order of the help."""

@@ -27,7 +27,6 @@ from sink_samples import (
 )
 
 from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
-from edge.pipeline.sink import SinkOptions
 from edge.sinks.json_records import COUNTED_NS, JsonLinesSink
 from edge.sinks.registry import FORMS, check_sink, open_sink
 from edge.sinks.ros2.messages import RESULT
@@ -133,13 +132,13 @@ def gone(tmp_path: Path) -> Sink:
     """Return a sink whose reader has left."""
     os.mkfifo(tmp_path / "fifo")
     reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
-    sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source(), SinkOptions())
+    sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source())
     os.close(reader)
     return sink
 
 
 def full(tmp_path: Path) -> Sink:
-    return JsonLinesSink("/dev/full", fake_source(), SinkOptions())
+    return JsonLinesSink("/dev/full", fake_source())
 
 
 @pytest.mark.parametrize("bad", [full, gone])

@@ -170,9 +170,9 @@ def test_an_environment_that_ros_would_not_take_is_refused(environment, error, s
 
 def test_without_the_package_one_line_says_how_to_get_it():
     script = (
-        "import sys; sys.modules['cyclonedds'] = None\n"
+        "import sys, types; sys.modules['cyclonedds'] = None\n"
         "from edge.sinks.registry import open_sink\n"
-        "try: open_sink('ros2:skin', None, None)\n"
+        "try: open_sink('ros2:skin', types.SimpleNamespace(output_unit='mm'), None)\n"
         "except ValueError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -193,7 +193,7 @@ def test_the_launch_file_starts_a_command_that_edge_sr_takes():
     program, *words = shlex.split(command)
     options = parser().parse_args(words)
     assert (program, str(options.sensor)) == ("edge-sr", "s.toml")
-    assert [(form.text, target) for form, target in map(check_sink, options.sink)] == [("ros2:TOPIC", "skin?commands")]
+    assert [*map(check_sink, options.sink)] == [("ros2", "skin?commands")]
     (node,) = launch.iter("node")
     assert (FILES / node.get("args").removeprefix("-d $(dirname)/")).is_file()
 

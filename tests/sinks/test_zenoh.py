@@ -17,12 +17,13 @@ import pytest
 import zenoh_samples
 from bridge_samples import write_recording
 from edge_samples import ROOT, ended, fake_source, make_scan, wait_for, write_model
+from packed_messages import unpack
 from test_listening import reachable
 from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
-from edge.sinks.json_records import event_record, record, unpack
+from edge.sinks.json_records import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.stop_signals import EXIT_FORCED

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from bridge_samples import write_npz
 from edge_samples import ROOT
+from packed_messages import unpack
 
 from edge.api import load_model
 from edge.inference.bundled import demo_recording
-from edge.sinks.json_records import unpack
 from edge.terminal.heatmap import colours
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44

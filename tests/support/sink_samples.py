@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from mcap_samples import messages_of
+from packed_messages import unpack
 
 from edge.perception.event import Event, Note
 from edge.perception.result import Result
@@ -211,8 +212,6 @@ class Zenoh(Opened):
         self._consumer.stop()
 
     def results(self) -> list[Back]:
-        from edge.sinks.json_records import unpack
-
         heard = self._heard
         packed = [unpack(data) for key, *_, data in heard if key.endswith("/pattern")]
         patterns = {header["scan"]: maps["pattern"] for header, maps in packed}

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from edge_samples import BASELINE, PERIOD_NS, FakeModel, fake_source, make_contract, make_scan
 from map_samples import result_of
+from packed_messages import unpack
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -18,7 +19,6 @@ from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
 from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
-from edge.sinks.json_records import unpack
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose
 

@@ -14,10 +14,10 @@ from contextlib import contextmanager, suppress
 
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT, wait_for, write_model
+from packed_messages import unpack
 from view_samples import HANDSHAKE, LONG_PING, Swallowing
 from websockets.sync.client import connect
 
-from edge.sinks.json_records import unpack
 from edge.terminal.stop_signals import EXIT_FORCED
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
