@@ -19,6 +19,7 @@ import termios
 import threading
 from collections.abc import Collection, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from io import FileIO
 from pathlib import Path
 from typing import Any, Final
@@ -28,6 +29,7 @@ import orjson
 from numpy.typing import NDArray
 
 from edge.errors import SinkClosedError, SinkError, UsageError
+from edge.inference.contract import Contract
 from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.perception.result_fields import FIELDS, MAPS, Columns, Out
@@ -43,6 +45,7 @@ PROGRESS: Final = frozenset(
 COUNTED_NS: Final = 1_000_000_000  # time from which on a sensor's record has the counters again, in [ns]
 _HEADS: Final = tuple(field for field in FIELDS if Out.RECORD in field.out)
 _ALL: Final = tuple(field.name for field in (*_HEADS, *MAPS))
+CONTACTS: Final = "contacts"  # separate contacts, which take as long as the pattern: in a record only if it is named
 
 
 class RecordForm:
@@ -93,7 +96,7 @@ def chosen_fields(text: str) -> frozenset[str]:
     from difflib import get_close_matches
 
     names = frozenset(name.strip() for name in text.split(","))
-    for name in sorted(names.difference(_ALL)):
+    for name in sorted(names.difference((*_ALL, CONTACTS))):
         near = get_close_matches(name, _ALL, n=1)
         meant = f"did you mean {near[0]}?" if near else f"expected {', '.join(_ALL)}"
         raise UsageError(f"no field {name!r}: {meant}")
@@ -141,12 +144,20 @@ class JsonLinesSink(Sink):
     """
 
     def __init__(
-        self, target: str, source: Source, *, stop: threading.Event | None = None, fields: str | None = None
+        self,
+        target: str,
+        contract: Contract,
+        source: Source,
+        *,
+        stop: threading.Event | None = None,
+        fields: str | None = None,
     ) -> None:
         """Open the target; a file that exists is replaced. Readers of a recording's records are waited for."""
         self._target = "stdout" if target == "-" else target
         self._source, self._stop, self._waits = source.kind, stop or threading.Event(), source.kind == "replay"
-        self._form = _WITH_MAPS if fields is None else RecordForm(chosen_fields(fields), maps=True)
+        names = None if fields is None else chosen_fields(fields)
+        self._form = _WITH_MAPS if names is None else RecordForm(names, maps=True)
+        self._contract = contract if CONTACTS in (names or ()) else None
         self.unwritten = 0
         self._turns = CountersInTurn()
         try:
@@ -163,12 +174,14 @@ class JsonLinesSink(Sink):
     def write(self, result: Result, counters: Mapping[str, int]) -> None:
         """Write one record; its counter `unwritten` counts what was left out for this reader only."""
         counters = {**counters, "unwritten": self.unwritten}
-        self._write(record_line(result, self._turns.of(result, counters), self._form))
+        fields = self._form.of(result, self._turns.of(result, counters))
+        if self._contract is not None:
+            fields[CONTACTS] = _contacts(result, self._contract)
+        self._write(_line(fields))
 
     def tell(self, event: Event, counters: Mapping[str, int]) -> None:
         """Write a record of an event."""
-        fields = event_record(event, {**counters, "unwritten": self.unwritten}, self._source)
-        self._write(orjson.dumps(fields, option=orjson.OPT_APPEND_NEWLINE))
+        self._write(_line(event_record(event, {**counters, "unwritten": self.unwritten}, self._source)))
 
     def _write(self, line: bytes) -> None:
         while self._may_be_full and not has_room(self._file.fileno(), len(line)):
@@ -194,9 +207,26 @@ class JsonLinesSink(Sink):
             self._file.close()
 
 
-def record_line(result: Result, counters: Mapping[str, int] | None, form: RecordForm = _WITH_MAPS) -> bytes:
+def record_line(result: Result, counters: Mapping[str, int] | None) -> bytes:
     """Return a result as one line of JSON, its maps last."""
-    return orjson.dumps(form.of(result, counters), option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+    return _line(_WITH_MAPS.of(result, counters))
+
+
+def _line(fields: Mapping[str, Any]) -> bytes:
+    return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+
+
+def _contacts(result: Result, contract: Contract) -> list[dict[str, Any]]:
+    """Return the separate contacts of a result, as `edge.api.patches` describes them."""
+    from edge.perception.patches import patches
+
+    return [
+        {
+            name: value if value is None or isinstance(value, bool) else np.round(value, 4).tolist()
+            for name, value in asdict(patch).items()
+        }
+        for patch in patches(result, contract)
+    ]
 
 
 def has_room(descriptor: int, wanted_bytes: int) -> bool:

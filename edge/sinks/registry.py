@@ -178,7 +178,7 @@ def open_sink(
         case "jsonl":
             from edge.sinks.json_records import JsonLinesSink
 
-            return JsonLinesSink(target, source, stop=stop, fields=fields)
+            return JsonLinesSink(target, contract, source, stop=stop, fields=fields)
         case "mcap":
             from edge.sinks.mcap import McapSink
 

@@ -27,7 +27,7 @@ from sink_samples import (
 )
 
 from edge.api import Event, Fan, LinkLostError, PadPose, Sink, SinkClosedError, SinkError, TimedPose, UsageError
-from edge.sinks.json_records import COUNTED_NS, JsonLinesSink
+from edge.sinks.json_records import COUNTED_NS
 from edge.sinks.registry import FORMS, check_sink, open_sink
 from edge.sinks.ros2.messages import RESULT
 
@@ -132,13 +132,13 @@ def gone(tmp_path: Path) -> Sink:
     """Return a sink whose reader has left."""
     os.mkfifo(tmp_path / "fifo")
     reader = os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)
-    sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source())
+    sink = open_sink(f"jsonl:{tmp_path}/fifo", CONTRACT, fake_source())
     os.close(reader)
     return sink
 
 
 def full(tmp_path: Path) -> Sink:
-    return JsonLinesSink("/dev/full", fake_source())
+    return open_sink("jsonl:/dev/full", CONTRACT, fake_source())
 
 
 @pytest.mark.parametrize("bad", [full, gone])

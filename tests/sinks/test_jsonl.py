@@ -5,6 +5,7 @@ import json
 import os
 import struct
 import subprocess
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +14,11 @@ from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_s
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from packed_messages import unpack
-from sink_samples import RUN, make_results, make_sure_results
+from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
 from edge.api import Event, Runtime
-from edge.sinks.json_records import ALWAYS, JsonLinesSink, has_room, pack, record_line
+from edge.sinks.json_records import ALWAYS, has_room, pack, record_line
+from edge.sinks.registry import open_sink
 from firmware_bridge.scans.scan import VendorReading
 
 
@@ -30,7 +32,7 @@ class TestJsonLines:
         assert [result.reused_from for result in results] == [None, None, 0, 1, None, None, None, 6]
         path = tmp_path / "out.jsonl"
         path.write_text("old\n")
-        sink, expected = JsonLinesSink(str(path), fake_source()), b""
+        sink, expected = open_sink(f"jsonl:{path}", CONTRACT, fake_source()), b""
         for number, result in enumerate(results):
             sink.write(result, RUN)
             expected += record_line(result, None if number > 1 else RUN | {"unwritten": 0})  # the first of each sensor
@@ -47,13 +49,27 @@ class TestJsonLines:
     )
     def test_a_record_holds_the_fields_that_are_named_and_what_a_robot_must_see(self, chosen, more, tmp_path):
         whole, path = make_sure_results()[6], tmp_path / "out.jsonl"
-        sink = JsonLinesSink(str(path), fake_source(), fields=chosen)
+        sink = open_sink(f"jsonl:{path}", CONTRACT, fake_source(), fields=chosen)
         sink.write(whole, RUN)
         sink.close()
         record, expected = json.loads(path.read_bytes()), json.loads(record_line(whole, RUN | {"unwritten": 0}))
         assert whole.pattern is not None and {"source", "state", "trusted", "note", "pattern_unit"} < record.keys()
         assert record.keys() == {*ALWAYS, "counters", *more}
         assert record == {name: expected[name] for name in record}
+
+    def test_separate_contacts_are_in_a_record_where_they_are_named(self, tmp_path):
+        pattern = np.zeros((40, 40), dtype=np.float32)
+        pattern[4:10, 4:14], pattern[25:35, 25:35] = 0.2, 0.4
+        results = [replace(make_sure_results()[6], pattern=pattern, trusted=True), make_sure_results()[0]]
+        with closing(open_sink(f"jsonl:{tmp_path}/out", CONTRACT, fake_source(), fields="contacts")) as sink:
+            for result in results:
+                sink.write(result, RUN)
+        touched, free = map(json.loads, (tmp_path / "out").read_bytes().splitlines())
+        assert free["contacts"] == [] and touched.keys() == {*ALWAYS, "counters", "contacts"}
+        strong, weak = touched["contacts"]
+        assert strong["area_mm2"] == pytest.approx(100 * 0.47**2, abs=1e-3) and weak["long_axis_deg"] == 0
+        assert strong["centre_mm"] == pytest.approx([10 * 0.47, 10 * 0.47], abs=1e-3)
+        assert strong["trusted"] is True and strong["force_n"] is None and len(weak["normal"]) == 3
 
     def test_what_the_vendor_says_is_told_where_it_does(self):
         runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
@@ -80,7 +96,7 @@ class TestJsonLines:
         assert line.endswith(b"}\n") and line.count(b"\n") == 1
 
     def test_an_event_is_a_record_told_by_its_state(self, tmp_path):
-        sink = JsonLinesSink(str(tmp_path / "out.jsonl"), fake_source())
+        sink = open_sink(f"jsonl:{tmp_path}/out.jsonl", CONTRACT, fake_source())
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
         sink.close()
         assert json.loads((tmp_path / "out.jsonl").read_text()) == {
@@ -98,7 +114,7 @@ class TestJsonLines:
         fifo = tmp_path / "fifo"
         os.mkfifo(fifo)
         reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-        sink = JsonLinesSink(str(fifo), fake_source("device"))
+        sink = open_sink(f"jsonl:{fifo}", CONTRACT, fake_source("device"))
         result, written = make_results(3)[4], 300
         for _ in range(written):
             sink.write(result, {})  # would wait for ever
@@ -124,7 +140,7 @@ class TestJsonLines:
         os.mkfifo(tmp_path / "fifo")
         with subprocess.Popen(["wc", "-l", tmp_path / "fifo"], stdout=subprocess.PIPE) as reader:
             descriptor = os.open(tmp_path / "fifo", os.O_WRONLY)  # waits for the reader
-            sink = JsonLinesSink(str(tmp_path / "fifo"), fake_source())
+            sink = open_sink(f"jsonl:{tmp_path}/fifo", CONTRACT, fake_source())
             os.close(descriptor)
             for _ in range(300):
                 sink.write(make_results(3)[4], {})

@@ -19,7 +19,7 @@ ENDLESS = {
     "make run": "http://127.0.0.1",
     "edge-sr demo --view": "http://127.0.0.1",
     "edge-sr replay --example --view": "http://127.0.0.1",
-    "edge-sr --source demo:loop --sink ros2:skin": "sinks",
+    "edge-sr --source demo:loop --sink ros2:skin": "an emulated sensor taps",
 }
 """Commands that go on until Ctrl-C, and what they print once they are at work."""
 LONGEST_S = 1800
