@@ -1,23 +1,109 @@
-"""Commands of `edge-sr`: what does each, its options and its help."""
+"""Commands of `edge-sr`, and their options, a row each: what does a command, what it takes, and its help."""
 
-from collections.abc import Mapping
+import argparse
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from edge.cli.option_tables import RESULTS, RUN, SENSOR, Group, Option
+from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.mapping.object_map import PX_PER_MM, SIZE_MM
+from edge.perception.contact_options import RuntimeOptions
 from edge.sinks.registry import FORMS as SINKS
-from edge.terminal.argument_types import positive, whole
+from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
+from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
+from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.zeroing.baseline import FEWEST_SCANS
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
 
+_SETTINGS: Final[dict[Any, Any]] = {bool: {"action": "store_true"}, list: {"action": "append", "default": []}}
+"""Settings of argparse for an option without a value, and for one that may be repeated."""
+
+
+class Option:
+    """One option or argument, in the form of the help, such as "--rate-hz R"; `kind` makes its value of a text."""
+
+    def __init__(self, form: str, kind: Callable[[str], Any], text: str, **more: Any) -> None:
+        self.name, *values = form.split(" ")
+        shown: dict[str, Any] = {"metavar": values[0] if len(values) == 1 else tuple(values)} if values else {}
+        self.settings: dict[str, Any] = _SETTINGS.get(kind, {"type": kind}) | shown | {"help": text} | more
+
+
+def _runtime(name: str, kind: Callable[[str], Any], **more: Any) -> Option:
+    """Return the row of an option of the runtime."""
+    field = RuntimeOptions.__dataclass_fields__[name]
+    return Option(field.metadata["form"], kind, field.metadata["text"], default=field.default, **more)
+
+
+class Group:
+    """Options under a title of the help, or under that of --help; of those in a tuple only one may be given."""
+
+    def __init__(self, title: str | None, *options: Option | tuple[Option, ...], about: str | None = None) -> None:
+        self.title, self.options, self.about = title, options, about
+        named = (one for one in options if isinstance(one, Option) and not one.name.startswith("-"))
+        self.arguments = [one.settings["metavar"] + "..." * ("nargs" in one.settings) for one in named]
+
+
+# fmt: off
+SENSOR: Final = (
+    Option("--source SRC", list, "where scans come from (default: the adapter plugged in); for two fingers repeated, "
+           "as NAME=SRC; edge-sr --help lists all"),
+    Option("--sensor FILE", Path, "sensor file, which edge-sr doctor writes: how the pad is wired and mounted, and its "
+           "readings when free; other options override it"),
+    Option("--id-map MAP", str, "kind of pad: which CAN message is which taxel: %(choices)s; A and B are boards before "
+           f"2021 (default {USPA44_MAP.name})", choices=ID_MAPS),
+    Option("--rate-hz R", positive, "scans a second at which a recording is played; for a device, its expected rate"),
+    Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
+)
+_READ: Final = Group("sensor",
+    *SENSOR,
+    Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
+           "start)"),
+    Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
+           "(default: never)"),
+    Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
+           "several sensors SENSOR=P; repeat it for several"),
+)
+RESULTS: Final = (
+    Group("model",
+        Option("--model M", str, "bundled model, of those that edge-sr models lists, or model file (default "
+               f"{DEFAULT_MODEL}; where poses of the pad come, as in the demo, {POSED_MODEL})"),
+    ),
+    Group("outputs",
+        Option("--sink S", list, "output for results, such as jsonl:-; repeat it for several; edge-sr --help lists "
+               "all"),
+        Option("--fields F", str, "fields of JSON records, such as force_n,pattern, in addition to those of every "
+               "record (default: all)"),
+        Option("--duration-s T", positive, "stop after T seconds, of a recording after T of its own"),
+    ),
+    Group("live page",
+        Option("--view PORT", port, "serve a page for a browser at this port (default %(const)s; 0: any free one)",
+               nargs="?", const=8077),
+        Option("--view-host H", str, "address of the page, for other computers (default 127.0.0.1: this one only)"),
+        Option("--view-token T", str, "password in the page's address (default: generated and printed)"),
+    ),
+    Group("contact",
+        _runtime("contact_on_counts", positive),
+        _runtime("contact_off_counts", positive),
+        Option("--counts-per-newton C", lambda text: positive(text, *PAD_RANGES["counts_per_newton"]),
+               "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
+        _runtime("idle_reset_s", positive),
+        _runtime("taps", whole(1)),
+        about="A tap is one press, from touch to release. Counts are the units of raw readings.",
+    ),
+    Group("checks of patterns and sensor",
+        _runtime("learn", bool, dest="learn", action="store_false"),
+        _runtime("every_scan", bool),
+    ),
+)
+RUN: Final = (_READ, *RESULTS)
+# fmt: on
+
 
 class Command(NamedTuple):
-    """Command: what does it, and its help: what follows its name, what it does, its options, and what is below them."""
+    """Command: what does it, and its help: what it does, its options, and what is below them."""
 
     does: str  # module and function, loaded when it is used
-    usage: str
     about: str
     groups: tuple[Group, ...]
     more: str = ""
@@ -30,7 +116,6 @@ def _lines(forms: Mapping[str, str]) -> str:
 TABLE: Final = {
     "": Command(
         "edge.cli.run_command:follow",
-        "[options]\n       edge-sr COMMAND [options]",
         "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
         "pattern: a fine map of how deep an object presses into the pad, in mm.",
         RUN,
@@ -73,7 +158,6 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
     ),
     "demo": Command(
         "edge.cli.run_command:show_demo",
-        "[options]",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),
@@ -81,7 +165,6 @@ Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
     ),
     "record": Command(
         "edge.cli.run_command:record",
-        "FILE [options]",
         "Runs like edge-sr, and records scans, patterns and events.",
         (Group("file", Option("file FILE", str, "new file, .mcap")), *RUN),
         """\
@@ -94,7 +177,6 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
     ),
     "replay": Command(
         "edge.cli.run_command:replay",
-        "FILE... [options]",
         "Computes the patterns of a recording.",
         (
             Group(
@@ -143,7 +225,6 @@ examples:
     ),
     "convert": Command(
         "edge.cli.convert_command:run",
-        "FILE NEW",
         "Writes a recording in another format: that of the ending of the new name.",
         (
             Group(
@@ -166,7 +247,6 @@ examples:
     ),
     "map": Command(
         "edge.cli.run_command:map_object",
-        "[options]",
         "Runs like edge-sr, and fuses the patterns into a map of the object.",
         (
             Group(
@@ -204,13 +284,11 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
     ),
     "models": Command(
         "edge.cli.listings:show_models",
-        "[--measure]",
         "Lists the bundled models, with their error.",
         (Group(None, Option("--measure", bool, "measure the run time of each here, 1.5 s a model")),),
     ),
     "baseline": Command(
         "edge.cli.run_command:baseline",
-        "--out FILE",
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
         (
             Group("sensor", *SENSOR),
@@ -240,7 +318,6 @@ Of a recording it takes the scans during which the pad is still and pressed leas
     ),
     "devices": Command(
         "edge.cli.listings:show_devices",
-        "[--json]",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
         (Group(None, Option("--json", bool, "write JSON, for programs")),),
@@ -248,7 +325,6 @@ Of a recording it takes the scans during which the pad is still and pressed leas
     ),
     "doctor": Command(
         "edge.doctor.command:run",
-        "[options]",
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
         (
             Group(
@@ -269,11 +345,6 @@ Of a recording it takes the scans during which the pad is still and pressed leas
                 "results",
                 Option("--out FILE", Path, "write the results into a sensor file"),
                 Option("--json", bool, "write one JSON document to stdout"),
-                Option(
-                    "--forget-gains SENSOR",
-                    str,
-                    "remove what the sensor of this name learned from contacts from the file of --sensor, and end",
-                ),
             ),
         ),
         """\
@@ -296,7 +367,6 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
     ),
     "bench": Command(
         "edge.bench.command:run",
-        "[options]",
         "Measures error against run time of the bundled models and of methods without a network.",
         (
             Group(
@@ -313,13 +383,17 @@ Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong 
 Run time is measured back to back, and paced: one inference a tick, as on a robot. A row takes half a minute. No other \
 program should run meanwhile.
 
-examples:
-  edge-sr bench --out today
-  edge-sr bench --threads 1 \\
-          --only stsr mtsr
+example:
+  edge-sr bench --out today --threads 1
 
 Ctrl-C ends it with exit code 130, after the rows measured so far are written.
 """,
     ),
 }
 COMMANDS: Final = (*filter(None, TABLE),)
+
+
+def runtime_options(options: argparse.Namespace) -> RuntimeOptions:
+    """Return the flags of the runtime, each by its own name; options without a flag keep their defaults."""
+    given = vars(options)
+    return RuntimeOptions(**{name: given[name] for name in RuntimeOptions.__dataclass_fields__ if name in given})

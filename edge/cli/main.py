@@ -20,8 +20,7 @@ from edge.api import (
     UsageError,
     unfinished_load,
 )
-from edge.cli.command_table import COMMANDS, TABLE
-from edge.cli.option_tables import runtime_options
+from edge.cli.command_table import COMMANDS, TABLE, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
 from firmware_bridge.errors import harmless
@@ -92,7 +91,9 @@ def _command(arguments: Sequence[str]) -> int | None:
 def parser(command: str = "") -> argparse.ArgumentParser:
     """Return the parser of a command, or of `edge-sr` without one."""
     name, help_ = f"edge-sr {command}".rstrip(), TABLE[command]
-    made = Parser(prog=name, usage=f"{name} {help_.usage}", description=help_.about, epilog=help_.more)
+    given = [word for group in help_.groups for word in group.arguments]
+    usage = " ".join((name, *(given or ["[options]"]))) + ("" if command else f"\n       {name} COMMAND [options]")
+    made = Parser(prog=name, usage=usage, description=help_.about, epilog=help_.more)
     for listed in help_.groups:
         group = made if listed.title is None else made.add_argument_group(listed.title, listed.about)
         for one in listed.options:
