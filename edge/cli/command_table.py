@@ -334,9 +334,7 @@ Of a recording it takes the scans during which the pad is still and pressed leas
             ),
             Group(
                 "what is measured",
-                Option(
-                    "--drift-s T", positive, "seconds to measure the free, still pad (default %(default)g)", default=60
-                ),
+                Option("--drift-s T", positive, "seconds to measure the free pad (default %(default)g)", default=60),
                 Option("--no-press", bool, "skip the presses on the corners"),
                 Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
                 Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
@@ -345,6 +343,7 @@ Of a recording it takes the scans during which the pad is still and pressed leas
                 "results",
                 Option("--out FILE", Path, "write the results into a sensor file"),
                 Option("--json", bool, "write one JSON document to stdout"),
+                Option("--forget-gains SENSOR", str, "remove its learned gains from the file of --sensor, and end"),
             ),
         ),
         """\

@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fcntl import ioctl
 from http import HTTPStatus
-from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import parse_qs
 
@@ -144,27 +143,13 @@ _REQUEST: Final = struct.Struct("16s4x4s232x")
 """The kernel's `ifreq` with an IPv4 address: name of the interface, family and port, address; room for other uses."""
 
 
-def own_addresses(host: str) -> list[str]:
-    """Return the addresses of this machine that a server at 0.0.0.0 (IPv4) or :: (IPv6) listens at.
-
-    Those that only this machine reaches, and those that need the name of an interface, are left out.
-    """
-    usable = (ipaddress.ip_address(one) for one in (_ipv6() if ":" in host else _ipv4()))
-    return list(dict.fromkeys(str(one) for one in usable if not (one.is_loopback or one.is_link_local)))
-
-
-def _ipv4() -> list[str]:
+def own_addresses() -> list[str]:
+    """Return the IPv4 addresses of this machine at which others on its networks reach it."""
     found: list[str] = []
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # SIOCGIFADDR of an interface without an IPv4 address
                 answer = ioctl(asked, 0x8915, _REQUEST.pack(name.encode(), bytes(4)))
                 found.append(socket.inet_ntoa(_REQUEST.unpack(answer)[1]))
-    return found
-
-
-def _ipv6() -> list[str]:
-    with suppress(OSError):
-        lines = Path("/proc/net/if_inet6").read_text().splitlines()
-        return [socket.inet_ntop(socket.AF_INET6, bytes.fromhex(line[:32])) for line in lines]
-    return []
+    usable = (one for one in map(ipaddress.ip_address, found) if not (one.is_loopback or one.is_link_local))
+    return list(dict.fromkeys(map(str, usable)))

@@ -55,7 +55,8 @@ class Page(NamedTuple):
 
 def load_page() -> Page:
     """Return the page, with its style and its script inside: nothing else is fetched."""
-    style, script = (FOLDER / "page.css").read_bytes(), page_script()
+    style = (FOLDER / "page.css").read_bytes()
+    script = b"\n".join((FOLDER / name).read_bytes() for name in SCRIPTS)
     body = (FOLDER / "page.html").read_bytes()
     body = body.replace(b'<link rel="stylesheet" href="page.css">', b"<style>\n%s</style>" % style)
     body = body.replace(b' src="page.js"></script>', b">%s</script>" % script)
@@ -69,11 +70,6 @@ def load_page() -> Page:
         ("X-Frame-Options", "DENY"),  # or a stranger's page could make a user press a button unseen
     )
     return Page(headers, body)
-
-
-def page_script() -> bytes:
-    """Return the page's script, joined from its files."""
-    return b"\n".join((FOLDER / name).read_bytes() for name in SCRIPTS)
 
 
 def _policy(script: bytes) -> str:
@@ -147,7 +143,7 @@ class LiveView:
         self._snapshot = RunSnapshot()
         self._snapshot.wake = self._wake_if_watched
         self.sinks: list[Sink] = [self._snapshot]
-        addresses = own_addresses(host) if is_everything(host) else []
+        addresses = own_addresses() if is_everything(host) and ":" not in host else []
         self.url, *self.other_urls = self._access.urls(self._socket.getsockname()[1], addresses)
 
     def __enter__(self) -> Self:

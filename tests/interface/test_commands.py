@@ -90,6 +90,18 @@ def test_other_lines_are_counted(pipe, line):
     assert taken(commands, 2) == [RESET] and commands.refused == 1
 
 
+def test_poses_and_commands_part_and_bad_lines_stop_nothing(pipe):
+    """Nobody polls, since the loop may wait for a scan: a pose without a time has that of its arrival."""
+    commands, place, before_ns = lines_of(pipe[0]), '{"cmd": "pose", "x_mm": 1, "y_mm": 2', time.monotonic_ns()
+    lines = f'{place}, "time_ns": 123}}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{place}}}\n'
+    os.write(pipe[1], lines.encode())
+    poses = []
+    wait_for(lambda: poses.extend(commands.poses.take()) or len(poses) == 2)
+    assert poses[0].time_ns == 123 and before_ns <= poses[1].time_ns <= time.monotonic_ns()
+    assert commands.poll() == [RESET] and (commands.refused, commands.poses.refused) == (1, 1)
+    assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
+
+
 def test_a_terminal_and_a_missing_stdin_are_left_alone(stdin):
     leader, follower = os.openpty()
     with os.fdopen(follower) as terminal:

@@ -1,7 +1,6 @@
 """Poses on stdin: lines, the bounded queue, the way into a real runtime and a whole `edge-sr`; and maps of them."""
 
 import json
-import os
 import signal
 import subprocess
 import threading
@@ -15,7 +14,7 @@ from pose_samples import make_posed_contract
 
 from edge.api import PadPose, Runtime, Source, TimedPose, pump
 from edge.mapping.sink import check_npz
-from edge.pipeline.commands import RESET, CommandLines, Commands
+from edge.pipeline.commands import Commands
 from edge.pipeline.pose_queue import (
     FURTHEST_AHEAD_NS,
     REPEATED_NS,
@@ -67,30 +66,6 @@ class TestFields:
         with pytest.raises(PoseError, match=words.replace("[", r"\[")) as caught:
             pose_of_fields(fields, NOW_NS)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 250
-
-
-class TestLines:
-    @pytest.fixture
-    def lines(self):
-        """Commands, and the end of a pipe from whose lines they come."""
-        (read_end, write_end), commands = os.pipe(), Commands()
-        lines = CommandLines(commands, read_end)
-        yield commands, write_end
-        os.close(write_end)
-        lines.close()
-        os.close(read_end)
-
-    def test_poses_and_commands_part_and_bad_lines_stop_nothing(self, lines):
-        """Nobody polls, since the loop may wait for a scan: a pose without a time has that of its arrival."""
-        commands, write_end = lines
-        before_ns = time.monotonic_ns()
-        place = '{"cmd": "pose", "x_mm": 1, "y_mm": 2}'
-        os.write(write_end, f'{WHOLE}\n{{"cmd": "pose"}}\nnonsense\n{{"cmd": "reset"}}\n{place}\n'.encode())
-        poses = []
-        wait_for(lambda: poses.extend(commands.poses.take()) or len(poses) == 2)
-        assert poses[0].time_ns == 123 and before_ns <= poses[1].time_ns <= time.monotonic_ns()
-        assert commands.poll() == [RESET] and (commands.refused, commands.poses.refused) == (1, 1)
-        assert commands.poses.take_reasons() == {"x_mm": "a pose is refused: x_mm is missing, expected a number"}
 
 
 class TestQueue:

@@ -128,7 +128,8 @@ def force_and_torque(result: Result, geometry: SensorGeometry) -> tuple[Vector, 
     if not known or vendor is None or vendor.newtons is None or math.isnan(geometry.pitch_mm):
         return None
     newtons = vendor.newtons.reshape(3, -1).T.astype(np.float64)
-    moments = np.cross(_taxel_places_m(geometry), newtons)
+    places_m = np.pad(geometry.taxel_centres_mm() / 1e3, ((0, 0), (0, 1)))  # on the face
+    moments = np.cross(places_m, newtons)
     (fx, fy, fz), (tx, ty, tz) = newtons.sum(axis=0).tolist(), moments.sum(axis=0).tolist()
     return (fx, fy, fz), (tx, ty, tz)
 
@@ -182,12 +183,6 @@ def log_message(event: Event, unix_ns: int) -> bytes:
             "line": 0,
         }
     )
-
-
-@lru_cache(maxsize=8)
-def _taxel_places_m(geometry: SensorGeometry) -> NDArray[np.float64]:
-    """Return the centres of the taxels (taxels, 3) on the face, in [m]."""
-    return np.pad(geometry.taxel_centres_mm() / 1e3, ((0, 0), (0, 1)))
 
 
 _POINT_FIELDS: Final = ("x", "y", "z", "fx", "fy", "fz", "sigma")
