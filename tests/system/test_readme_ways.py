@@ -40,12 +40,18 @@ class Terminal:
         self._variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def type(self, line: str) -> str:
-        """Run a line until it ends, or until it is at work and Ctrl-C; return what it printed."""
+        """Run a line until it ends, or until it is at work and Ctrl-C; return what it printed.
+
+        Four minutes of training hand no model over, which is a 1.
+        """
         if re.search(r"(^|&& )\. \S+/activate$", line):
             made = self.run(f"{self._activated} && {line}")
             self._activated = f". {line.rpartition('. ')[2]}"
             return made
-        return self.run(f"{self._activated} && {line}", ENDLESS.get(line))
+        trains = "train_and_deploy.py" in line
+        shown = self.run(f"{self._activated} && {line}{'; test $? -le 1' if trains else ''}", ENDLESS.get(line))
+        assert not trains or "not handed over: " in shown or "from now on: " in shown
+        return shown
 
     def run(self, command: str, at_work: str | None = None) -> str:
         pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
