@@ -1,40 +1,28 @@
 """Recordings as CSV, as loggers and spreadsheets write them: one line for each scan of one sensor."""
 
-import codecs
 import csv
 import itertools
 import math
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, Recording, Track, is_rate
-from firmware_bridge.scans.scan import VendorReading
-from firmware_bridge.scans.xela_server_messages import HIGHEST_NEWTONS
+from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, RATES_HZ, Recording, Track, is_rate
 
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
 EMULATED: Final = "emulated"  # column of a recording of an emulated sensor, whatever its cells are
-_TAXEL: Final = re.compile(r"(?P<force>force[ _])?(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
-_TIMES: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "datetime", "clock", "epoch", "elapsed"}
-_UNITS: Final = {
-    word: per_second
-    for words, per_second in (
-        ("s sec secs second seconds", 1.0),
-        ("ms msec msecs millis milliseconds", 1e3),
-        ("us usec usecs micros microseconds", 1e6),
-        ("ns nsec nsecs nanos nanoseconds", 1e9),
-    )
-    for word in words.split()
-}
+_TAXEL: Final = re.compile(r"(?:txl|taxel)?[ _]?0*(?P<taxel>[1-9][0-9]?)[ _]?(?P<axis>[xyz])")
+_TIMES: Final = {"t", "time", "timestamp"}
+_PER_S: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_USUAL_HZ: Final = (4.0, 2000.0)  # rates of sensors: another one shows that the times have another unit
 _WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,9}(\.0*)?")
 MOST_CSV_BYTES: Final = 1 << 30  # most bytes of a CSV: some eight hours of one sensor at 100 Hz
 LONGEST_CSV_LINE: Final = 1 << 14  # most characters of a line: fifty times a row of counts
@@ -49,19 +37,20 @@ CSV_HEADER: Final = csv_header(USPA44.taxel_count)
 
 
 def _rate_of(name: str, times: ArrayLike) -> float | None:
-    """Return the rate of scans in [Hz] by their times (n,) in a column of this name; None where it cannot be told."""
-    values = np.asarray(times, dtype=np.float64)
-    steps = np.diff(values)
-    if not steps.size or not np.isfinite(values).all() or steps.min() < 0:
+    """Return the rate in [Hz] by the times (n,) of a column: in the unit of its name, else in seconds.
+
+    None where the times fall, or give no rate that a sensor can have.
+    """
+    steps = np.diff(np.asarray(times, dtype=np.float64))
+    if not steps.size or not np.isfinite(steps).all() or steps.min() < 0:
         return None
     usual = float(np.percentile(steps, 90))
     # A gap of ten usual steps says nothing about the rate.
     step = float(steps[steps <= 10 * usual].mean() if usual else steps.mean())
-    units = [_UNITS[word] for word in _words(name) if word in _UNITS]
-    if not units and not (steps == 1).all():  # such a column may as well number the rows
-        # No period of a sensor in this range is usual in two units.
-        units = [unit for unit in sorted(set(_UNITS.values())) if 0.0005 <= step / unit < 0.25]
-    return units[-1] / step if units and step else None
+    stated = [_PER_S[word] for word in _words(name) if word in _PER_S]
+    rate_hz = (stated or [1.0])[0] / step if step else math.inf
+    low, high = RATES_HZ if stated else _USUAL_HZ
+    return rate_hz if low <= rate_hz <= high else None
 
 
 def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
@@ -122,17 +111,16 @@ class _Scans:
     def __init__(self, header: Sequence[str]) -> None:
         """Sort the columns by their names."""
         counts: dict[tuple[int, str], int] = {}
-        newtons: dict[tuple[int, str], int] = {}
         others: dict[str, int] = {}
         self._time_names: dict[int, str] = {}
         names = ["".join(char if char.isprintable() else "?" for char in name.strip()) for name in header]
         for column, name in enumerate(names):
             matched = _TAXEL.fullmatch(name.lower())
             if matched is not None:
-                found, key = newtons if matched["force"] else counts, (int(matched["taxel"]), matched["axis"])
-                if key in found:
+                key = (int(matched["taxel"]), matched["axis"])
+                if key in counts:
                     raise ValueError(f"two columns {name[:20]!r}, expected each of them once")
-                found[key] = column
+                counts[key] = column
             elif _TIMES & set(_words(name)):
                 self._time_names[column] = name
             elif name:
@@ -150,13 +138,11 @@ class _Scans:
             raise ValueError(f"columns {', '.join(posed)[:60]}, expected {', '.join(CSV_POSES)}, or no poses")
         # Taxel by taxel, x, y and z each.
         self._count_columns = [counts[key] for key in sorted(wanted)]
-        self._newton_columns = [newtons[key] for key in sorted(wanted)] if newtons.keys() == wanted else []
         self._pose_columns = [others[name] for name in CSV_POSES if name in others]
         self._emulated = EMULATED in others
         self._left_out = [name for name in others if name not in (*CSV_POSES, EMULATED)]
         self._width = max(place + 1 for place, name in enumerate(header) if name)
         self._counts = array("i")
-        self._newtons = array("f")
         self._poses: list[TimedPose] = []
         self._times = {column: array("d") for column in self._time_names}
         self._before: list[str] = []
@@ -167,7 +153,6 @@ class _Scans:
         cells = row.cells
         _check_whole(row, self._width, self._before)
         self._counts.extend(_count(cells[column]) for column in self._count_columns)
-        self._newtons.extend(_number(cells[column]) for column in self._newton_columns)
         if any(cells[column] for column in self._pose_columns):
             try:
                 pose = PadPose(*(_number(cells[column]) for column in self._pose_columns))
@@ -175,14 +160,14 @@ class _Scans:
                 raise ValueError(f"its pose: {error}") from error
             self._poses.append(TimedPose(pose, self.count, used_from_ns=self.count))
         for column, times in self._times.items():
-            times.append(_time_s(cells[column]))
+            times.append(_number(cells[column]))
         self._before = cells
         self.count += 1
 
     def recording(self, path: Path, notes: list[str]) -> Recording:
         """Return the recording, with these notes and others."""
         rates_hz = [_rate_of(self._time_names[column], times) for column, times in self._times.items()]
-        rate_hz = next((rate for rate in rates_hz if rate is not None and is_rate(rate)), None)
+        rate_hz = next((rate for rate in rates_hz if rate is not None), None)
         if rates_hz:
             by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
             notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, {by}")
@@ -191,15 +176,11 @@ class _Scans:
                 f"{path}: {_listed(self._left_out)} left out as none of a taxel, a time or a pose; if one is, rename "
                 "it, such as txl1_x, time_s, pose_x_mm"
             )
-        vendor = None
-        if self._newtons:
-            newtons = _by_axis(np.frombuffer(self._newtons, np.float32), self._pad)
-            sound = np.abs(newtons).max(axis=(1, 2, 3)) <= HIGHEST_NEWTONS  # False of NaN
-            vendor = tuple(VendorReading(one) if right else None for one, right in zip(newtons, sound, strict=True))
-        counts = _by_axis(np.frombuffer(self._counts, np.int32), self._pad)
+        taxels = np.frombuffer(self._counts, np.int32).reshape(-1, self._pad.taxel_count, len(AXES))
+        counts = np.ascontiguousarray(taxels.transpose(0, 2, 1)).reshape(-1, *self._pad.scan_shape)
         return Recording(
             path,
-            (Track(harmless(path.stem, kept=""), counts, time_ns=None, vendor=vendor),),
+            (Track(harmless(path.stem, kept=""), counts, time_ns=None),),
             rate_hz or _meta_rate_hz(path.with_name("meta_data.csv")),
             notes=tuple(notes),
             origin="emulated" if self._emulated else None,
@@ -211,10 +192,7 @@ class _Scans:
 def _rows(path: Path) -> Iterator[_Row]:
     """Yield the rows that are not empty, each from one line; the first one is the header, and tells the separator."""
     read, separator = 0, None
-    with path.open("rb") as file:
-        start = file.read(2)
-    utf16 = start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # as Excel's "Unicode text"
-    with path.open(encoding="utf-16" if utf16 else "utf-8-sig", errors="replace", newline="") as file:
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         for number in itertools.count(1):
             line = file.readline(LONGEST_CSV_LINE + 1)
             if not line:
@@ -227,10 +205,6 @@ def _rows(path: Path) -> Iterator[_Row]:
                 raise _DamageError(number, f"a line longer than {LONGEST_CSV_LINE} bytes", "a row of counts")
             if "\ufffd" in line and separator is not None:  # a header may have a name in another encoding
                 raise _DamageError(number, "bytes that are no UTF-8 text", "a row of counts")
-            named = re.fullmatch(r'"?sep=(.)"?\s*', line) if separator is None else None
-            if named is not None:
-                separator = named[1]
-                continue
             separator = separator or max(",;\t", key=line.count)
             try:
                 cells = next(csv.reader([line], delimiter=separator, strict=True))
@@ -267,23 +241,6 @@ def _number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return math.nan
-
-
-def _time_s(cell: str) -> float:
-    """Return the number in a cell, or the seconds since 1970 of a date and time."""
-    value = _number(cell)
-    if math.isnan(value):
-        try:
-            return datetime.fromisoformat(cell).timestamp()
-        except (ValueError, OverflowError, OSError):
-            return math.nan
-    return value
-
-
-def _by_axis(values: NDArray[Any], geometry: SensorGeometry) -> NDArray[Any]:
-    """Return values of rows as (n, 3, rows, cols)."""
-    taxels = values.reshape(-1, geometry.taxel_count, len(AXES))
-    return np.ascontiguousarray(taxels.transpose(0, 2, 1)).reshape(-1, *geometry.scan_shape)
 
 
 def _meta_rate_hz(path: Path) -> float | None:
