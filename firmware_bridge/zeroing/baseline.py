@@ -1,12 +1,11 @@
 """Zeroing: the baseline of a free pad, and the difference of a scan to it. Counts wrap round at 2^16."""
 
+import hashlib
 import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
@@ -38,8 +37,6 @@ FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
 LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
-
-_AS_WIRED: Final[Mapping[str, Sequence[int]]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +81,8 @@ class Baseline:
         """Return a baseline of counts (3, rows, cols), with its id."""
         own = np.array(counts, dtype=np.float32)
         own.setflags(write=False)
-        digest = _sha256_hex(f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes())
-        return cls(sensor, own, created_unix_s, scans, origin, digest[:8])
+        content = f"{sensor} {created_unix_s!r} {scans} {own.shape} ".encode() + own.tobytes()
+        return cls(sensor, own, created_unix_s, scans, origin, hashlib.sha256(content).hexdigest()[:8])
 
     def age_s(self, now_unix_s: float) -> float:
         """Return its age at `now_unix_s`, in [s]."""
@@ -179,7 +176,7 @@ class BaselineEstimator:
 
 
 def save_baselines(
-    path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = _AS_WIRED
+    path: str | Path, baselines: Iterable[Baseline], orders: Mapping[str, Sequence[int]] = MappingProxyType({})
 ) -> None:
     """Write baselines, one per sensor, as one JSON file, in place; an existing file stays as NAME.bak.
 
@@ -215,7 +212,7 @@ def save_baselines(
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_baselines(path: str | Path, orders: Mapping[str, Sequence[int]] = _AS_WIRED) -> dict[str, Baseline]:
+def load_baselines(path: str | Path, orders: Mapping[str, Sequence[int]] = MappingProxyType({})) -> dict[str, Baseline]:
     """Read baselines, by sensor; `orders` are the present ones of the taxels, as in `save_baselines`.
 
     Raises:
@@ -297,14 +294,6 @@ def _refuse(where: tuple[int, ...], what: str, limit: float, remedy: str) -> Non
     raise BaselineRefusedError(
         f"taxel ({row}, {col}) {AXES[axis]} {what} while zeroing, at most {limit:.0f} allowed: {remedy}"
     )
-
-
-def _sha256_hex(data: bytes) -> str:
-    """Return the hash of some bytes by Python's own code: `hashlib` loads OpenSSL, 3.7 MB and 5 ms of every start."""
-    for name in ("_sha2", "_sha256"):  # of Python 3.12 and later, and of 3.11
-        with suppress(ImportError):
-            return import_module(name).sha256(data).hexdigest()
-    return import_module("hashlib").sha256(data).hexdigest()
 
 
 def _read_entries(value: Any) -> list[Any]:
