@@ -174,11 +174,10 @@ class GsUsbLink(FrameLink):
     def _start(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
         self._stop(device)
-        channels = gs_usb.channel_count(_ask(device, gs_usb.DEVICE_CONFIG, gs_usb.CONFIG_BYTES))
         limits = gs_usb.BitTimingLimits.from_bytes(_ask(device, gs_usb.BIT_TIMING_LIMITS, gs_usb.LIMITS_BYTES))
         _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
         features = limits.features & gs_usb.HARDWARE_STAMPS
-        self._scans.start(stamped=features != 0, channels=channels)
+        self._scans.start(stamped=features != 0)
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):

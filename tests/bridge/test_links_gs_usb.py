@@ -236,7 +236,7 @@ class Full(GsUsbAdapter):
     [
         (partial(GsUsbAdapter, CANDLELIGHT._replace(clock_hz=8_500_000)), "cannot do 1 Mbit/s"),
         (Deaf, "does not answer: unplug it"),
-        (Odd, "2 bytes, expected 12"),
+        (Odd, "2 bytes, expected 40"),
         (Full, "does not answer"),
     ],
 )
