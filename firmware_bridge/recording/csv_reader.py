@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from firmware_bridge.errors import RecordingError, harmless
 from firmware_bridge.pad_geometry import AXES, PADS, USPA44, SensorGeometry
 from firmware_bridge.poses import PadPose, TimedPose
-from firmware_bridge.recording.tracks import A_RATE, HIGHEST_COUNT, RATES_HZ, Recording, Track, is_rate
+from firmware_bridge.recording.tracks import HIGHEST_COUNT, RATES_HZ, Recording, Track
 
 CSV_POSES: Final = ("pose_x_mm", "pose_y_mm", "pose_turn_deg")
 EMULATED: Final = "emulated"  # column of a recording of an emulated sensor, whatever its cells are
@@ -47,10 +47,15 @@ def _rate_of(name: str, times: ArrayLike) -> float | None:
     usual = float(np.percentile(steps, 90))
     # A gap of ten usual steps says nothing about the rate.
     step = float(steps[steps <= 10 * usual].mean() if usual else steps.mean())
-    stated = [_PER_S[word] for word in _words(name) if word in _PER_S]
-    rate_hz = (stated or [1.0])[0] / step if step else math.inf
-    low, high = RATES_HZ if stated else _USUAL_HZ
+    per_s = _per_s(name)
+    rate_hz = (per_s or 1.0) / step if step else math.inf
+    low, high = RATES_HZ if per_s else _USUAL_HZ
     return rate_hz if low <= rate_hz <= high else None
+
+
+def _per_s(name: str) -> float | None:
+    """Return how many of the unit in a column's name make a second; None where it states none."""
+    return next((_PER_S[word] for word in _words(name) if word in _PER_S), None)
 
 
 def _taxels(pad: SensorGeometry) -> set[tuple[int, str]]:
@@ -168,7 +173,7 @@ class _Scans:
         """Return the recording, with these notes and others."""
         rates_hz = [_rate_of(self._time_names[column], times) for column, times in self._times.items()]
         rate_hz = next((rate for rate in rates_hz if rate is not None), None)
-        if rates_hz:
+        if rates_hz and (rate_hz is None or not any(map(_per_s, self._time_names.values()))):
             by = "which give no rate" if rate_hz is None else f"which give {rate_hz:.4g} scans/s"
             notes.append(f"{path}: {_listed(self._time_names.values())} left out as times, {by}")
         if self._left_out:
@@ -181,7 +186,7 @@ class _Scans:
         return Recording(
             path,
             (Track(harmless(path.stem, kept=""), counts, time_ns=None),),
-            rate_hz or _meta_rate_hz(path.with_name("meta_data.csv")),
+            rate_hz,
             notes=tuple(notes),
             origin="emulated" if self._emulated else None,
             poses=self._poses,
@@ -241,23 +246,6 @@ def _number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return math.nan
-
-
-def _meta_rate_hz(path: Path) -> float | None:
-    if not path.is_file():
-        return None
-    try:
-        rows = list(itertools.islice(_rows(path), 2))
-    except _DamageError as damage:
-        raise RecordingError(f"{path}, {damage}") from damage
-    if not rows or "frequency_hz" not in rows[0].cells:
-        return None
-    column = rows[0].cells.index("frequency_hz")
-    cell = rows[1].cells[column] if len(rows) > 1 and len(rows[1].cells) > column else ""
-    rate_hz = _number(cell)
-    if not is_rate(rate_hz):
-        raise RecordingError(f"{path}, line 2: frequency_hz '{cell[:20]}', expected {A_RATE}")
-    return rate_hz
 
 
 def _listed(names: Iterable[str]) -> str:

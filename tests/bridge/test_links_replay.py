@@ -61,13 +61,13 @@ def test_sources_without_a_name_are_called_by_their_place(tmp_path):
     forms = []
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
-        forms.append(f"replay:{write_recording(tmp_path / folder / '4.csv', make_counts(1), rate_hz=50)}")
+        forms.append(f"replay:{write_recording(tmp_path / folder / '4.csv', make_counts(2), rate_hz=50)}")
     for texts, names in (
         (forms, ["source1/4", "source2/4"]),
         ([forms[0], f"left={forms[1]}"], ["source1/4", "left/4"]),
         (forms[:1], ["4"]),
     ):
-        assert [scan.sensor for link in open_sources(texts) for scan in link.__enter__().read(1)] == names
+        assert [link.__enter__().read(1)[0].sensor for link in open_sources(texts)] == names
 
 
 def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):

@@ -145,7 +145,7 @@ class TestCsv:
             (1, []),
             (2, [TimedPose(PadPose(-4.5, 0.5, 0), 40_000_000, used_from_ns=40_000_000)]),
         ]
-        (first, *_) = self.poses(self.write(tmp_path / "finger.csv", ["1,2"], "pose_x_mm,pose_y_mm"))
+        (first, *_) = self.poses(self.write(tmp_path / "finger.csv", ["1,2"] * 2, "pose_x_mm,pose_y_mm"))
         assert [pose.pose for pose in first[1]] == [PadPose(1, 2, 0)]
 
     def test_two_files_together_keep_their_poses_apart(self, tmp_path):
