@@ -29,7 +29,7 @@ def opened(port=None, **settings):
 @pytest.mark.parametrize("packet_bytes", [24, 64, 512])
 def test_an_adapter_without_time_stamps_and_with_two_channels(packet_bytes):
     limits, now_ns = CANDLELIGHT._replace(features=0x03), [10**12]
-    port = GsUsbPort(lambda: GsUsbAdapter(limits, channels=2), packet_bytes=packet_bytes)
+    port = GsUsbPort(lambda: GsUsbAdapter(limits), packet_bytes=packet_bytes)
     port, link = opened(port, clock_ns=lambda: now_ns[0])
     with link:
         port.adapter.hear(*frames_of(1), channel=1)
