@@ -16,7 +16,7 @@ from firmware_bridge.links.base import Link, SourceKind, not_open
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import Scan
-from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, PRETENDED_VERSION
+from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 from firmware_bridge.scans.xela_server_scans import ServerScans
 
 OPENING_S: Final = 3.0
@@ -29,7 +29,6 @@ class XelaServerLink(Link):
 
     Attributes:
         url: URL of the server.
-        version: version that the server reports.
         trouble: sensors that are left out or silent, and readings that are old.
     """
 
@@ -53,22 +52,10 @@ class XelaServerLink(Link):
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._received_bytes = 0
         self._connection: ClientConnection | None = None
-        self._first: list[Scan] = []
-
-    @property
-    def version(self) -> str:
-        """Version that the server reports; empty until it has."""
-        return self._scans.version
 
     def __enter__(self) -> Self:
         self._scans.begin()
         self._connection = self._connect()
-        try:
-            self._first = self._take(self._connection, 0.5)  # a server greets at once; no message is no error
-        except BaseException:
-            self.__exit__()
-            raise
-        self.kind = "emulated" if self.version.endswith(PRETENDED_VERSION) else "device"
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -85,21 +72,10 @@ class XelaServerLink(Link):
         """
         if self._connection is None:
             raise not_open()
-        if self._first:
-            first, self._first = self._first, []
-            return first
-        return self._take(self._connection, timeout_s)
-
-    def counters(self) -> dict[str, int]:
-        """Return the count of received bytes, and the counters of decoder and scans."""
-        with self._counting:
-            return {"received_bytes": self._received_bytes} | self._scans.counters()
-
-    def _take(self, connection: ClientConnection, timeout_s: float) -> list[Scan]:
         scans: list[Scan] = []
         try:
             for _ in range(64):  # later messages wait for the next read
-                message = connection.recv(timeout_s, decode=False)
+                message = self._connection.recv(timeout_s, decode=False)
                 timeout_s, time_ns = 0, time.monotonic_ns()
                 with self._counting:
                     self._received_bytes += len(message)
@@ -114,6 +90,11 @@ class XelaServerLink(Link):
         if not self._scans.usable:
             raise DeviceError(f"{self.url}: no sensor that can be used: {self.trouble}")
         return scans
+
+    def counters(self) -> dict[str, int]:
+        """Return the count of received bytes, and the counters of decoder and scans."""
+        with self._counting:
+            return {"received_bytes": self._received_bytes} | self._scans.counters()
 
     def _connect(self) -> ClientConnection:
         host, port, url = self._address

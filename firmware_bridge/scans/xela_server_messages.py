@@ -32,7 +32,6 @@ HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
 WELCOME: Final = "Welcome"
-PRETENDED_VERSION: Final = "_emulated"  # suffix of an emulated server's version, which separates it from the vendor's
 _COUNTED: Final = [
     "messages",
     "welcomes",
@@ -69,7 +68,6 @@ class ServerMessage(NamedTuple):
 
     sequence: int | None = None
     sent_s: float | None = None
-    version: str = ""
     readings: tuple[ServerReading, ...] = ()
 
 
@@ -93,11 +91,10 @@ class ServerDecoder:
         except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
             content = None
         content = content if isinstance(content, dict) else {}
-        version, sequence = content.get("version"), content.get("message")
-        version = version[:40] if isinstance(version, str) else ""
+        sequence = content.get("message")
         if sequence == WELCOME:
             self._counted["welcomes"] += 1
-            return ServerMessage(version=version)
+            return ServerMessage()
         if type(sequence) is not int or not 0 <= sequence < 1 << 63:
             self._counted["bad_json"] += 1
             return ServerMessage()
@@ -106,7 +103,7 @@ class ServerDecoder:
         self._counted["bad_sensor"] += max(0, len(named) - MOST_SENSORS)
         readings = [self._reading(name, content[name]) for name in named[:MOST_SENSORS]]
         found = tuple(reading for reading in readings if reading is not None)
-        return ServerMessage(sequence, self._time_s(content.get("time")), version, found)
+        return ServerMessage(sequence, self._time_s(content.get("time")), found)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of messages and of their errors.

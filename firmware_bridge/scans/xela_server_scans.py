@@ -44,7 +44,6 @@ class ServerScans:
         mountings: Mapping[str, Mounting] = MappingProxyType({}),
     ) -> None:
         """Begin without a message; `prefix` begins the names of sensors in scans, and `mountings` are by these."""
-        self.version = ""
         self._prefix, self._mountings = prefix, mountings
         self._geometry = geometry
         self._decoder = ServerDecoder(geometry)
@@ -76,7 +75,6 @@ class ServerScans:
     def feed(self, text: str | bytes, arrival_ns: int) -> list[Scan]:
         """Return the scans that a message closes; `arrival_ns` [ns] is never before that of the message before."""
         message = self._decoder.decode(text)
-        self.version = message.version or self.version
         if message.sequence is None or not self._in_order(message.sequence):
             return []
         sent_ns = None if message.sent_s is None else self._clock.host_ns(round(message.sent_s * 1e6), arrival_ns)

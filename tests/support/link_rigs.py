@@ -259,7 +259,7 @@ def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: 
 class ServerRig(Rig):
     """The vendor's server, emulated."""
 
-    sensor = "1"
+    kind, sensor = "device", "1"
     lost, away = "link lost: the server is gone", "connection refused"
     decoder = ServerScans
 

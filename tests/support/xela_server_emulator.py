@@ -27,7 +27,7 @@ from firmware_bridge.errors import LinkLostError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import ABSENT
-from firmware_bridge.scans.xela_server_messages import PRETENDED_VERSION, WELCOME
+from firmware_bridge.scans.xela_server_messages import WELCOME
 
 UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
@@ -83,7 +83,7 @@ class VendorServer:
 
     def welcome(self, unix_s: float) -> str:
         """Return the greeting."""
-        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version + PRETENDED_VERSION})
+        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version})
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
@@ -92,7 +92,7 @@ class VendorServer:
             "time": unix_s,
             "sensors": len(self._players) + len(self._others),
             "type": "welcome" if self._version == "1.7.7" else "routine",
-            "version": self._version + PRETENDED_VERSION,
+            "version": self._version,
         }
         for index in range(len(self._players)):
             message[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
