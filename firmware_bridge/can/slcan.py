@@ -37,7 +37,7 @@ STATUS_FLAGS: Final = b"F\r"
 BUS_FLAGS: Final = 0xA0  # flags of errors on the bus, and of a controller that these have made passive
 
 LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp
-LAST_TIMESTAMP_MS: Final = 59_999
+LAST_TIMESTAMP_MS: Final = 59_999  # of an adapter whose clock counts milliseconds; others count on
 
 LINES_TO_LEARN: Final = 4
 """Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
@@ -45,7 +45,7 @@ LINES_TO_LEARN: Final = 4
 PACKED_BYTES: Final = 10  # bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data
 STAMPED_BYTES: Final = 12  # bytes of a usual frame packed with two bytes of time stamp, in [ms]
 
-_STAMP = rb"(?:[0-9A-Da-d][0-9A-Fa-f]{3}|[Ee](?:[0-9][0-9A-Fa-f]{2}|[Aa][0-5][0-9A-Fa-f]))"
+_STAMP = rb"[0-9A-Fa-f]{4}"
 _USUAL = rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}%s\r)+"
 _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7}))([0-8])([0-9A-Fa-f]*)")
 _LINE_END = re.compile(rb"[\r\a]")
@@ -93,8 +93,7 @@ class SlcanDecoder:
         flags: flags that the adapter has answered last.
         status_answers: number of these answers so far.
         frames: number of frames so far, of any kind.
-            late_stamps: number of lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
-        usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
+            usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
             form until the form is learnt.
         pending_bytes: number of bytes of an unfinished line.
     """
@@ -112,7 +111,6 @@ class SlcanDecoder:
         self._bad_lines = 0
         self._non_ascii_lines = 0
         self._skipped_bytes = 0
-        self.late_stamps = 0
         self._replies = 0
         self._refusals = 0
 
@@ -181,7 +179,6 @@ class SlcanDecoder:
             "bad_lines": self._bad_lines,
             "non_ascii_lines": self._non_ascii_lines,
             "skipped_bytes": self._skipped_bytes,
-            "late_stamps": self.late_stamps,
             "replies": self._replies,
             "refusals": self._refusals,
             "status_lines": self._status_lines,
@@ -194,9 +191,7 @@ class SlcanDecoder:
         # A frame ends at CR alone: a BEL means that the command before it was refused.
         if start >= 0 and not refused:
             frame = _parse_frame(line[start:])
-            if frame is not None and (frame.timestamp_ms or 0) > LAST_TIMESTAMP_MS:
-                self.late_stamps += 1
-            elif frame is not None and self._takes(frame.timestamp_ms is not None):
+            if frame is not None and self._takes(frame.timestamp_ms is not None):
                 self._skipped_bytes += start
                 return frame
         if _REPLY.fullmatch(line):
@@ -249,7 +244,7 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def _parse_frame(text: bytes) -> CanFrame | None:
-    """Parse a frame that the text must match exactly, None if it does not; any time stamp is accepted."""
+    """Parse a frame that the text must match exactly, None if it does not."""
     match = _FRAME.fullmatch(text)
     if match is None:
         return None

@@ -45,10 +45,6 @@ LONGEST_SETTLE_S: Final = 0.3
 
 MOST_SILENT_OPENINGS: Final = 10
 """Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
-MOST_LATE_STAMPS: Final = 4
-"""Lines lost to stamps that are no milliseconds of a minute, after which stamps of this adapter are switched off."""
-LATE_STAMPS_FRAMES: Final = 1000
-"""Frames within which those lines must come: an occasional flipped digit is no evidence on the adapter's clock."""
 
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
@@ -168,7 +164,6 @@ class SlcanSerialLink(Link):
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
-        self._late_stamps_from = (0, 0)
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = {"received_bytes": 0, "dropped_bytes": 0}
         self._unread = Unread()
@@ -218,12 +213,7 @@ class SlcanSerialLink(Link):
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
         self._ask_in_silence(self._serial, bool(scans), pieces[-1][1])
-        decoder = self._scans.decoder
-        late_before, frames_before = self._late_stamps_from
-        no_stamps = decoder.late_stamps - late_before >= MOST_LATE_STAMPS
-        if decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
-            self._late_stamps_from = decoder.late_stamps, decoder.frames
-        if self._stamps_on and (no_stamps or self._scans.clock.dropped):
+        if self._stamps_on and self._scans.clock.dropped:
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
             self._open_anew(self._serial, STAMPS_OFF)
@@ -292,7 +282,6 @@ class SlcanSerialLink(Link):
         frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M)))
         self._reader = PortReader(port.fileno())
