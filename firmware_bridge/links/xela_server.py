@@ -1,12 +1,12 @@
 """Link to the vendor's server, over WebSocket."""
 
+import re
 import socket
 import threading
 import time
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final, Self
-from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, WebSocketException
 from websockets.sync.client import ClientConnection, connect
@@ -20,6 +20,7 @@ from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES
 from firmware_bridge.scans.xela_server_scans import ServerScans
 
 OPENING_S: Final = 3.0
+_ADDRESS: Final = re.compile(r"ws://(\[[0-9a-f:.]+\]|[^\s/:@?#\[\]]+)(?::([0-9]{1,5}))?/?", re.IGNORECASE)
 
 
 class XelaServerLink(Link):
@@ -121,18 +122,13 @@ class XelaServerLink(Link):
 
 def server_address(url: str) -> tuple[str, int, str]:
     """Parse ws://HOST[:PORT] into host, port (5000 by default) and URL; raises SourceError on any other form."""
-    expected = "expected ws://HOST or ws://HOST:PORT"
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname, 5000 if parts.port is None else parts.port
-    except ValueError as error:
-        raise SourceError(f"address of the xela_server is {url!r}, {expected}: {error}") from error
-    if parts.scheme == "wss":
-        raise SourceError(f"address of the xela_server is {url!r}: it does not speak TLS, {expected}")
-    extra = parts.username is not None or parts.query or parts.fragment or parts.path not in ("", "/")
-    if parts.scheme != "ws" or not host or not port or extra or not url.isprintable() or " " in url:
-        raise SourceError(f"address of the xela_server is {url!r}, {expected}")
-    return host, port, f"ws://{f'[{host}]' if ':' in host else host}:{port}"
+    match = _ADDRESS.fullmatch(url)
+    port = int(match[2] or 5000) if match else 0
+    if match is None or not 0 < port < 1 << 16:
+        secure = ": it does not speak TLS" if url.lower().startswith("wss:") else ""
+        raise SourceError(f"address of the xela_server is {url!r}{secure}, expected ws://HOST or ws://HOST:PORT")
+    host = match[1].lower()
+    return host.strip("[]"), port, f"ws://{host}:{port}"
 
 
 def _unreachable(host: str, error: OSError | UnicodeError) -> str:
