@@ -24,7 +24,6 @@ frame that was never sent. The text does not show it. Such a value lasts for one
 """
 
 import re
-import struct
 from binascii import hexlify, unhexlify
 from typing import Final, NamedTuple
 
@@ -60,12 +59,11 @@ class _Form(NamedTuple):
     lines: re.Pattern[bytes]
     line_bytes: int
     frame_bytes: int
-    unpack: struct.Struct
 
 
 _FORMS: Final = {
-    False: _Form(re.compile(_USUAL % b""), 22, PACKED_BYTES, struct.Struct(">H8s")),
-    True: _Form(re.compile(_USUAL % _STAMP), 26, STAMPED_BYTES, struct.Struct(">H8sH")),
+    False: _Form(re.compile(_USUAL % b""), 22, PACKED_BYTES),
+    True: _Form(re.compile(_USUAL % _STAMP), 26, STAMPED_BYTES),
 }
 
 
@@ -126,22 +124,11 @@ class SlcanDecoder:
         self._form, self._same_in_a_row = None, 0
         self.usual_line_bytes = _FORMS[False].line_bytes
 
-    def feed(self, data: bytes) -> list[CanFrame]:
-        """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call."""
-        frames: list[CanFrame] = []
-        for piece in self.cut(data):
-            if isinstance(piece, CanFrame):
-                frames.append(piece)
-            else:
-                unpack = _FORMS[piece.frame_bytes == STAMPED_BYTES].unpack.iter_unpack
-                for id_and_length, payload, *stamp in unpack(piece.data):
-                    frames.append(CanFrame(id_and_length >> 4, payload, timestamp_ms=stamp[0] if stamp else None))
-        return frames
-
     def cut(self, data: bytes) -> list[PackedFrames | CanFrame]:
-        """Decode the same frames in their order, those of the usual form packed, run by run, once that form is learnt.
+        """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call.
 
-        A sensor sends no other form, and a run of sixteen costs about as much as a single frame.
+        Those of the usual form are packed, run by run, once that form is learnt. A sensor sends no other form, and a
+        run of sixteen costs about as much as a single frame.
         """
         buffer = self._pending + data
         pieces: list[PackedFrames | CanFrame] = []

@@ -1,6 +1,7 @@
 """Lines of slcan and their frames, whole and damaged."""
 
 import pytest
+from bridge_samples import decoded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,7 +18,7 @@ STAMPED = [GOLDEN[:-1] + b"%04X\r" % stamp_ms for stamp_ms in (0, 1, 0x1234, 59_
 def decode(*chunks: bytes) -> tuple[list[CanFrame], dict[str, int]]:
     """Return the frames, and the counters that are not zero."""
     decoder = SlcanDecoder()
-    frames = [frame for chunk in chunks for frame in decoder.feed(chunk)]
+    frames = [frame for chunk in chunks for frame in decoded(decoder, chunk)]
     return frames, {name: count for name, count in decoder.counters().items() if count}
 
 
@@ -123,7 +124,7 @@ def test_other_lines_are_counted(line, counted):
 )
 def test_the_status_of_the_adapter(lines, flags, bus_off):
     decoder = SlcanDecoder()
-    decoder.feed(GOLDEN + lines)
+    decoder.cut(GOLDEN + lines)
     assert (decoder.flags, decoder.bus_off) == (flags, bus_off)
 
 
@@ -155,7 +156,7 @@ def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
     few = LINES_TO_LEARN - 1
     decoder = SlcanDecoder()
     assert decoder.usual_line_bytes == len(GOLDEN)
-    decoder.feed(b"".join(usual))
+    decoder.cut(b"".join(usual))
     assert decoder.usual_line_bytes == len(usual[0])
     # Before that both are taken, in any order.
     assert len(decode(b"".join((usual[:few] + other[:few]) * 3))[0]) == 6 * few
@@ -171,12 +172,12 @@ def test_the_form_of_lines_is_learnt_from_four_in_a_row(usual, other):
 
 def test_what_breaks_the_row_begins_it_anew():
     decoder = SlcanDecoder()
-    decoder.feed(GOLDEN * 5)
+    decoder.cut(GOLDEN * 5)
     for between in (GOLDEN, b"T1FFFFFFF2ABCD\r"):
-        assert decoder.feed(b"".join(STAMPED[:3])) == []
-        assert len(decoder.feed(between)) == 1
-    assert decoder.feed(b"".join(STAMPED[:3]) + b"z\rnoise\r") == []
-    assert len(decoder.feed(STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
+        assert decoded(decoder, b"".join(STAMPED[:3])) == []
+        assert len(decoded(decoder, between)) == 1
+    assert decoded(decoder, b"".join(STAMPED[:3]) + b"z\rnoise\r") == []
+    assert len(decoded(decoder, STAMPED[3])) == 1, "neither replies nor bad lines are frames of the other form"
 
 
 # Damaged lines: bytes that are changed, cut, lost or of noise.
@@ -252,5 +253,5 @@ def test_no_loss_makes_a_frame_once_stamps_are_learnt():
     for start in range(len(line)):
         for end in range(start + 1, len(line)):
             decoder = SlcanDecoder()
-            decoder.feed(line * LINES_TO_LEARN)
-            assert decoder.feed(line[:start] + line[end:] + line) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)]
+            decoder.cut(line * LINES_TO_LEARN)
+            assert decoded(decoder, line[:start] + line[end:] + line) == [GOLDEN_FRAME._replace(timestamp_ms=0x1234)]

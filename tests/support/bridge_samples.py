@@ -4,6 +4,7 @@ import csv
 import os
 import random
 import select
+import struct
 import time
 import tty
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.can.slcan import STAMPED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
@@ -35,6 +36,19 @@ def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
     """Return the frames of so many scans that all differ."""
     noise = random.Random(seed)
     return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
+
+
+def decoded(decoder: SlcanDecoder, data: bytes) -> list[CanFrame]:
+    """Return the frames that a decoder finds, one by one."""
+    frames: list[CanFrame] = []
+    for piece in decoder.cut(data):
+        if isinstance(piece, CanFrame):
+            frames.append(piece)
+            continue
+        layout = ">H8sH" if piece.frame_bytes == STAMPED_BYTES else ">H8s"
+        for id_and_length, payload, *stamp in struct.iter_unpack(layout, piece.data):
+            frames.append(CanFrame(id_and_length >> 4, payload, timestamp_ms=stamp[0] if stamp else None))
+    return frames
 
 
 def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recording:
