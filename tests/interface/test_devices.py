@@ -231,7 +231,7 @@ def test_what_is_wrong_is_read_from_what_came(said):
             "30 messages .* no reading in them: they name no sensor",
         ),
         ({"messages": 30, "foreign_sensor": 30}, "no reading in them: their sensors are of another pad: --id-map"),
-        ({"messages": 9, "bad_json": 9, "received_bytes": 99}, "they are no JSON: another server"),
+        ({"messages": 9, "bad_json": 9, "received_bytes": 99}, "they are no JSON with a number: another server"),
         ({"messages": 1, "welcomes": 1}, "the server only greets"),
         ({"messages": 5}, "no whole scan in them"),
         ({"received_bytes": 12, "replies": 4}, "12 bytes came, the adapter's answers alone: is the sensor powered"),
