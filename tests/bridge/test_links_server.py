@@ -39,17 +39,6 @@ def test_every_scan_comes_once_and_in_order(version):
     assert counters == {"messages": 31, "welcomes": 1, "scans": 60}
 
 
-def test_a_client_that_does_not_read_counts_what_it_missed():
-    with ServerEmulator(looping()) as server, XelaServerLink(server.url) as link:
-        read_scans(link, 1)
-        sent = server.sent_messages
-        wait_for(lambda: server.sent_messages > sent + 30)
-        while not server.lost_messages:
-            server.say(" " * 200_000)  # fills what the kernel and the server keep
-        wait_for(lambda: server.lost_messages > 30)
-        wait_for(lambda: link.read(0.1) is not None and link.counters()["missed_messages"])
-
-
 def test_sensors_of_other_shapes_are_left_out():
     with ServerEmulator(looping(others=[("uSPa46", 24)])) as server, XelaServerLink(server.url) as link:
         assert {scan.sensor for scan in read_scans(link, 5)} == {"1"}
@@ -84,25 +73,6 @@ def test_edge_sr_reads_a_server(tmp_path, capsys):
 
 
 # It goes, hangs and comes back.
-
-
-def test_a_server_that_restarts_counts_its_messages_anew():
-    with ServerEmulator(looping()) as server:
-        link = XelaServerLink(server.url)
-        for _ in range(2):
-            with link:
-                read_scans(link, 5)
-                server.kill()
-            server.start_again()
-        counters = link.counters()
-        assert counters["server_restarts"] == counters["missed_messages"] == 0
-        with link:  # and one that does so without closing
-            read_scans(link, 2)
-            server.count_from(1000)
-            wait_for(lambda: link.read(0.05) and link.counters()["missed_messages"] > 900)
-            server.count_from(0)
-            server.say('{"message": "Welcome"}')
-            wait_for(lambda: link.read(0.05) and link.counters()["server_restarts"] == 1)
 
 
 def test_a_dead_sensor_is_told_of_once_and_not_taken_for_back():

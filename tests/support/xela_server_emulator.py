@@ -155,14 +155,13 @@ class ServerEmulator:
 
     Attributes:
         url: ws://HOST:PORT, once entered.
-        sent_messages: number of messages sent to a client, without greetings.
         lost_messages: number of messages without room at a client.
     """
 
     def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
         """Prepare to serve so many messages a second."""
         self.url = ""
-        self.sent_messages = self.lost_messages = 0
+        self.lost_messages = 0
         self._vendor, self._message_hz = server, message_hz
         self._port = 0
         self._sequence = 0
@@ -206,10 +205,6 @@ class ServerEmulator:
         """Go on after `freeze`; the messages of the time between are never sent."""
         self._thawed.set()
 
-    def count_from(self, sequence: int) -> None:
-        """Give the next message this number."""
-        self._sequence = sequence
-
     def say(self, text: str | bytes) -> None:
         """Send any text or bytes to every client; bytes as a binary message."""
         self._ask(self._send(text))
@@ -242,7 +237,6 @@ class ServerEmulator:
             if client.transport.get_write_buffer_size() > 1 << 20:  # unread bytes
                 self.lost_messages += 1
             else:
-                self.sent_messages += 1
                 broadcast([client], text)
 
     async def _close(self, code: int, reason: str) -> None:
