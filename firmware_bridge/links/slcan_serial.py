@@ -11,7 +11,7 @@ import select
 import termios
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
@@ -26,7 +26,6 @@ from firmware_bridge.can.slcan import (
     STAMPS_OFF,
     STAMPS_ON,
     STATUS_FLAGS,
-    CanFrame,
     encode_frame,
 )
 from firmware_bridge.errors import DeviceError, LinkLostError
@@ -146,15 +145,14 @@ class SlcanSerialLink(Link):
         baudrate: int = DEFAULT_BAUD,
         *,
         model: ModelMap = USPA44_MAP,
-        triggers: Sequence[CanFrame] = (),
     ) -> None:
-        """Prepare a link; nothing is opened yet. `triggers` are frames that wake older controllers, after opening."""
+        """Prepare a link; nothing is opened yet."""
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
         self.baudrate = baudrate
-        self._triggers = tuple(triggers)
+        self._triggers = model.triggers
         self._plugged = PluggedAdapter(port)
         # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
         self._asks_stamps = baudrate >= 1_000_000

@@ -18,7 +18,7 @@ from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links import gs_usb_link
 from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.gs_usb_link import gs_usb_devices as list_devices
-from firmware_bridge.scans.can_id_maps import trigger_frame
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
 
 
 def opened(port=None, **settings):
@@ -241,7 +241,7 @@ class Full(GsUsbAdapter):
     ],
 )
 def test_adapters_that_cannot_be_used_are_given_back(adapter, words):
-    port, link = opened(GsUsbPort(adapter), triggers=[trigger_frame(1)])
+    port, link = opened(GsUsbPort(adapter), model=LAYOUT_A_MAP)
     port.kernel_driver = True
     with pytest.raises(DeviceError, match=words):
         link.__enter__()

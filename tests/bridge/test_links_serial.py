@@ -18,7 +18,7 @@ from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import PortReader, SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
 
@@ -121,7 +121,10 @@ def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
     [
         ({}, b"C\rS8\rZ1\rO\rC\rZ0\r"),
         ({"baudrate": 921_600}, b"C\rS8\rO\rC\r"),  # the line carries no time stamps
-        ({"triggers": [trigger_frame(1)]}, b"C\rS8\rZ1\rO\rt20120700\rC\rZ0\r"),
+        (
+            {"model": LAYOUT_A_MAP},
+            b"C\rS8\rZ1\rO\r" + b"".join(b"t20%d20700\r" % board for board in range(1, 8)) + b"C\rZ0\r",
+        ),
     ],
 )
 def test_commands_on_opening_and_closing(settings, commands):
