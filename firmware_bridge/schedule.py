@@ -68,7 +68,6 @@ LINK_SILENT_S: Final = 0.7
 """Time without a scan after which a link is opened again: a little more than a sensor's silence, which must not."""
 ADAPTER_ASKED_NS: Final = 500_000_000
 """Time without a scan after which an adapter's status, which can explain the silence, is requested."""
-SERVER_QUIET_S: Final = 0.75  # time without a message after which the vendor's server is pinged
 
 # ---- A person, or a program that waits ----
 

@@ -184,8 +184,7 @@ All other options are those of edge-sr: its --help lists sources, outputs and ke
                 Option(
                     "file FILE",
                     str,
-                    "recording, .mcap, .npz, .csv or a rosbag2 folder; of several sensors a file each, "
-                    "also as FILE,FILE",
+                    "recording, .mcap, .npz or .csv; of several sensors a file each, also as FILE,FILE",
                     nargs="*",
                 ),
                 Option("--example", bool, "play what is bundled: two emulated fingers grip a pen and a nut"),
@@ -229,7 +228,7 @@ examples:
         (
             Group(
                 "recording",
-                Option("recording FILE", str, "recording, .mcap, .npz, .csv or a rosbag2 folder"),
+                Option("recording FILE", str, "recording, .mcap, .npz or .csv"),
                 Option("new NEW", str, "new file, .mcap, .npz or .csv"),
                 Option("--rate-hz R", positive, "scans a second of a .csv that does not state it"),
             ),

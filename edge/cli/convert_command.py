@@ -33,7 +33,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     Of a new file that cannot be written nothing is left.
     """
     source, target = Path(options.recording), Path(options.new)
-    was, ending = ".mcap" if source.is_dir() else source.suffix.lower(), target.suffix.lower()
+    was, ending = source.suffix.lower(), target.suffix.lower()
     if ending not in _WRITERS:
         raise UsageError(f"{target}: expected a name that ends in .mcap, .npz or .csv")
     if was == ending:

@@ -214,10 +214,7 @@ _MESSAGES: Final = {
     "without_readings": "they name no sensor: is one plugged in, and in the server's xServ.ini?",
     "foreign_sensor": "their sensors are of another pad: --id-map",
     "bad_sensor": "the counts of their sensors are not those of a pad",
-    "bad_json": "they are no JSON: another server answers at this address",
-    "bad_sequence": "they have no number: another server answers at this address",
-    "too_long": "they are too long: another server answers at this address",
-    "duplicate_keys": "their keys are not unique: another server answers at this address",
+    "bad_json": "they are no JSON with a number: another server answers at this address",
     "welcomes": "the server only greets: is a sensor plugged in, and in its xServ.ini?",
 }
 """Reasons why messages of a server gave no reading, by their counters."""

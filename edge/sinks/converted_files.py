@@ -13,7 +13,6 @@ from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
@@ -25,7 +24,6 @@ from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PoseTrack, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
-from firmware_bridge.recording.mcap_reader import mcap_files
 from firmware_bridge.recording.mcap_records import DamageError, EncodedMessage, records
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.recording.scan_messages import (
@@ -135,9 +133,7 @@ def recorded_rows(path: Path, geometry: SensorGeometry, origin: str) -> Iterator
 
     Raises a RecordingError where a result or a map cannot be read.
     """
-    baselines: dict[str, Baseline] = {}
-    for file in mcap_files(path)[0]:
-        yield from _Rows(file, geometry, origin, baselines).rows()
+    yield from _Rows(path, geometry, origin).rows()
 
 
 class _Topic(NamedTuple):
@@ -148,8 +144,9 @@ class _Topic(NamedTuple):
 
 
 class _Rows:
-    def __init__(self, path: Path, geometry: SensorGeometry, origin: str, baselines: dict[str, Baseline]) -> None:
-        self._path, self._geometry, self._origin, self._baselines = path, geometry, origin, baselines
+    def __init__(self, path: Path, geometry: SensorGeometry, origin: str) -> None:
+        self._path, self._geometry, self._origin = path, geometry, origin
+        self._baselines: dict[str, Baseline] = {}
         self._types: dict[int, MessageType] = {}
         self._topics: dict[int, _Topic] = {}
         self._taps = 1
@@ -159,7 +156,6 @@ class _Rows:
     def rows(self) -> Iterator[dict[str, Any]]:
         try:
             with self._path.open("rb") as file:
-                file.seek(len(MCAP0_MAGIC))
                 for record in records(file):
                     if not isinstance(record, EncodedMessage):
                         self._take(record)

@@ -6,8 +6,7 @@ The adapter sends host frames, little-endian, usually one in a USB transfer:
 
 echo_id is all ones for a frame from the bus, else the number of a frame that this side sent and that went out. can_id
 holds three flags (extended, remote, error). A transfer begins with a frame, and a packet that is not full ends it: a
-frame that is incomplete by then stays incomplete. Within a transfer nothing marks the beginning of a frame, so a header
-is accepted only if an adapter could send every field of it; otherwise bytes are skipped until one is acceptable.
+frame that is incomplete by then stays incomplete. USB has checksums, so that no other bytes come between frames.
 
 Source: Linux drivers/net/can/usb/gs_usb.c; candleLight_fw include/gs_usb.h.
 """
@@ -26,9 +25,7 @@ HOST_FORMAT: Final = 0
 BIT_TIMING: Final = 1
 MODE: Final = 2
 BIT_TIMING_LIMITS: Final = 4
-DEVICE_CONFIG: Final = 5
 LIMITS_BYTES: Final = 40
-CONFIG_BYTES: Final = 12
 
 HARDWARE_STAMPS: Final = 1 << 4
 LPC546XX_QUIRK: Final = 1 << 9  # feature flag of a chip that needs one more byte after every frame sent to it
@@ -115,13 +112,6 @@ def bit_timing(limits: BitTimingLimits) -> BitTiming:
     return min(timings, key=lambda timing: (abs(timing.sample_point - 0.875), timing.brp))
 
 
-def channel_count(config: bytes) -> int:
-    """Decode the number of channels from the answer to the request DEVICE_CONFIG; ValueError if it is too short."""
-    if len(config) < CONFIG_BYTES:
-        raise ValueError(f"device configuration has {len(config)} bytes, expected {CONFIG_BYTES}")
-    return config[3] + 1
-
-
 def host_format() -> bytes:
     """Encode the choice of little-endian; all but the first adapters support nothing else."""
     return struct.pack("<I", 0x0000BEEF)
@@ -158,40 +148,29 @@ class HostFrame(NamedTuple):
 class GsUsbDecoder:
     """Decoder of a byte stream into host frames. Any chunking gives the same frames and the same counters."""
 
-    def __init__(self, *, stamped: bool, channels: int = 1) -> None:
-        """Configure the decoder as the adapter was started: with time stamps or not, and with so many channels."""
+    def __init__(self, *, stamped: bool) -> None:
+        """Configure the decoder as the adapter was started: with time stamps or not."""
         self._stamped = stamped
-        self._channels = channels
         self._frame_bytes = FRAME_BYTES + 4 * stamped
         self._pending = b""
-        self._in_step = True
         self._counts = dict.fromkeys(("frames", "error_frames", "echoes", "other_channels", "fd_frames"), 0)
         self._skipped_bytes = 0
 
     def end_transfer(self) -> None:
         """Discard an incomplete frame: the next transfer begins with another one."""
         self._skipped_bytes += len(self._pending)
-        self._pending, self._in_step = b"", True
+        self._pending = b""
 
     def feed(self, data: bytes) -> list[HostFrame]:
         """Decode frames of channel 0 whose last byte lies in `data`; without echoes, FD frames and other channels."""
         buffer = self._pending + data
-        end = len(buffer)
         position = 0
         taken: list[HostFrame] = []
-        while end - position >= HEADER_BYTES:
+        while len(buffer) - position >= HEADER_BYTES:
             echo_id, raw_id, dlc, channel, flags, _ = _header.unpack_from(buffer, position)
-            # Where a frame must begin, a header of a channel that was not announced is valid as well.
-            known = channel < self._channels or self._in_step
-            if not known or not self._plausible(echo_id, raw_id, dlc, flags):
-                self._skipped_bytes += 1
-                self._in_step = False
-                position += 1
-                continue
             size = self._frame_bytes + (64 - 8 if flags & FD_FLAG else 0)
-            if end - position < size:
+            if len(buffer) - position < size:
                 break
-            self._in_step = True
             if echo_id != RECEIVED:
                 self._counts["echoes"] += 1
             elif channel != 0:
@@ -207,14 +186,6 @@ class GsUsbDecoder:
     def counters(self) -> dict[str, int]:
         """Return the counts of frames, of each kind that is left out, and of bytes that belong to no frame."""
         return self._counts | {"skipped_bytes": self._skipped_bytes}
-
-    def _plausible(self, echo_id: int, raw_id: int, dlc: int, flags: int) -> bool:
-        return (
-            (echo_id == RECEIVED or echo_id < ECHO_IDS)
-            and (raw_id & (EXTENDED | ERROR) != 0 or raw_id & _HIGHEST_EXTENDED <= 0x7FF)
-            and dlc <= 15
-            and flags <= 0x0F
-        )
 
     def _read(self, buffer: bytes, position: int, raw_id: int, dlc: int, flags: int) -> HostFrame:
         start = position + HEADER_BYTES

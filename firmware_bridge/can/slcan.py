@@ -14,26 +14,29 @@ A prefix cannot harm the frame after it, which is checked as if it stood alone. 
 INTO a letter starts a false frame, but too few characters follow it for eight data bytes; only the
 length digit of a stamped line leaves enough, and that false frame has no stamp.
 
+Of an adapter's own lines it takes the state, such as "sb000000", b for bus-off (Linux slcan-core.c), errors on the bus,
+such as "e1s", and eight flags in answer to `F`, which the request clears (Lawicel CAN232 manual, version 3). EasySYNC
+adapters answer without the F: that is a bad line.
+
 The limit: slcan has no checksum on the serial leg. A flipped hex digit, and a loss of exactly one
 line's length across two lines (the head of one frame with the tail of the next), give a well-formed
 frame that was never sent. The text does not show it. Such a value lasts for one scan.
 """
 
 import re
-import struct
 from binascii import hexlify, unhexlify
 from typing import Final, NamedTuple
-
-from firmware_bridge.can.slcan_status import AdapterStatus
 
 CLOSE: Final = b"C\r"
 BITRATE_1M: Final = b"S8\r"
 OPEN: Final = b"O\r"
 STAMPS_ON: Final = b"Z1\r"
 STAMPS_OFF: Final = b"Z0\r"
+STATUS_FLAGS: Final = b"F\r"
+BUS_FLAGS: Final = 0xA0  # flags of errors on the bus, and of a controller that these have made passive
 
 LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp
-LAST_TIMESTAMP_MS: Final = 59_999
+LAST_TIMESTAMP_MS: Final = 59_999  # of an adapter whose clock counts milliseconds; others count on
 
 LINES_TO_LEARN: Final = 4
 """Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
@@ -41,11 +44,13 @@ LINES_TO_LEARN: Final = 4
 PACKED_BYTES: Final = 10  # bytes of a usual frame packed: twelve bits of id, four of length (8), eight bytes of data
 STAMPED_BYTES: Final = 12  # bytes of a usual frame packed with two bytes of time stamp, in [ms]
 
-_STAMP = rb"(?:[0-9A-Da-d][0-9A-Fa-f]{3}|[Ee](?:[0-9][0-9A-Fa-f]{2}|[Aa][0-5][0-9A-Fa-f]))"
+_STAMP = rb"[0-9A-Fa-f]{4}"
 _USUAL = rb"(?:t[0-7][0-9A-Fa-f]{2}8[0-9A-Fa-f]{16}%s\r)+"
 _FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7}))([0-8])([0-9A-Fa-f]*)")
 _LINE_END = re.compile(rb"[\r\a]")
 _REPLY = re.compile(rb"[zZ]?|[VN][0-9A-Za-z]{4}")
+_FLAGS = re.compile(rb"F[0-9A-Fa-f]{2}")
+_STATUS = re.compile(rb"s[awpb][0-9]{6}|e[1-9][abBcfoOs]{1,9}")
 
 
 class _Form(NamedTuple):
@@ -54,12 +59,11 @@ class _Form(NamedTuple):
     lines: re.Pattern[bytes]
     line_bytes: int
     frame_bytes: int
-    unpack: struct.Struct
 
 
 _FORMS: Final = {
-    False: _Form(re.compile(_USUAL % b""), 22, PACKED_BYTES, struct.Struct(">H8s")),
-    True: _Form(re.compile(_USUAL % _STAMP), 26, STAMPED_BYTES, struct.Struct(">H8sH")),
+    False: _Form(re.compile(_USUAL % b""), 22, PACKED_BYTES),
+    True: _Form(re.compile(_USUAL % _STAMP), 26, STAMPED_BYTES),
 }
 
 
@@ -84,17 +88,17 @@ class SlcanDecoder:
     """Decoder of a byte stream into frames. Any chunking gives the same frames and the same counters.
 
     Attributes:
-        status: the state that the adapter has reported.
+        flags: flags that the adapter has answered last.
+        status_answers: number of these answers so far.
         frames: number of frames so far, of any kind.
-        refusals: number of BELs so far.
-        late_stamps: number of lines lost so far because their time stamp was beyond LAST_TIMESTAMP_MS.
-        usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
+            usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
             form until the form is learnt.
         pending_bytes: number of bytes of an unfinished line.
     """
 
     def __init__(self) -> None:
-        self.status = AdapterStatus()
+        self.flags = self.status_answers = self._status_lines = 0
+        self._off_at_frame: int | None = None
         self.usual_line_bytes = _FORMS[False].line_bytes
         self._form: _Form | None = None
         self._newest_stamped = False
@@ -105,9 +109,13 @@ class SlcanDecoder:
         self._bad_lines = 0
         self._non_ascii_lines = 0
         self._skipped_bytes = 0
-        self.late_stamps = 0
         self._replies = 0
-        self.refusals = 0
+        self._refusals = 0
+
+    @property
+    def bus_off(self) -> bool:
+        """True if the adapter has reported bus-off, and since then no frame has come."""
+        return self._off_at_frame == self.frames
 
     def begin_anew(self) -> None:
         """Discard an unfinished line and the learnt form: the link broke, and the next bytes belong to neither."""
@@ -116,22 +124,11 @@ class SlcanDecoder:
         self._form, self._same_in_a_row = None, 0
         self.usual_line_bytes = _FORMS[False].line_bytes
 
-    def feed(self, data: bytes) -> list[CanFrame]:
-        """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call."""
-        frames: list[CanFrame] = []
-        for piece in self.cut(data):
-            if isinstance(piece, CanFrame):
-                frames.append(piece)
-            else:
-                unpack = _FORMS[piece.frame_bytes == STAMPED_BYTES].unpack.iter_unpack
-                for id_and_length, payload, *stamp in unpack(piece.data):
-                    frames.append(CanFrame(id_and_length >> 4, payload, timestamp_ms=stamp[0] if stamp else None))
-        return frames
-
     def cut(self, data: bytes) -> list[PackedFrames | CanFrame]:
-        """Decode the same frames in their order, those of the usual form packed, run by run, once that form is learnt.
+        """Decode the frames whose last byte lies in `data`; the bytes after them wait for the next call.
 
-        A sensor sends no other form, and a run of sixteen costs about as much as a single frame.
+        Those of the usual form are packed, run by run, once that form is learnt. A sensor sends no other form, and a
+        run of sixteen costs about as much as a single frame.
         """
         buffer = self._pending + data
         pieces: list[PackedFrames | CanFrame] = []
@@ -169,31 +166,43 @@ class SlcanDecoder:
             "bad_lines": self._bad_lines,
             "non_ascii_lines": self._non_ascii_lines,
             "skipped_bytes": self._skipped_bytes,
-            "late_stamps": self.late_stamps,
             "replies": self._replies,
-            "refusals": self.refusals,
-        } | self.status.counts
+            "refusals": self._refusals,
+            "status_lines": self._status_lines,
+            "status_answers": self.status_answers,
+        }
 
     def _read_line(self, line: bytes, *, refused: bool) -> CanFrame | None:
-        self.refusals += refused
+        self._refusals += refused
         start = max(line.rfind(letter) for letter in (b"t", b"T", b"r", b"R"))
         # A frame ends at CR alone: a BEL means that the command before it was refused.
         if start >= 0 and not refused:
             frame = _parse_frame(line[start:])
-            if frame is not None and (frame.timestamp_ms or 0) > LAST_TIMESTAMP_MS:
-                self.late_stamps += 1
-            elif frame is not None and self._takes(frame.timestamp_ms is not None):
+            if frame is not None and self._takes(frame.timestamp_ms is not None):
                 self._skipped_bytes += start
                 return frame
         if _REPLY.fullmatch(line):
             self._replies += not refused
-        elif not self.status.hear(line, self.frames):
+        elif not self._takes_status(line):
             self._skipped_bytes += len(line)
             if line[-LONGEST_LINE:].isascii():
                 self._bad_lines += 1
             else:
                 self._non_ascii_lines += 1
         return None
+
+    def _takes_status(self, line: bytes) -> bool:
+        """Take flags, a state or errors; False if the line is none of these."""
+        if _FLAGS.fullmatch(line):
+            self.flags = int(line[1:], 16)
+            self.status_answers += 1
+        elif _STATUS.fullmatch(line) and (line[:1] == b"s" or int(line[1:2]) == len(line) - 2):
+            self._status_lines += 1
+            if line[:1] == b"s":
+                self._off_at_frame = self.frames if line[1:2] == b"b" else None
+        else:
+            return False
+        return True
 
     def _takes(self, stamped: bool) -> bool:
         """Return True if the adapter sends frames of this form, and learn the form from it."""
@@ -222,7 +231,7 @@ def encode_frame(frame: CanFrame) -> bytes:
 
 
 def _parse_frame(text: bytes) -> CanFrame | None:
-    """Parse a frame that the text must match exactly, None if it does not; any time stamp is accepted."""
+    """Parse a frame that the text must match exactly, None if it does not."""
     match = _FRAME.fullmatch(text)
     if match is None:
         return None

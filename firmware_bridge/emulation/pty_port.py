@@ -77,14 +77,6 @@ class PseudoPort:
         select.select([self._client_fd], [], [], 0)
         return struct.unpack("i", fcntl.ioctl(self._client_fd, termios.FIONREAD, bytes(4)))[0]
 
-    def left_bytes(self) -> int:
-        """Return the number of bytes left by a client that has stopped reading."""
-        counted = 0
-        for _ in range(4):  # a busy kernel counts sent bytes as unread up to 10 ms late
-            counted = max(counted, self.unread_bytes())
-            time.sleep(0.0025)
-        return counted
-
 
 def listen(ports: Iterable[PseudoPort], timeout_s: float) -> dict[PseudoPort, bytes]:
     """Return the bytes that clients have written, by port; waits at most `timeout_s` [s] for the first."""

@@ -213,7 +213,6 @@ class LinkReader:
         self._give_up_s = give_up_s if link.lasts else 0.0
         self._clock_ns, self._sleep = clock_ns, sleep
         self._entered = False
-        self._kind = link.kind
         self._trouble: str | None = None
         self._stamps_dropped = False
         self._notices: list[Notice] = []
@@ -224,7 +223,6 @@ class LinkReader:
     def __enter__(self) -> Self:
         self._guarded(self.link.__enter__)
         self._entered = True
-        self._kind = self.link.kind
         self._received_ns = self._clock_ns()
         return self
 
@@ -329,8 +327,6 @@ class LinkReader:
             return
         self._entered, self._away = True, False
         self.reopenings += 1
-        if self.link.kind != self._kind:  # every result would go on to state the first kind
-            raise LinkLostError(f"{self.link.name} was {self._kind} and came back as {self.link.kind}: start again")
 
     def _guarded(self, call: Callable[..., _Answer], *arguments: object) -> _Answer:
         """Return what the link returns; any error that no link is expected to raise is a LinkLostError."""

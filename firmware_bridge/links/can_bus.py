@@ -3,7 +3,7 @@
 import errno
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from types import ModuleType
 from typing import Any, Final, Self
@@ -40,16 +40,16 @@ class CanBusLink(FrameLink):
         channel: str,
         *,
         model: ModelMap = USPA44_MAP,
-        triggers: Sequence[CanFrame] = (),
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Prepare a link to a channel such as "can0" of a python-can interface such as "socketcan"; opens nothing yet.
 
-        `triggers` are frames that wake older controllers, sent once after opening. It raises SourceError for an
-        interface that python-can or this link does not support, and DeviceError where python-can is not installed.
+        It raises SourceError for an interface that python-can or this link does not support, and DeviceError where
+        python-can is not installed.
         """
         self._scans = FrameScans(model)
-        super().__init__(self._scans, triggers, clock_ns)
+        super().__init__(self._scans, clock_ns)
+        self._triggers = model.triggers
         self.name = f"can:{interface}:{channel}"
         no_wire = interface == "socketcan" and channel.startswith(("vcan", "vxcan"))  # every device there is emulated
         self.kind: SourceKind = "emulated" if no_wire or interface in PRETENDED else "device"

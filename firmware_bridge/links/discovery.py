@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple
 
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.errors import DeviceError
-from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, holders, latency_timer_ms, serial_ports
+from firmware_bridge.links.serial_ports import NO_PERMISSION, Port, holders, serial_ports
 
 SYS_ROOT: Final = Path("/sys")
 
@@ -79,9 +79,7 @@ def devices() -> tuple[list[Found], list[str]]:
 
 
 def serial_devices(
-    ports: Sequence[Port],
-    sys_root: Path = SYS_ROOT,
-    may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK),
+    ports: Sequence[Port], may_open: Callable[[str], bool] = lambda path: os.access(path, os.R_OK | os.W_OK)
 ) -> list[Found]:
     """Describe the serial ports, in their order; `may_open` returns True if this user may read and write a path."""
     serials = [port.serial_number for port in ports]
@@ -94,11 +92,6 @@ def serial_devices(
             problems.append(NO_PERMISSION)
         if held := holders(port.path):
             problems.append(f"held by {', '.join(held)}: end it first")
-        latency_ms = latency_timer_ms(port.path, sys_root / "bus/usb-serial/devices") or 0
-        if latency_ms >= 16:
-            problems.append(
-                f"latency timer at {latency_ms} ms: edge-sr sets 1 ms when it opens it; other programs read in bunches"
-            )
         found.append(
             Found(
                 "serial",

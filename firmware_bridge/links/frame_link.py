@@ -1,10 +1,9 @@
 """Link to an adapter that gives frames one by one, for gs_usb and python-can."""
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.links.base import Link, Unread
 from firmware_bridge.scans.frame_scans import FrameScans
 from firmware_bridge.scans.scan import Scan
@@ -13,9 +12,8 @@ from firmware_bridge.scans.scan import Scan
 class FrameLink(Link):
     """Link to an adapter that gives frames one by one, which is asked for them until a scan closes."""
 
-    def __init__(self, scans: FrameScans, triggers: Sequence[CanFrame], clock_ns: Callable[[], int]) -> None:
+    def __init__(self, scans: FrameScans, clock_ns: Callable[[], int]) -> None:
         self._stages = scans
-        self._triggers = tuple(triggers)
         self._clock_ns = clock_ns
         self._unread = Unread()
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks

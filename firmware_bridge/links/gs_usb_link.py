@@ -14,7 +14,6 @@ import usb.util
 from usb.backend import IBackend
 
 from firmware_bridge.can import gs_usb
-from firmware_bridge.can.slcan import CanFrame
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.frame_link import FrameLink
@@ -80,17 +79,17 @@ class GsUsbLink(FrameLink):
         wanted: str | None = None,
         *,
         model: ModelMap = USPA44_MAP,
-        triggers: Sequence[CanFrame] = (),
         backend: IBackend | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Prepare a link to the adapter with a serial number or at a place such as "1-2.3", for None the only one.
 
-        Once it was open, only that adapter is opened again, or with a place the one that is there. `triggers` are
-        frames that wake older controllers, sent once after opening, and `backend` is one of pyusb, by default libusb.
+        Once it was open, only that adapter is opened again, or with a place the one that is there. `backend` is one of
+        pyusb, by default libusb.
         """
         self._scans = GsUsbScans(model)
-        super().__init__(self._scans, triggers, clock_ns)
+        super().__init__(self._scans, clock_ns)
+        self._triggers = model.triggers
         self.name = "gs_usb" if wanted is None else f"gs_usb:{wanted}"
         self.kind: SourceKind = "device"
         self._wanted = wanted
@@ -174,11 +173,10 @@ class GsUsbLink(FrameLink):
     def _start(self, device: usb.core.Device) -> None:
         _request(device, gs_usb.HOST_FORMAT, gs_usb.host_format())
         self._stop(device)
-        channels = gs_usb.channel_count(_ask(device, gs_usb.DEVICE_CONFIG, gs_usb.CONFIG_BYTES))
         limits = gs_usb.BitTimingLimits.from_bytes(_ask(device, gs_usb.BIT_TIMING_LIMITS, gs_usb.LIMITS_BYTES))
         _request(device, gs_usb.BIT_TIMING, gs_usb.bit_timing(limits).to_bytes())
         features = limits.features & gs_usb.HARDWARE_STAMPS
-        self._scans.start(stamped=features != 0, channels=channels)
+        self._scans.start(stamped=features != 0)
         self._unread.empty_ns = self._clock_ns()  # from here on: this thread may not run for long after the start
         _request(device, gs_usb.MODE, gs_usb.mode(started=True, features=features))
         for number, frame in enumerate(self._triggers):

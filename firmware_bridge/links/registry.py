@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import find_adapter, find_by_serial, serial_ports
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap, trigger_frames
+from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.mounting import Mounting, placed_map
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def open_source(
         from firmware_bridge.links.slcan_serial import DEFAULT_BAUD, SlcanSerialLink
 
         port, baud = (find_adapter(serial_ports()).path, None) if text is None else _port_and_baud(text, rest)
-        link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=placed, triggers=trigger_frames(placed))
+        link = SlcanSerialLink(port, baud or DEFAULT_BAUD, model=placed)
         link.name = text or link.name
     elif scheme == "xela-server" and rest:
         from firmware_bridge.links.xela_server import XelaServerLink
@@ -104,11 +104,11 @@ def open_source(
     elif text == "gs_usb" or (scheme == "gs_usb" and rest):
         from firmware_bridge.links.gs_usb_link import GsUsbLink
 
-        link = GsUsbLink(rest or None, model=placed, triggers=trigger_frames(placed))
+        link = GsUsbLink(rest or None, model=placed)
     elif scheme == "can" and channel:
         from firmware_bridge.links.can_bus import CanBusLink
 
-        link = CanBusLink(interface, channel, model=placed, triggers=trigger_frames(placed))
+        link = CanBusLink(interface, channel, model=placed)
     elif scheme == "replay" and rest:
         from firmware_bridge.links.replay import ReplayLink
         from firmware_bridge.recording.formats import load_recording

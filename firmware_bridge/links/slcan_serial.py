@@ -8,28 +8,33 @@ import errno
 import math
 import os
 import select
+import termios
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Self
 
 import serial
 
-try:
-    import termios
-except ImportError:
-    termios = None
-
-from firmware_bridge.can.slcan import BITRATE_1M, CLOSE, OPEN, STAMPS_OFF, STAMPS_ON, CanFrame, encode_frame
-from firmware_bridge.can.slcan_status import STATUS_FLAGS, StatusQuestions
+from firmware_bridge.can.slcan import (
+    BITRATE_1M,
+    BUS_FLAGS,
+    CLOSE,
+    OPEN,
+    STAMPS_OFF,
+    STAMPS_ON,
+    STATUS_FLAGS,
+    encode_frame,
+)
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import Link, SourceKind, Unread, not_open
 from firmware_bridge.links.serial_ports import NO_PERMISSION, PluggedAdapter, in_use, serial_ports
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.scans.slcan_scans import SlcanScans
+from firmware_bridge.schedule import ADAPTER_ASKED_NS
 
 DEFAULT_BAUD: Final = 3_000_000
 WRITE_TIMEOUT_S: Final = 1.0
@@ -39,10 +44,6 @@ LONGEST_SETTLE_S: Final = 0.3
 
 MOST_SILENT_OPENINGS: Final = 10
 """Openings in a row without a scan after which stamps are not requested: a lasting link may reopen for days."""
-MOST_LATE_STAMPS: Final = 4
-"""Lines lost to stamps that are no milliseconds of a minute, after which stamps of this adapter are switched off."""
-LATE_STAMPS_FRAMES: Final = 1000
-"""Frames within which those lines must come: an occasional flipped digit is no evidence on the adapter's clock."""
 
 MOST_BYTES: Final = 65536  # most bytes read at once: as many as a kernel keeps for a serial port
 BYTE_S: Final = 5e-6  # time in [s] for a byte of a frame's line, of which a frame of 0.13 ms has 26 at most
@@ -51,9 +52,11 @@ LONGEST_WAIT_S: Final = 0.004
 """Longest wait for the end of a scan after its first bytes, in [s]: sixteen frames take 2.1 ms on the bus."""
 LONGEST_LOOK_S: Final = 0.02  # longest time between two looks that find nothing, in [s]: `Unread` tells stalls by them
 
-# pyserial lets termios.error through, which is no OSError; Windows has no termios.
-_PORT_ERRORS: Final[tuple[type[Exception], ...]] = (OSError, termios.error) if termios else (OSError,)
-
+ASKED_AGAIN_NS: Final = 5_000_000_000
+"""Time between two requests for the status flags of a silent adapter, in [ns]: each request clears them."""
+BUS_OFF: Final = "the adapter reports bus-off: check bitrate, wiring and termination"
+BUS_ERRORS: Final = "the adapter reports errors on the bus, and no frame arrives: check bitrate, wiring and termination"
+_PORT_ERRORS: Final = (OSError, termios.error)  # pyserial lets termios.error through, which is no OSError
 
 Piece = tuple[bytes, int, int]
 """Bytes received together, the time of that, and the latest time before at which the port was empty, in [ns]."""
@@ -69,10 +72,10 @@ class PortReader:
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
         os.set_blocking(descriptor, False)
-        if termios is not None:  # with fewer, a port that is empty reads like one that is gone
-            attributes = termios.tcgetattr(descriptor)
-            attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
-            termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
+        attributes = termios.tcgetattr(descriptor)
+        # With fewer, a port that is empty reads like one that is gone.
+        attributes[6][termios.VMIN], attributes[6][termios.VTIME] = 1, 0
+        termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
 
     def read(self, timeout_s: float, wanted_bytes: int) -> Piece:
         """Return the bytes received, once `wanted_bytes` have come, or no more; waits at most `timeout_s` for any.
@@ -142,24 +145,23 @@ class SlcanSerialLink(Link):
         baudrate: int = DEFAULT_BAUD,
         *,
         model: ModelMap = USPA44_MAP,
-        triggers: Sequence[CanFrame] = (),
     ) -> None:
-        """Prepare a link; nothing is opened yet. `triggers` are frames that wake older controllers, after opening."""
+        """Prepare a link; nothing is opened yet."""
         self.name = f"slcan:{port}"
         # No hardware sensor is a pseudo-terminal, so a device on one is emulated.
         self.kind: SourceKind = "emulated" if Path(port).resolve().is_relative_to("/dev/pts") else "device"
         self.port = port
         self.baudrate = baudrate
-        self._triggers = tuple(triggers)
+        self._triggers = model.triggers
         self._plugged = PluggedAdapter(port)
         # Two sensors at 100 scans a second take 832 kbit/s with stamps, and 704 without.
         self._asks_stamps = baudrate >= 1_000_000
         self._scans = SlcanScans(model)
-        self._questions = StatusQuestions(self._scans.decoder.status)
+        self._scan_ns, self._answers_at_scan = 0, 0
+        self._asked_ns: int | None = None
         self._stamps_on = False
         self._silent_openings = 0
         self._frames_at_opening = 0
-        self._late_stamps_from = (0, 0)
         self._counting = threading.Lock()  # counters are of whole pieces, whichever thread asks
         self._counts = {"received_bytes": 0, "dropped_bytes": 0}
         self._unread = Unread()
@@ -178,7 +180,6 @@ class SlcanSerialLink(Link):
             self._serial.close()
             self._serial = self._reader = None  # its descriptor may soon be another file's
             raise DeviceError(f"{self.port}: does not take commands: {error}") from error
-        self._questions.reopened()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -209,18 +210,8 @@ class SlcanSerialLink(Link):
                 self._counts["received_bytes"] += len(data)
                 fed = self._scans.feed(data, time_ns)
             scans += self._unread.mark(fed, time_ns, self._scans.clock.begun_ns)
-        decoder = self._scans.decoder
-        if self._questions.due(len(scans), decoder.refusals, pieces[-1][1]):
-            with suppress(*_PORT_ERRORS):  # an adapter that accepts no bytes would not answer either
-                if not self._serial.out_waiting:
-                    os.write(self._serial.fileno(), STATUS_FLAGS)
-        silence = not scans and self._questions.answered_in_silence
-        self.trouble = decoder.status.trouble(decoder.frames, flags_of_a_silence=silence)
-        late_before, frames_before = self._late_stamps_from
-        no_stamps = decoder.late_stamps - late_before >= MOST_LATE_STAMPS
-        if decoder.frames - frames_before >= LATE_STAMPS_FRAMES:
-            self._late_stamps_from = decoder.late_stamps, decoder.frames
-        if self._stamps_on and (no_stamps or self._scans.clock.dropped):
+        self._ask_in_silence(self._serial, bool(scans), pieces[-1][1])
+        if self._stamps_on and self._scans.clock.dropped:
             self.stamps_dropped = True
             self._asks_stamps = self._stamps_on = False
             self._open_anew(self._serial, STAMPS_OFF)
@@ -228,6 +219,24 @@ class SlcanSerialLink(Link):
             self._stamps_on = True
             self._open_anew(self._serial, STAMPS_ON)
         return scans
+
+    def _ask_in_silence(self, port: serial.Serial, heard: bool, now_ns: int) -> None:
+        """Request the status flags where no scan comes, which they may explain: of any bus they hold an error at times.
+
+        They are not requested while scans come: some adapters obey one command a USB packet, and the answer arrives
+        among the frames.
+        """
+        decoder = self._scans.decoder
+        if heard or not self._scan_ns:
+            self._scan_ns, self._answers_at_scan, self._asked_ns = now_ns, decoder.status_answers, None
+        asked_ns = self._asked_ns
+        if now_ns - self._scan_ns >= ADAPTER_ASKED_NS and (asked_ns is None or now_ns - asked_ns >= ASKED_AGAIN_NS):
+            self._asked_ns = now_ns
+            with suppress(*_PORT_ERRORS):  # an adapter that accepts no bytes would not answer either
+                if not port.out_waiting:
+                    os.write(port.fileno(), STATUS_FLAGS)
+        in_errors = decoder.status_answers > self._answers_at_scan and decoder.flags & BUS_FLAGS
+        self.trouble = BUS_OFF if decoder.bus_off else BUS_ERRORS if in_errors else None
 
     def fetch(self) -> None:
         """Take the bytes there, without waiting for more."""
@@ -271,7 +280,6 @@ class SlcanSerialLink(Link):
         frames = self._scans.decoder.frames
         self._silent_openings = 0 if frames > self._frames_at_opening else self._silent_openings + 1
         self._frames_at_opening = frames
-        self._late_stamps_from = self._scans.decoder.late_stamps, frames
         self._stamps_on = self._asks_stamps and self._silent_openings <= MOST_SILENT_OPENINGS
         _send(port, *((CLOSE, BITRATE_1M, STAMPS_ON) if self._stamps_on else (CLOSE, BITRATE_1M)))
         self._reader = PortReader(port.fileno())

@@ -8,14 +8,16 @@ from firmware_bridge.recording.tracks import Recording
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format, and a folder is a rosbag2.
+    """Read a recording; the ending of its name, .csv, .npz or .mcap, selects the format.
 
     Raises:
         RecordingError: the file cannot be read, is no recording, or a value in it is impossible.
     """
     path = Path(path)
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder: name a recording in it, such as the .mcap of a rosbag2")
     # Each reader is imported where it is needed: that of MCAP loads a package.
-    match ".mcap" if path.is_dir() else path.suffix.lower():
+    match path.suffix.lower():
         case ".csv":
             from firmware_bridge.recording.csv_reader import load_csv as reader
         case ".npz":
@@ -23,7 +25,7 @@ def load_recording(path: str | Path) -> Recording:
         case ".mcap":
             from firmware_bridge.recording.mcap_reader import load_mcap as reader
         case _:
-            raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap, or is a folder of a rosbag2")
+            raise RecordingError(f"{path}: a recording ends in .csv, .npz or .mcap")
     try:
         recording = reader(path)
     except OSError as error:

@@ -11,10 +11,8 @@ from typing import Final, Literal, NoReturn
 
 import numpy as np
 from mcap.records import Channel, Metadata, Schema
-from mcap.writer import MCAP0_MAGIC
 
 from firmware_bridge.errors import CdrError, RecordingError
-from firmware_bridge.in_place import read_bounded
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
@@ -83,48 +81,18 @@ class _Sensor:
 
 
 def load_mcap(path: Path) -> Recording:
-    """Read an MCAP file, or those of a rosbag2 folder in order; one without an end up to its last whole record."""
+    """Read an MCAP file; one without an end up to its last whole record."""
     reading = _Reading(path)
-    files, missing = mcap_files(path)
-    if missing:
-        names = ", ".join(map(ascii, missing))
-        reading.notes.append(f"{path}: its metadata.yaml names {names[:100]}, which is not there")
-    for one in files:
-        with one.open("rb") as file:
-            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise RecordingError(f"{one}: not an MCAP file: it does not begin as one")
-            reading.begin(one)
-            try:
-                for record in records(file):
-                    reading.take(record)
-            except CutOffError as end:
-                reading.notes.insert(0, f"{one} breaks off ({end}): its recording was killed, or the disk was full")
-            except DamageError as damage:
-                left_bytes = os.fstat(file.fileno()).st_size - file.tell()
-                reading.notes.insert(0, f"{one} is damaged ({damage}): {left_bytes:,} bytes after that are not read")
+    with path.open("rb") as file:
+        try:
+            for record in records(file):
+                reading.take(record)
+        except CutOffError as end:
+            reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
+        except DamageError as damage:
+            left_bytes = os.fstat(file.fileno()).st_size - file.tell()
+            reading.notes.insert(0, f"{path} is damaged ({damage}): {left_bytes:,} bytes after that are not read")
     return reading.recording()
-
-
-def mcap_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the files of a recording, and the names of those that are missing.
-
-    Those of a folder are in the order of its metadata.yaml, else by the numbers in their names.
-
-    Raises:
-        RecordingError: there is none in the folder.
-    """
-    if not path.is_dir():
-        return [path], []
-    there = sorted(path.glob("*.mcap"), key=lambda path: [int(one) for one in re.findall("[0-9]+", path.stem)])
-    if not there:
-        names = ", ".join(ascii(path.name) for path in sorted(path.iterdir())[:MOST_SHOWN_TOPICS])
-        remedy = "name a file, or convert a bag of another storage with `ros2 bag convert` to mcap"
-        raise RecordingError(f"{path}: a folder with {names or 'nothing in it'}, expected .mcap files: {remedy}")
-    about = path / "metadata.yaml"
-    text = read_bounded(about, 1 << 20).decode(errors="replace") if about.is_file() else ""
-    named = [path / name for name in re.findall(r"^\s*- [\"']?([^/\"'\n]+\.mcap)[\"']?\s*$", text, re.MULTILINE)]
-    order = [one for one in dict.fromkeys(named) if one in there]
-    return order or there, [one.name for one in named if one not in there]
 
 
 class _Reading:
@@ -132,7 +100,7 @@ class _Reading:
 
     def __init__(self, path: Path) -> None:
         self.notes: list[str] = []
-        self._whole = self._path = path
+        self._path = path
         self._schemas: dict[int, MessageType | None] = {}
         self._topics: dict[int, tuple[str, MessageType | None]] = {}
         self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
@@ -144,10 +112,6 @@ class _Reading:
         self._kept_bytes = 0
         self._poses: list[TimedPose] = []
         self._origin: Literal["device", "emulated"] | None = None
-
-    def begin(self, path: Path) -> None:
-        """Go on with a file: its numbers of schemas and channels are its own."""
-        self._path, self._schemas, self._topics = path, {}, {}
 
     def take(self, record: EncodedMessage | Schema | Channel | Metadata) -> None:
         """Process one record, from a chunk or between chunks."""
@@ -174,7 +138,7 @@ class _Reading:
                 "copies a part of it: its axes and gains are those of the id map, unless --sensor FILE gives others"
             )
         return Recording(
-            self._whole,
+            self._path,
             tuple(one.track(name, self._geometry) for name, one in scanned.items()),
             None,
             {name: one.baseline for name, one in scanned.items() if one.baseline is not None},

@@ -15,6 +15,9 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+from firmware_bridge.errors import RecordingError
 
 MOST_RECORD_BYTES: Final = 1 << 25
 """Most bytes of a record, of a chunk unpacked, and of zstd's window: writers make chunks of one to a few megabytes."""
@@ -44,11 +47,14 @@ class EncodedMessage(NamedTuple):
 
 
 def records(file: BinaryIO) -> Iterator[EncodedMessage | Schema | Channel | Metadata]:
-    """Yield these records up to the end of the data, those in chunks one by one, from behind the mark of the format.
+    """Yield these records of a file up to the end of its data, those in chunks one by one.
 
     Raises:
-        DamageError: one cannot be read.
+        RecordingError: it is no MCAP file.
+        DamageError: a record cannot be read.
     """
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise RecordingError(f"{file.name}: not an MCAP file: it does not begin as one")
     for opcode, data in _undivided(file):
         if opcode == Opcode.MESSAGE:
             if len(data) < _MESSAGE.size:

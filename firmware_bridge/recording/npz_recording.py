@@ -113,10 +113,11 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any
 NPZ_FORMAT: Final = "tactile-recording"
 NPZ_VERSION: Final = 1
 MOST_NPZ_BYTES: Final = 1 << 31  # most bytes of the arrays that are read: a day of one sensor at 100 Hz
-_SCANS: Final = {"sensor": "U", "scan": "iu", "time_ns": "iu"}  # arrays with a row for each scan, and kinds of numpy
-_ORIGINS: Final = {"origin": "U", "source": "U"}  # of these `source` in older files, which have no `origin`
+_SCANS: Final = {"sensor": "U", "time_ns": "iu", "counts": "iu", "origin": "U", "source": "U"}  # older: no `origin`
+_BASELINES: Final = {"baseline": "U", "baseline_counts": "f", "baseline_age_s": "f"}
 _POSES: Final = {"pose_time_ns": "iu", "pose": "fiu", "pose_sensor": "U", "pose_holds": "b", "pose_used_from_ns": "iu"}
-_BASELINE: Final = {"baseline": "U", "baseline_counts": "f", "baseline_age_s": "f"}
+"""Arrays with a row for each scan, the last for each pose, and their kinds of numpy."""
+_REQUIRED: Final = ("format", "version", "sensor", "time_ns", "counts")
 _KINDS: Final = {"U": "text", "b": "truth values", "iu": "whole numbers", "f": "real numbers", "fiu": "numbers"}
 
 
@@ -129,9 +130,8 @@ def load_npz(path: Path) -> Recording:
 
 
 def _recording(path: Path) -> Recording:
-    required = ("format", "version", *_SCANS, "counts")
-    arrays = read_npz(path, (*required, *_ORIGINS, *_POSES, *_BASELINE, "rate_hz", "mountings"), MOST_NPZ_BYTES)
-    for name in required:
+    arrays = read_npz(path, (*_REQUIRED, *_SCANS, *_BASELINES, *_POSES, "rate_hz", "mountings"), MOST_NPZ_BYTES)
+    for name in _REQUIRED:
         if name not in arrays:
             raise NpzError(f"array '{name}': missing, expected what `edge-sr convert` writes")
     form, version, counts = arrays["format"], arrays["version"], arrays["counts"]
@@ -139,12 +139,21 @@ def _recording(path: Path) -> Recording:
         _refuse("format", repr(str(form)[:40]), f"'{NPZ_FORMAT}'")
     if version.shape or version.dtype.kind not in "iu" or int(version) != NPZ_VERSION:
         _refuse("version", str(version)[:40], f"{NPZ_VERSION}")
-    _check_counts(counts)
-    _check_arrays(arrays, _SCANS | _ORIGINS, counts.shape[:1])
-    tracks = tuple(_tracks(arrays))
+    grid = counts.shape[1:]
+    if len(grid) != 3 or grid[0] != len(AXES) or not 0 < grid[1] * grid[2] <= MOST_TAXELS or not counts.size:
+        expected = f"(scans, {len(AXES)}, rows, cols), {MOST_TAXELS} taxels at most, at least one scan"
+        _refuse("counts", f"shape {counts.shape}", expected)
+    _check_arrays(arrays, _SCANS | _BASELINES, len(counts), counts=grid, baseline_counts=grid)
+    if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
+        got = f"counts {counts.min()}..{counts.max()}"
+        _refuse("counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
+    absent = counts == ABSENT
+    if (absent.any(axis=1) != absent.all(axis=1)).any():
+        _refuse("counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
     rate, origin = arrays.get("rate_hz"), arrays.get("origin", arrays.get("source", np.empty(0)))
     if rate is not None and (rate.shape or rate.dtype.kind not in "iuf" or not is_rate(float(rate))):
         _refuse("rate_hz", str(rate)[:40], A_RATE)
+    tracks = tuple(_tracks(arrays))
     return Recording(
         path,
         tracks,
@@ -154,21 +163,6 @@ def _recording(path: Path) -> Recording:
         origin=origin_of(np.unique(origin).tolist()),
         poses=_poses(arrays),
     )
-
-
-def _check_counts(counts: NDArray[Any]) -> None:
-    shape = counts.shape
-    grid = len(shape) == 4 and shape[1] == len(AXES) and 0 < shape[2] * shape[3] <= MOST_TAXELS
-    if counts.dtype.kind not in "iu" or not grid or counts.size == 0:
-        most = f"{MOST_TAXELS} taxels at most"
-        expected = f"whole numbers of shape (scans, {len(AXES)}, rows, cols), {most}, at least one scan"
-        _refuse("counts", f"{counts.dtype} of shape {shape}", expected)
-    if counts.min() < ABSENT or counts.max() > HIGHEST_COUNT:
-        got = f"counts {counts.min()}..{counts.max()}"
-        _refuse("counts", got, f"0..{HIGHEST_COUNT}, or {ABSENT} where a taxel is absent")
-    absent = counts == ABSENT
-    if (absent.any(axis=1) != absent.all(axis=1)).any():
-        _refuse("counts", "a taxel absent on some axes", "all of a taxel's axes absent or none")
 
 
 def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
@@ -189,14 +183,11 @@ def _tracks(arrays: Mapping[str, NDArray[Any]]) -> Iterator[Track]:
 
 def _baselines(arrays: Mapping[str, NDArray[Any]], tracks: Sequence[Track]) -> dict[str, Baseline]:
     """Return the baselines of the first scan of each sensor, dated by the clock of the scans."""
-    if not arrays.keys() >= _BASELINE.keys():
-        return {}
-    sensors = arrays["sensor"]
-    _check_arrays(arrays, _BASELINE, sensors.shape, baseline_counts=tracks[0].counts.shape[1:])
     baselines: dict[str, Baseline] = {}
-    for track in tracks:
-        ids, counts, ages_s = (arrays[name][int(np.argmax(sensors == track.sensor))] for name in _BASELINE)
-        own, text, age_s = counts.astype(np.float32), str(ids), float(ages_s)
+    for track in tracks if arrays.keys() >= _BASELINES.keys() else ():
+        first = int(np.argmax(arrays["sensor"] == track.sensor))
+        text, age_s = str(arrays["baseline"][first]), float(arrays["baseline_age_s"][first])
+        own = arrays["baseline_counts"][first].astype(np.float32)
         if not text or track.time_ns is None:
             continue
         known = np.isnan(own) | ((own >= 0) & (own <= HIGHEST_COUNT + 1))
@@ -229,25 +220,25 @@ def _poses(arrays: Mapping[str, NDArray[Any]]) -> list[TimedPose]:
     count = arrays["pose_time_ns"].size
     if count > MOST_POSES:
         _refuse("pose", f"{count:,} poses", f"at most {MOST_POSES:,}: cut it in parts")
-    _check_arrays(arrays, _POSES, (count,), pose=(len(POSE_FIELDS),))
-    sensors = arrays.get("pose_sensor", np.zeros(count, "U1")).tolist()
-    if len(set(sensors)) > MOST_SENSORS + 1:
-        _refuse("pose_sensor", f"{len(set(sensors))} sensors", f"at most {MOST_SENSORS}")
-    holds, used_from_ns = arrays.get("pose_holds", np.zeros(count, bool)), arrays.get("pose_used_from_ns")
-    used_from_ns = np.full(count, -1) if used_from_ns is None else used_from_ns
-    rows = (arrays["pose"].astype(np.float64), arrays["pose_time_ns"], holds, used_from_ns)
+    _check_arrays(arrays, _POSES, count, pose=(len(POSE_FIELDS),))
+    sensors = arrays.get("pose_sensor", np.zeros(count, "U1"))
+    if len(np.unique(sensors)) > MOST_SENSORS + 1:
+        _refuse("pose_sensor", f"{len(np.unique(sensors))} sensors", f"at most {MOST_SENSORS}")
+    holds = arrays.get("pose_holds", np.zeros(count, bool))
+    used_from_ns = arrays.get("pose_used_from_ns", np.full(count, -1))
+    rows = (arrays["pose"].astype(np.float64), arrays["pose_time_ns"], holds, used_from_ns, sensors)
     try:
-        return list(map(checked_pose, *(each.tolist() for each in rows), sensors))
+        return list(map(checked_pose, *(each.tolist() for each in rows)))
     except CdrError as error:
         raise NpzError(f"array 'pose': {error}") from error
 
 
 def _check_arrays(
-    arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, str], rows: tuple[int, ...], **of_a_row: tuple[int, ...]
+    arrays: Mapping[str, NDArray[Any]], kinds: Mapping[str, str], rows: int, **of_a_row: tuple[int, ...]
 ) -> None:
     """Refuse arrays that are there, and not of these kinds, so many rows, and the shape of a row, else one value."""
     for name in filter(arrays.__contains__, kinds):
-        array, shape = arrays[name], (*rows, *of_a_row.get(name, ()))
+        array, shape = arrays[name], (rows, *of_a_row.get(name, ()))
         if array.dtype.kind not in kinds[name] or array.shape != shape:
             _refuse(name, f"{array.dtype} of shape {array.shape}", f"{_KINDS[kinds[name]]} of shape {shape}")
 

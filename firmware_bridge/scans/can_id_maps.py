@@ -30,25 +30,20 @@ class ModelMap:
     name: str  # name of the sensor model or layout
     geometry: SensorGeometry  # geometry of each sensor
     taxels: Mapping[int, tuple[str, int]]  # CAN id -> (sensor, taxel)
-    triggered: bool = False  # True where the controller stays silent until it gets its `trigger_frame`
+    triggered: bool = False  # True where a controller stays silent until it gets its trigger
 
     def __post_init__(self) -> None:
         if not 0 < self.geometry.taxel_count <= MOST_TAXELS:
             raise ValueError(f"{self.name} has {self.geometry.taxel_count} taxels, expected 1 to {MOST_TAXELS}")
 
+    @property
+    def triggers(self) -> tuple[CanFrame, ...]:
+        """Frames that start the controllers, if they need any: each board obeys only its own."""
+        return tuple(CanFrame(0x200 | board, bytes((0x07, 0x00))) for board in BOARDS) if self.triggered else ()
+
     def wire_order(self, sensor: str) -> list[tuple[int, int]]:
         """Return (CAN id, taxel) of one sensor by ascending id, which is the order of SDA, then taxel."""
         return sorted((can_id, taxel) for can_id, (name, taxel) in self.taxels.items() if name == sensor)
-
-
-def trigger_frames(model: ModelMap) -> list[CanFrame]:
-    """Return the trigger frames of all boards that a model's ids can name; each board obeys only its own."""
-    return [trigger_frame(board) for board in BOARDS] if model.triggered else []
-
-
-def trigger_frame(board: int) -> CanFrame:
-    """Return the frame that starts a controller of layout A or B; `board` is one of BOARDS."""
-    return CanFrame(0x200 | board, bytes((0x07, 0x00)))
 
 
 def layout_c(geometry: SensorGeometry) -> ModelMap:

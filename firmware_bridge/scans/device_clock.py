@@ -117,7 +117,8 @@ class DeviceClock:
         self._heard_whole_ns += since_ns
         self._told_ns += step_ns if step_ns > -BACK_NS else since_ns  # one set back tells nothing of its rate
         self._read_late |= since_ns > LONGEST_STEP_NS
-        self.follow_order(step_ns)
+        self._back += 2 * step_ns < -BACK_NS  # on the bus one frame came after the other
+        self.dropped |= self._back >= 8
         if self._heard_ns >= 50_000_000:
             # A serial line of 115,200 baud is 4 times slower than its bus, and stamps in units of 10 ms are 10 times
             # too slow.
@@ -128,8 +129,3 @@ class DeviceClock:
             self._heard_ns = self._heard_whole_ns = self._told_ns = self._back = 0
             self._read_late = False
         self.dropped |= max(self._slow, self._fast) >= MOST_OFF or self._later_ns > SLOW_NS
-
-    def follow_order(self, step_ns: int) -> None:
-        """Take note of a step between the stamps of two frames, in [ns]: on the bus one came after the other."""
-        self._back += 2 * step_ns < -BACK_NS
-        self.dropped |= self._back >= 8

@@ -50,10 +50,10 @@ class GsUsbScans(FrameScans):
         self._earlier_counts: dict[str, int] = {}
         self._decoder = GsUsbDecoder(stamped=False)
 
-    def start(self, *, stamped: bool, channels: int) -> None:
+    def start(self, *, stamped: bool) -> None:
         """Begin with a new decoder and clock after a start of the adapter, which may have reset its clock."""
         self._earlier_counts = self._sum_decoder_counts()
-        self._decoder = GsUsbDecoder(stamped=stamped, channels=channels)
+        self._decoder = GsUsbDecoder(stamped=stamped)
         self.clock = DeviceClock(1_000, 1 << 32)  # the 32-bit stamps wrap after 71.6 minutes
         self.errors.restarted()
 

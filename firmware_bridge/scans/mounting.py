@@ -61,11 +61,6 @@ class Mounting:
         return self.order != tuple(range(self.taxel_count))
 
     @property
-    def evens_gains(self) -> bool:
-        """True if some reading is multiplied by another number than 1."""
-        return any(gain != 1 for gain in self.gains)
-
-    @property
     def reverses_axes(self) -> bool:
         """True if the pad's axes differ from the wire's, or point the other way."""
         return self.swap_xy or self.signs != (1, 1, 1)
@@ -73,7 +68,7 @@ class Mounting:
     @property
     def turns_axes(self) -> bool:
         """True if counts become deformation by more than the baseline: turned axes or gains."""
-        return self.reverses_axes or self.evens_gains
+        return self.reverses_axes or any(gain != 1 for gain in self.gains)
 
     def correct(self, deformation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Turn deformation (3, rows, cols), in place but along the wire's axes, to the pad's axes, in [counts]."""

@@ -6,7 +6,7 @@ after the other, row by row from the top left. Versions differ:
 
     1.7.6   data "8197,829A,..."       hexadecimal
     1.7.7   data [33175, 33434, ...]   and "welcome" as `type` of every message, so that `type` has no use
-    1.8.0   data hexadecimal, and the same as `integer`
+    1.8.0   data hexadecimal, and the same as `integer`, which is not read
 
 `ups`, the updates a second of a taxel, is the sign of life, together with a `time` of the sensor that moves on.
 `calibrated` (in newtons), `temp` (in kelvin) and `ups` are absent, null or zeros where the server has no value.
@@ -18,7 +18,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +32,14 @@ HIGHEST_UPS_HZ: Final = 10_000.0
 HIGHEST_NEWTONS: Final = 1000.0
 KELVIN: Final = (200.0, 500.0)
 WELCOME: Final = "Welcome"
-PRETENDED_VERSION: Final = "_emulated"  # suffix of an emulated server's version, which separates it from the vendor's
 _COUNTED: Final = [
     "messages",
     "welcomes",
     "without_readings",
-    "too_long",
     "bad_json",
-    "duplicate_keys",
-    "bad_sequence",
     "bad_sensor",
     "foreign_sensor",
-    "disagreeing",
-    "bad_ups",
-    "bad_calibrated",
-    "bad_temperature",
-    "bad_time",
+    "bad_values",
 ]
 
 
@@ -65,19 +57,17 @@ class ServerReading(NamedTuple):
 
     sensor: str
     counts: NDArray[np.int32]
-    ups_hz: tuple[float, ...] | None
+    ups_hz: Sequence[float] | None
     newtons: NDArray[np.float32] | None
     temperature_k: NDArray[np.float32] | None
     acquired_s: float | None
 
 
 class ServerMessage(NamedTuple):
-    """One message. `sequence` is None only for a welcome and a bad message; `sent_s` is by the server's clock."""
+    """One message. `sequence` is None for a welcome and a bad message; `sent_s` is by the server's clock."""
 
-    kind: Literal["welcome", "readings", "bad"]
     sequence: int | None = None
     sent_s: float | None = None
-    version: str = ""
     readings: tuple[ServerReading, ...] = ()
 
 
@@ -96,156 +86,97 @@ class ServerDecoder:
     def decode(self, text: str | bytes) -> ServerMessage:
         """Decode one message, as text or in UTF-8."""
         self._counted["messages"] += 1
-        content = self._content(text)
-        if isinstance(content, str):
-            return self._bad(content)
-        version = content.get("version")
-        version = version[:40] if isinstance(version, str) else ""
-        if content.get("message") == WELCOME:
-            self._counted["welcomes"] += 1
-            return ServerMessage("welcome", version=version)
+        try:
+            content = json.loads(text)
+        except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
+            content = None
+        content = content if isinstance(content, dict) else {}
         sequence = content.get("message")
+        if sequence == WELCOME:
+            self._counted["welcomes"] += 1
+            return ServerMessage()
         if type(sequence) is not int or not 0 <= sequence < 1 << 63:
-            return self._bad("bad_sequence")
+            self._counted["bad_json"] += 1
+            return ServerMessage()
         named = [name for name, value in content.items() if _is_name(name) and isinstance(value, dict)]
-        if not named:
-            self._counted["without_readings"] += 1
+        self._counted["without_readings"] += not named
         self._counted["bad_sensor"] += max(0, len(named) - MOST_SENSORS)
         readings = [self._reading(name, content[name]) for name in named[:MOST_SENSORS]]
         found = tuple(reading for reading in readings if reading is not None)
-        return ServerMessage("readings", sequence, self._time_s(content.get("time")), version, found)
+        return ServerMessage(sequence, self._time_s(content.get("time")), found)
 
     def counters(self) -> dict[str, int]:
         """Return the counts of messages and of their errors.
 
-        messages; welcomes; without_readings: no sensor named; too_long; bad_json; duplicate_keys; bad_sequence: no
-        valid sequence number. For sensors: bad_sensor: no valid counts; foreign_sensor: of another geometry;
-        disagreeing: `integer` differs from `data`, which wins; bad_ups, bad_calibrated, bad_temperature, bad_time:
-        left out.
+        messages; welcomes; without_readings: no sensor named; bad_json: no JSON, or no valid sequence number. For
+        sensors: bad_sensor: no valid counts; foreign_sensor: of another geometry; bad_values: forces, temperatures,
+        rates or times that are left out.
         """
         return dict(self._counted)
 
-    def _content(self, text: str | bytes) -> dict[str, Any] | str:
-        """Return the object in a message, or what is wrong."""
-        if len(text) > LONGEST_MESSAGE_BYTES:
-            return "too_long"
-        try:
-            content = json.loads(text, object_pairs_hook=_without_duplicates)
-        except _DuplicateError:
-            return "duplicate_keys"
-        except (ValueError, RecursionError):  # no JSON, no UTF-8, a number too long for int(), or brackets in brackets
-            return "bad_json"
-        return content if isinstance(content, dict) else "bad_json"
-
-    def _bad(self, kind: str) -> ServerMessage:
-        self._counted[kind] += 1
-        return ServerMessage("bad")
-
     def _reading(self, name: str, content: dict[str, Any]) -> ServerReading | None:
-        taxels = content.get("taxels")
-        if type(taxels) is int and 0 < taxels != self._geometry.taxel_count:
+        shape, count = self._geometry.scan_shape, self._geometry.taxel_count
+        taxels, data = content.get("taxels"), content.get("data")
+        if type(taxels) is int and 0 < taxels != count:
             model = content.get("model")
             model = repr(model[:20]) if isinstance(model, str) else "a model without a name"
             self.foreign[name] = f"{model} with {min(taxels, 9999)} taxels"
             self._counted["foreign_sensor"] += 1
             return None
-        known = type(taxels) is int and taxels == self._geometry.taxel_count
-        counts = self._counts(content.get("data"), content.get("integer")) if known else None
-        if counts is None:
+        counts = _from_hex(data) if isinstance(data, str) else data
+        right = type(taxels) is int and taxels == count and _are_numbers(counts, 3 * count, (0, HIGHEST_COUNT), {int})
+        if not right:
             self._counted["bad_sensor"] += 1
             return None
         self.foreign.pop(name, None)
-        ups_hz = self._in_range(content.get("ups"), self._geometry.taxel_count, (0, HIGHEST_UPS_HZ), "bad_ups")
+        newtons = self._in_range(content.get("calibrated"), 3 * count, (-HIGHEST_NEWTONS, HIGHEST_NEWTONS))
+        by_axis = None if newtons is None else np.array(newtons, dtype=np.float32).reshape(-1, 3).T
         return ServerReading(
             name,
             np.ascontiguousarray(np.array(counts, dtype=np.int32).reshape(-1, 3).T),
-            None if ups_hz is None else tuple(ups_hz),
-            self._newtons(content.get("calibrated")),
+            self._in_range(content.get("ups"), count, (0, HIGHEST_UPS_HZ)),
+            None if by_axis is None else np.ascontiguousarray(by_axis).reshape(shape),
             self._temperature_k(content.get("temp")),
             self._time_s(content.get("time")),
         )
 
-    def _counts(self, data: object, integer: object) -> list[int] | None:
-        """Decode the counts from `data`, which every version has, or from `integer` where `data` cannot be used."""
-        size = 3 * self._geometry.taxel_count
-        of_data = _from_hex(data, size) if isinstance(data, str) else _whole_numbers(data, size)
-        if integer is None and of_data is not None:
-            return of_data
-        of_integer = _whole_numbers(integer, size)
-        self._counted["disagreeing"] += of_data != of_integer
-        return of_integer if of_data is None else of_data
-
-    def _newtons(self, content: object) -> NDArray[np.float32] | None:
-        size, range_n = 3 * self._geometry.taxel_count, (-HIGHEST_NEWTONS, HIGHEST_NEWTONS)
-        newtons = self._in_range(content, size, range_n, "bad_calibrated")
-        if newtons is None:
-            return None
-        by_axis = np.array(newtons, dtype=np.float32).reshape(-1, 3).T
-        return np.ascontiguousarray(by_axis).reshape(self._geometry.scan_shape)
-
     def _temperature_k(self, content: object) -> NDArray[np.float32] | None:
-        kelvin = self._in_range(content, self._geometry.taxel_count, (0, KELVIN[1]), "bad_temperature")
+        kelvin = self._in_range(content, self._geometry.taxel_count, (0, KELVIN[1]))
         if kelvin is None or not any(kelvin):  # zeros: the sensor has no thermometer
             return None
         if min(one for one in kelvin if one) < KELVIN[0]:
-            self._counted["bad_temperature"] += 1
+            self._counted["bad_values"] += 1
             return None
         known = np.array([one or math.nan for one in kelvin], dtype=np.float32)
         return known.reshape(self._geometry.rows, self._geometry.cols)
 
-    def _in_range(
-        self, content: object, size: int, ends: tuple[float, float], counted_as: str
-    ) -> Sequence[float] | None:
+    def _in_range(self, content: Any, size: int, ends: tuple[float, float]) -> Sequence[float] | None:
         """Return a list of `size` numbers in a range; None, and count it, if it is another thing than None."""
-        numbers = _numbers(content, size)
-        if numbers is not None and ends[0] <= min(numbers) <= max(numbers) <= ends[1]:
-            return numbers
-        self._counted[counted_as] += content is not None
+        if _are_numbers(content, size, ends, {int, float}):
+            return content
+        self._counted["bad_values"] += content is not None
         return None
 
     def _time_s(self, content: object) -> float | None:
         if isinstance(content, bool) or not isinstance(content, (int, float)) or not 0 < content < 1e11:  # since 1970
-            self._counted["bad_time"] += content is not None
+            self._counted["bad_values"] += content is not None
             return None
         return float(content)
-
-
-class _DuplicateError(ValueError):
-    """A key is there twice, so its value is ambiguous."""
-
-
-def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) != len(pairs):
-        raise _DuplicateError
-    return content
 
 
 def _is_name(key: str) -> bool:
     return 0 < len(key) <= 3 and key.isascii() and key.isdigit()
 
 
-def _from_hex(text: str, size: int) -> list[int] | None:
+def _from_hex(text: str) -> list[int] | None:
     # Not int() alone: it takes signs, spaces, underscores and 0x as well.
     if not re.fullmatch("[0-9A-Fa-f]{1,4}(?:,[0-9A-Fa-f]{1,4})*,?", text):
         return None
-    words = text.removesuffix(",").split(",")
-    return [int(word, 16) for word in words] if len(words) == size else None
+    return [int(word, 16) for word in text.removesuffix(",").split(",")]
 
 
-def _whole_numbers(content: object, size: int) -> list[int] | None:
-    if not isinstance(content, list) or len(content) != size:
-        return None
-    if set(map(type, content)) != {int} or not 0 <= min(content) <= max(content) <= HIGHEST_COUNT:
-        return None
-    return content
-
-
-def _numbers(content: object, size: int) -> Sequence[float] | None:
-    """Return a list of `size` finite numbers, None if it is not one; True is no number here, unlike in Python."""
-    if not isinstance(content, list) or len(content) != size or not set(map(type, content)) <= {int, float}:
-        return None
-    try:
-        return content if all(map(math.isfinite, content)) else None
-    except OverflowError:  # a whole number that no float can hold
-        return None
+def _are_numbers(content: object, size: int, ends: tuple[float, float], kinds: set[type]) -> bool:
+    """Return True for a list of so many numbers in a range; True is no number here, unlike in Python."""
+    if not isinstance(content, list) or len(content) != size or not set(map(type, content)) <= kinds:
+        return False
+    return all(ends[0] <= number <= ends[1] for number in content)  # False of NaN

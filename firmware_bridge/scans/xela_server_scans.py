@@ -15,7 +15,6 @@ reading of each.
 - Within a cycle nothing shows which readings belong together; slow servers mix those of two cycles, as on the wire.
 """
 
-from collections import deque
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
@@ -30,15 +29,8 @@ from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries, VendorReading
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder, ServerMessage, ServerReading
 from firmware_bridge.schedule import NS_PER_S, SERVER_READING_OLD_NS
 
-STALE_NS: Final = 150_000_000
-"""Age beyond the server's usual one at which an arriving reading counts as stale, in [ns]; more than a clock may be set
-back unnoticed."""
-MANY_STALE: Final = 50
-"""Surplus of stale scans over others at which the lag is reported, until the others have made up for it."""
-FARTHEST_BACK: Final = 32
-"""Rising numbers in a row below the highest after which they are a new count and no late messages."""
 MOST_MISSED: Final = 100_000
-_COUNTED: Final = ["repeated_messages", "reordered_messages", "missed_messages", "server_restarts", "stale_scans"]
+_COUNTED: Final = ["repeated_messages", "missed_messages", "server_restarts"]
 _COUNTED_BY_SENSOR: Final = ["scans", "torn_wire", "torn_source", "repeated", "missing_taxels"]
 
 
@@ -52,15 +44,10 @@ class ServerScans:
         mountings: Mapping[str, Mounting] = MappingProxyType({}),
     ) -> None:
         """Begin without a message; `prefix` begins the names of sensors in scans, and `mountings` are by these."""
-        self.version = ""
         self._prefix, self._mountings = prefix, mountings
         self._geometry = geometry
         self._decoder = ServerDecoder(geometry)
         self._sensors: dict[str, _ServerSensor] = {}
-        self._more_stale = 0
-        self._lags = False
-        # The least of them is the usual age: one observed server sends every reading 0.3 s old.
-        self._ages_ns: deque[int] = deque(maxlen=50)
         self._counted: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self.begin()
 
@@ -71,9 +58,6 @@ class ServerScans:
         notes = [f"sensor {name} is left out: {what}, {wanted}" for name, what in self._decoder.foreign.items()]
         silent = [name for name, sensor in self._sensors.items() if sensor.silent]
         notes += [f"nothing arrives from sensor {name}: check its cable and its power" for name in silent]
-        if self._lags:
-            late = f"what is read is older by {STALE_NS // 1_000_000} ms than usual"
-            notes.append(f"{late}: the server lags, the network does, or this program is too slow")
         return "; ".join(notes) or None
 
     @property
@@ -84,8 +68,6 @@ class ServerScans:
     def begin(self) -> None:
         """Begin again with the server, as after a connection: its count, its clock and its readings are new."""
         self._sequence: int | None = None
-        self._may_begin = True
-        self._late_ones: list[int] = []
         self._clock = DeviceClock(1000, None)
         for sensor in self._sensors.values():
             sensor.begin()
@@ -93,9 +75,6 @@ class ServerScans:
     def feed(self, text: str | bytes, arrival_ns: int) -> list[Scan]:
         """Return the scans that a message closes; `arrival_ns` [ns] is never before that of the message before."""
         message = self._decoder.decode(text)
-        self.version = message.version or self.version
-        if message.kind == "welcome":
-            self._may_begin = True
         if message.sequence is None or not self._in_order(message.sequence):
             return []
         sent_ns = None if message.sent_s is None else self._clock.host_ns(round(message.sent_s * 1e6), arrival_ns)
@@ -107,22 +86,18 @@ class ServerScans:
             if sensor is None:
                 own_name = self._prefix + name
                 sensor = self._sensors[name] = _ServerSensor(own_name, self._geometry, self._mountings.get(own_name))
-            scan = age_ns = None
             if name in readings:
                 age_ns = _age_ns(readings[name], message)
                 device_ns = None if sent_ns is None or age_ns is None else sent_ns - age_ns
                 scan = sensor.feed(readings[name], arrival_ns, device_ns, old=(age_ns or 0) > SERVER_READING_OLD_NS)
-            if scan is not None:
-                self._follow_age(scan, age_ns or 0)
-                scans.append(scan)
+                scans += [] if scan is None else [scan]
             sensor.look(arrival_ns)
         return scans
 
     def counters(self) -> dict[str, int]:
         """Return the counters of the decoder and of the scans.
 
-        repeated_messages and reordered_messages were dropped; missed_messages: numbers that never came;
-        server_restarts: the count restarted; stale_scans: a reading was older by STALE_NS than usual when it arrived;
+        repeated_messages were dropped; missed_messages: numbers that never came; server_restarts: the count restarted;
         and as for every link scans, torn_wire, torn_source, repeated and missing_taxels.
         """
         totals: dict[str, int] = dict.fromkeys(_COUNTED_BY_SENSOR, 0)
@@ -131,42 +106,19 @@ class ServerScans:
                 totals[name] += count
         return self._decoder.counters() | self._counted | totals
 
-    def _follow_age(self, scan: Scan, age_ns: int) -> None:
-        self._ages_ns.append(age_ns)
-        usual_ns = min(self._ages_ns)
-        stale = scan.device_ns is not None and scan.time_ns - scan.device_ns - usual_ns > STALE_NS
-        self._counted["stale_scans"] += stale
-        self._more_stale = min(max(self._more_stale + (1 if stale else -1), 0), 2 * MANY_STALE)
-        self._lags = self._more_stale > (0 if self._lags else MANY_STALE)
-
     def _in_order(self, sequence: int) -> bool:
-        """Return True if the message is the next in order, and update the count."""
+        """Return True if the message is a new one, and update the count: another order has only a new server's."""
         last = self._sequence
-        if last is None:
-            self._take(sequence)
-            return True
         if sequence == last:
             self._counted["repeated_messages"] += 1
             return False
-        if last < sequence <= last + MOST_MISSED:
+        if last is not None and last < sequence <= last + MOST_MISSED:
             self._counted["missed_messages"] += sequence - last - 1
-            self._take(sequence)
-            return True
-        if sequence < last and not self._may_begin:
-            if self._late_ones and sequence <= self._late_ones[-1]:
-                self._late_ones.clear()
-            self._late_ones.append(sequence)
-            if len(self._late_ones) < FARTHEST_BACK:
-                self._counted["reordered_messages"] += 1
-                return False
-        self._counted["server_restarts"] += 1
-        self.begin()
-        self._take(sequence)
+        elif last is not None:
+            self._counted["server_restarts"] += 1
+            self.begin()
+        self._sequence = sequence
         return True
-
-    def _take(self, sequence: int) -> None:
-        self._sequence, self._may_begin = sequence, False
-        self._late_ones.clear()
 
 
 class _ServerSensor:

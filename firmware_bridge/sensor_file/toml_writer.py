@@ -1,20 +1,16 @@
 """Writer of the sensor file, in which a pad's numbers have the same arrangement as on the pad."""
 
+import fcntl
 import json
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 from firmware_bridge.errors import SensorFileError
 from firmware_bridge.in_place import write_in_place
@@ -30,6 +26,7 @@ from firmware_bridge.sensor_file.model import (
     load_sensor_file,
 )
 
+_EMULATED: Final = "measured on an emulated sensor: not for a device"
 LOCKED_S: Final = 5.0  # longest wait for another program that changes the file, in [s]: changing it takes milliseconds
 
 
@@ -50,7 +47,7 @@ def changing(path: str | Path) -> Iterator[None]:
         return
     try:
         end_s = time.monotonic() + LOCKED_S
-        while fcntl is not None:
+        while True:
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
@@ -97,92 +94,84 @@ def save_sensor_file(path: str | Path, sensor_file: SensorFile, *, keep_before: 
 def _text(sensor_file: SensorFile) -> str:
     lines = [
         "# Sensor file of edge-sr doctor; use it with edge-sr --sensor FILE.",
-        _line("format", FILE_FORMAT),
-        _line("version", FILE_VERSION),
-        _line("model", sensor_file.model, "which CAN id is which taxel, as --id-map"),
+        *_line("format", FILE_FORMAT),
+        *_line("version", FILE_VERSION),
+        *_line("model", sensor_file.model, "which CAN id is which taxel, as --id-map"),
+        *_line("adapter", sensor_file.adapter, "serial number"),
     ]
-    if sensor_file.adapter is not None:
-        lines.append(_line("adapter", sensor_file.adapter, "serial number"))
-    grid = sensor_file.geometry.scan_shape
+    shape = sensor_file.geometry.scan_shape
     for name, entry in sensor_file.sensors.items():
-        parts: dict[str, list[str]] = {"": _entry_lines(entry, grid)}
-        if (frame := entry.frame) is not None:
-            parts[".frame"] = [
-                "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
-                _line("parent", frame.parent),
-                _line("place_mm", frame.place_mm),
-                _line("quaternion", frame.quaternion, "x, y, z, w"),
-            ]
-        if entry.pad is not None:
-            parts[".pad"] = ["# The pad itself, for networks that ask for it.", *_pad_lines(entry.pad, grid)]
-        if entry.learned is not None:
-            about = "# Learned from contacts while it ran; edge-sr doctor --forget-gains removes it."
-            parts[".learned"] = [about, *_pad_lines(entry.learned, grid)]
-        if (baseline := entry.baseline) is not None:
-            dated = not math.isnan(baseline.created_unix_s)
-            parts[".baseline"] = [
-                "# What the free pad reads, in counts, place by place.",
-                _line("id", baseline.id),
-                *[_line("created_unix_s", baseline.created_unix_s)] * dated,
-                _line("scans", baseline.scans),
-                *(
-                    line
-                    for axis, plane in zip(AXES, baseline.counts.tolist(), strict=True)
-                    for line in _rows(axis, plane)
-                ),
-            ]
-        for part, own in parts.items():
+        for part, own in _tables(entry, shape).items():
             lines += ["", f"[sensors.{_value(name)}{part}]", *own]
     return "\n".join([*lines, ""])
 
 
-def _entry_lines(entry: SensorEntry, grid: tuple[int, int, int]) -> list[str]:
-    mounting = entry.mounting
-    gains = np.asarray(mounting.gains).reshape(grid)
+def _tables(entry: SensorEntry, shape: tuple[int, int, int]) -> dict[str, list[str]]:
+    """Return the lines of an entry's tables, by what follows the sensor's name in theirs."""
+    mounting, frame, baseline = entry.mounting, entry.frame, entry.baseline
+    gains = np.reshape(mounting.gains, shape)
     alike = bool((gains == gains[:, :1, :1]).all())
-    lines = [
+    own = [
         "# Which taxel of the model's map lies at each place, seen from above, as patterns are drawn.",
-        *_rows("order", np.reshape(mounting.order, grid[1:]).tolist()),
-        _line("swap_xy", mounting.swap_xy),
-        _line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
-        *([_line("gains", gains[:, 0, 0].tolist(), "of x, y and z")] if alike else _rows("gains", gains.tolist())),
+        *_line("order", np.reshape(mounting.order, shape[1:]).tolist()),
+        *_line("swap_xy", mounting.swap_xy),
+        *_line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
+        *_line("gains", gains[:, 0, 0].tolist() if alike else gains.tolist(), "of x, y and z"),
+        *_line("counts_per_newton", entry.counts_per_newton, "of the summed z"),
+        *_line("assumed", sorted(entry.assumed, key=PARTS.index) or None, "as wired; not measured"),
+        *_line("emulated", sorted(entry.emulated, key=PARTS.index) or None, _EMULATED),
     ]
-    if entry.counts_per_newton is not None:
-        lines.append(_line("counts_per_newton", float(entry.counts_per_newton), "of the summed z"))
-    if entry.assumed:
-        lines.append(_line("assumed", sorted(entry.assumed, key=PARTS.index), "as wired; not measured"))
-    if entry.emulated:
-        why = "measured on an emulated sensor: not for a device"
-        lines.append(_line("emulated", sorted(entry.emulated, key=PARTS.index), why))
-    return lines
+    tables = {"": own}
+    if frame is not None:
+        tables[".frame"] = [
+            "# Where the middle of the pad's face is on the robot, for ROS 2 and recordings.",
+            *_line("parent", frame.parent),
+            *_line("place_mm", frame.place_mm),
+            *_line("quaternion", frame.quaternion, "x, y, z, w"),
+        ]
+    for part, pad, about in (
+        (".pad", entry.pad, "The pad itself, for networks that ask for it."),
+        (".learned", entry.learned, "Learned from contacts while it ran; edge-sr doctor --forget-gains removes it."),
+    ):
+        if pad is not None:
+            tables[part] = [f"# {about}", *_pad_lines(pad, shape[2])]
+    if baseline is not None:
+        created_unix_s = None if math.isnan(baseline.created_unix_s) else baseline.created_unix_s
+        tables[".baseline"] = [
+            "# What the free pad reads, in counts, place by place.",
+            *_line("id", baseline.id),
+            *_line("created_unix_s", created_unix_s),
+            *_line("scans", baseline.scans),
+        ]
+        for axis, plane in zip(AXES, baseline.counts.tolist(), strict=True):
+            tables[".baseline"] += _line(axis, plane)
+    return tables
 
 
-def _pad_lines(pad: Pad, grid: tuple[int, int, int]) -> list[str]:
+def _pad_lines(pad: Pad, cols: int) -> list[str]:
     lines: list[str] = []
     for name in PAD_RANGES:
-        if name in pad.constants:
-            lines.append(_line(name, float(pad.constants[name])))
-        if name in pad.intervals:
-            lines.append(_line(f"{name}_interval", list(map(float, pad.intervals[name]))))
+        lines += [*_line(name, pad.constants.get(name)), *_line(f"{name}_interval", pad.intervals.get(name))]
     for key, values, about in (
-        ("gains", pad.gains, "How strongly each place reads: x row by row, then y, then z."),
-        ("gain_half_widths", pad.gain_half_widths, "Half of each one's 90 % interval, as a share of it."),
+        ("gains", pad.gains, "how strongly each place reads: x row by row, then y, then z"),
+        ("gain_half_widths", pad.gain_half_widths, "half of each one's 90 % interval, as a share of it"),
     ):
         if values is not None:
-            rows = np.reshape(values, (-1, grid[2])).tolist()
-            lines += [f"# {about}", f"{key} = [", *(f"    {_value(row)[1:-1]}," for row in rows), "]"]
+            rows = [_value(values[first : first + cols])[1:-1] for first in range(0, len(values), cols)]
+            lines += [f"{key} = [  # {about}", *(f"    {row}," for row in rows), "]"]
     return lines
 
 
-def _rows(key: str, rows: Sequence[object]) -> list[str]:
-    """Return a list of lists with a line for each, as a grid lies on the pad."""
-    return [f"{key} = [", *(f"    {_value(row)}," for row in rows), "]"]
-
-
-def _line(key: str, value: object, about: str = "") -> str:
-    return f"{key} = {_value(value)}" + (f"  # {about}" if about else "")
+def _line(key: str, value: Any, about: str = "") -> list[str]:
+    """Return the lines of a value, a grid with a line for each row, as it lies on the pad; none of None."""
+    comment = f"  # {about}" if about else ""
+    if value is None:
+        return []
+    if isinstance(value, list) and isinstance(value[0], list):
+        return [f"{key} = [{comment}", *(f"    {_value(row)}," for row in value), "]"]
+    return [f"{key} = {_value(value)}{comment}"]
 
 
 def _value(value: object) -> str:
     """Return a text, number, truth value or list of them in TOML, which writes these as JSON does."""
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False, default=float)  # numpy's numbers are no numbers of JSON

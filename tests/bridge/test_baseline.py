@@ -169,9 +169,6 @@ def test_from_counts_takes_what_it_is_given():
     baseline = Baseline.from_counts("6", counts, 99.0)
     assert (baseline.counts == np.median(counts, axis=0)).all()
     assert (baseline.sensor, baseline.scans, baseline.created_unix_s) == ("6", 20, 99.0)
-    for bad in (counts[:0], np.where(counts == counts[0, 0, 0, 0], ABSENT, counts)):
-        with pytest.raises(ValueError, match="whole scans"):
-            Baseline.from_counts("6", bad, 99.0)
 
 
 def test_a_taxel_given_up_has_no_rest_until_the_next_zeroing():
@@ -239,8 +236,6 @@ def test_saved_baselines_come_back(tmp_path):
         assert got.origin == "file"
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["zero.json", "zero.json.bak"]
     assert (tmp_path / "zero.json.bak").read_text() == "old"
-    with pytest.raises(ValueError, match="each sensor once"):
-        save_baselines(path, [made(), made()])
 
 
 def test_a_baseline_of_another_order_of_taxels_is_refused(tmp_path):

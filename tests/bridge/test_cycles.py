@@ -100,7 +100,7 @@ def read(frames, reader, broken_s=0.0):
     """
     scans = GsUsbScans() if reader.usb else SlcanScans()
     if reader.usb:
-        scans.start(stamped=True, channels=1)
+        scans.start(stamped=True)
     found = SimpleNamespace(numbers={}, whole=0, mixed=0, waits_ns=[])
     for time_s, data in handed_on(frames, reader):
         now_ns = 5_000_000_000 + round(time_s * 1e9)

@@ -14,7 +14,7 @@ from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
 from firmware_bridge.links.base import LinkReader
-from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, trigger_frame, trigger_frames
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
 CAN = [SlcanRig, GsUsbRig, PythonCanRig]
@@ -209,8 +209,8 @@ def test_half_a_scan_is_forgotten_with_the_link(rig):
 
 @of(CAN)
 def test_triggers_wake_older_controllers(rig):
-    with rig.link(model=LAYOUT_A_MAP, triggers=trigger_frames(LAYOUT_A_MAP)) as link:
-        assert rig.sent(7) == [trigger_frame(board) for board in range(1, 8)]
+    with rig.link(model=LAYOUT_A_MAP) as link:
+        assert rig.sent(7) == [CanFrame(0x200 | board, b"\7\0") for board in range(1, 8)]
         frames = [CanFrame(0x710 + taxel, bytes((0, 0, 1, 0, 2, 0, 3, 0))) for taxel in range(16)]
         (scan,) = rig.read(link, frames)
         assert scan.sensor == "1" and scan.complete and link.counters()["foreign"] == 0

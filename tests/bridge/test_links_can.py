@@ -18,7 +18,7 @@ from firmware_bridge.links import can_bus
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.can_bus import CanBusLink
 from firmware_bridge.links.discovery import can_interfaces, can_networks
-from firmware_bridge.scans.can_id_maps import trigger_frame
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP
 
 
 @pytest.fixture
@@ -259,5 +259,5 @@ def test_triggers_that_do_not_go_out(bus, monkeypatch):
 
     monkeypatch.setattr(VirtualBus, "send", send)
     with pytest.raises(DeviceError, match="does not send frames: Transmit buffer full"):
-        link_to(bus, triggers=[trigger_frame(1)]).__enter__()
+        link_to(bus, model=LAYOUT_A_MAP).__enter__()
     assert len(bus.channel) == 1, "it has left"

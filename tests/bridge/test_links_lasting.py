@@ -144,22 +144,6 @@ def test_where_it_may_not_be_lost_silence_is_left_alone():
     assert notices == [] and len(world.opened_at_s) == 1
 
 
-def test_one_that_comes_back_as_another_kind_is_given_up():
-    """Every result states the kind of its source: an emulated one must not follow a real one under its name."""
-
-    class Changeling(WorldLink):
-        def __enter__(self):
-            super().__enter__()
-            self.kind = "device" if self.world.now_ns < 1.5 * S else "emulated"
-            return self
-
-    world = World(away=[(1.0, 2.0)])
-    inner = Changeling(world)
-    with pytest.raises(LinkLostError, match=r"^slcan:x was device and came back as emulated: start again$"):
-        lasting(world, 5.0, inner=inner)
-    assert inner.scans <= 100 and not inner.is_open
-
-
 @pytest.mark.parametrize("error", [AssertionError(), RecursionError("deep"), ValueError("a\nb"), OSError(5, "bus")])
 def test_an_error_of_any_class_is_a_loss_and_it_is_opened_again(error):
     """Libraries raise what nobody foresees, when they read, open and close."""

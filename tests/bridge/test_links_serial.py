@@ -9,19 +9,16 @@ import termios
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import serial
 from bridge_samples import SilentDevice, read_scans
 
 from firmware_bridge.can.slcan import CLOSE, CanFrame, encode_frame
-from firmware_bridge.emulation.pty_port import PseudoPort
-from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
 from firmware_bridge.links import slcan_serial
 from firmware_bridge.links.slcan_serial import PortReader, SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import USPA44_MAP, trigger_frame
+from firmware_bridge.scans.can_id_maps import LAYOUT_A_MAP, USPA44_MAP
 
 LINES = [encode_frame(CanFrame(can_id, bytes(8))) for can_id, _ in USPA44_MAP.wire_order("4")]
 
@@ -67,32 +64,6 @@ def test_a_scan_comes_with_its_last_byte_however_it_is_cut(piece_bytes, monkeypa
 
 
 # The reader of the port.
-
-
-def test_few_looks_make_a_scan(monkeypatch):
-    """A plain loop wakes for every piece that comes; this one sleeps until the end of the scan can have come."""
-    now_s, sent, takes, take = [0.0], [0], [], PortReader.take
-
-    def sleep(time_s):
-        now_s[0] += time_s
-        while sent[0] < 16 and sent[0] * FRAME_S <= now_s[0]:
-            port.write(LINES[sent[0]])
-            sent[0] += 1
-        while port.unread_bytes() < 22 * sent[0] - sum(len(data) for data, _, _ in takes):
-            time.sleep(0.001)  # the kernel delivers them late
-
-    port = PseudoPort()
-    port.plug()
-    with SlcanSerialLink(port.path), monkeypatch.context() as patched:
-        descriptor = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
-        reader = PortReader(descriptor, clock_ns=lambda: round(1e9 * now_s[0]))
-        patched.setattr(slcan_serial, "time", SimpleNamespace(sleep=sleep))
-        patched.setattr(PortReader, "take", lambda reader: takes.append(take(reader)) or takes[-1])
-        sleep(0.0)
-        assert reader.read(1.0, 22 * 16)[0] == b"".join(LINES)
-        os.close(descriptor)
-    port.unplug()
-    assert len(takes) <= 4 and now_s[0] < 15 * FRAME_S + 0.0005
 
 
 def test_who_stands_still_after_a_look_is_not_up_to_date(monkeypatch):
@@ -150,7 +121,10 @@ def test_what_lies_there_at_an_opening_or_at_the_end_is_dropped():
     [
         ({}, b"C\rS8\rZ1\rO\rC\rZ0\r"),
         ({"baudrate": 921_600}, b"C\rS8\rO\rC\r"),  # the line carries no time stamps
-        ({"triggers": [trigger_frame(1)]}, b"C\rS8\rZ1\rO\rt20120700\rC\rZ0\r"),
+        (
+            {"model": LAYOUT_A_MAP},
+            b"C\rS8\rZ1\rO\r" + b"".join(b"t20%d20700\r" % board for board in range(1, 8)) + b"C\rZ0\r",
+        ),
     ],
 )
 def test_commands_on_opening_and_closing(settings, commands):

@@ -1,18 +1,15 @@
 """Wire of an slcan adapter besides frames: time stamps and status."""
 
 import os
-import time
 
 import pytest
 from bridge_samples import SilentDevice, make_recording, read_scans
 from edge_samples import wait_for
 
-from firmware_bridge.can import slcan_status
 from firmware_bridge.can.slcan import CanFrame, encode_frame
-from firmware_bridge.can.slcan_status import BUS_ERRORS, BUS_OFF, FRAMES_LOST
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links import slcan_serial
-from firmware_bridge.links.slcan_serial import MOST_LATE_STAMPS, SlcanSerialLink
+from firmware_bridge.links.slcan_serial import BUS_ERRORS, BUS_OFF, SlcanSerialLink
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.scans.slcan_scans import SlcanScans
 
@@ -65,9 +62,9 @@ def test_the_same_stamp_again_is_a_minute_later():
 LATE = cycle_lines(0, 0)[0][:-5] + b"FA00\r"  # no milliseconds of a minute
 
 
-@pytest.mark.parametrize("text", [LATE, b"".join(cycle_lines(0, 0))], ids=["other units", "standing still"])
-def test_stamps_that_are_no_clock_are_left_out(text, limits):
-    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
+@pytest.mark.parametrize("text", [LATE * 16, b"".join(cycle_lines(0, 0))], ids=["beyond a minute", "within it"])
+def test_stamps_that_stand_still_are_left_out(text, limits):
+    limits(slcan_serial, ADAPTER_ASKED_NS=10**12)
     with SilentDevice() as device:
         with SlcanSerialLink(device.port) as link:
 
@@ -87,64 +84,36 @@ def test_stamps_that_are_no_clock_are_left_out(text, limits):
         assert device.received(9) == b"C\rS8\rO\rC\r"
 
 
-def test_a_stamp_that_flips_now_and_then_is_no_reason_for_it(limits):
-    limits(slcan_status, ADAPTER_ASKED_NS=10**12)
-    limits(slcan_serial, LATE_STAMPS_FRAMES=20)
-    with SilentDevice() as device:
-        link, begun_s = SlcanSerialLink(device.port), time.monotonic()
-
-        def send(number, before=b""):  # stamped by a clock, which a busy machine holds up no more than ours
-            lines = cycle_lines(number, round(1000 * (time.monotonic() - begun_s)))
-            os.write(device.device_fd, before + b"".join(lines))
-
-        for opening in range(2):
-            with link:
-                assert device.received(10) == b"C\rS8\rZ1\rO\r"
-                for number in range(MOST_LATE_STAMPS):
-                    send(2 * number, LATE)
-                    send(2 * number + 1)
-                    assert None not in [scan.device_ns for scan in read_scans(link, 2)]
-                os.write(device.device_fd, LATE * (MOST_LATE_STAMPS - 1))  # which the next opening does not count
-                late = (2 * opening + 2) * MOST_LATE_STAMPS - opening - 1
-                wait_for(lambda late=late: link.read(0.01) == [] and link.counters()["late_stamps"] == late)
-            assert device.received(5) == b"C\rZ0\r"
-
-
 # Status.
 
 
 @pytest.fixture
 def impatient(limits):
-    """Asks every 50 ms instead of 5 s."""
-    limits(slcan_status, INTERVAL_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
+    """Asks a silent adapter every 50 ms instead of 5 s."""
+    limits(slcan_serial, ASKED_AGAIN_NS=50 * MS, ADAPTER_ASKED_NS=40 * MS)
 
 
 def read_until(link: SlcanSerialLink, condition) -> None:
     wait_for(lambda: link.read(0.01) is not None and condition())
 
 
-def test_flags_are_asked_for_and_told(impatient):
-    with Emulator([make_recording(10)], loop=True) as emulator, SlcanSerialLink(emulator.port) as link:
-        read_until(link, lambda: link.counters()["status_answers"] >= 2)
-        assert link.trouble is None
-        emulator.adapter.flags = 0x08
-        read_until(link, lambda: link.trouble == FRAMES_LOST)
-        assert link.counters()["adapter_overrun"] == 1
-        read_until(link, lambda: link.trouble is None)  # asking has cleared it
-        assert link.counters()["bad_lines"] == 0
-
-
 def test_a_silent_bus_with_errors_is_trouble(impatient):
     """The bitrate or the wiring is wrong: the adapter hears noise, and a frame never."""
     with SilentDevice() as device, SlcanSerialLink(device.port) as link:
-        for answered, answer in enumerate((b"F00\r", b"FA4\r")):
+        of_flags = ((b"F00\r", None), (b"F5F\r", None), (b"F80\r", BUS_ERRORS), (b"F20\r", BUS_ERRORS))
+        for answered, (answer, trouble) in enumerate((*of_flags, (b"sb256256\r", BUS_OFF))):
             wait_for(lambda: link.read(0.01) == [] and b"F\r" in read_now(device))
             os.write(device.device_fd, answer)
-            wait_for(lambda n=answered: link.read(0.01) == [] and link.counters()["status_answers"] > n)
-            assert link.trouble == (BUS_ERRORS if answer == b"FA4\r" else None)
+            wait_for(lambda n=answered: link.read(0.01) == [] and status_lines(link) > n)
+            assert link.trouble == trouble
         os.write(device.device_fd, b"".join(cycle_lines(0)))
         read_scans(link, 1)
         assert link.trouble is None
+
+
+def status_lines(link: SlcanSerialLink) -> int:
+    counted = link.counters()
+    return counted["status_lines"] + counted["status_answers"]
 
 
 def read_now(device: SilentDevice) -> bytes:

@@ -1,10 +1,7 @@
 """The serial ports of this machine, the links that a user names, and a port that comes back under another name."""
 
-import libusb_package
 import pytest
 from bridge_samples import make_counts, write_recording
-from can.interfaces.virtual import VirtualBus
-from gs_usb_emulator import GsUsbBackend
 from link_rigs import SlcanRig
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
@@ -17,7 +14,7 @@ from firmware_bridge.links.gs_usb_link import GsUsbLink
 from firmware_bridge.links.registry import FORMS, open_source
 from firmware_bridge.links.serial_ports import PluggedAdapter, Port, find_adapter, find_by_serial, serial_ports
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
-from firmware_bridge.scans.can_id_maps import ID_MAPS, trigger_frame, trigger_frames
+from firmware_bridge.scans.can_id_maps import ID_MAPS
 
 VSCOM = Port("/dev/ttyUSB0", (0x0403, 0x6015), "D30BL366", "USB-CAN Plus")
 SECOND_VSCOM = Port("/dev/ttyUSB1", (0x0403, 0x6015), "D30XXXXX", "USB-CAN Plus")
@@ -208,19 +205,9 @@ def test_the_id_map_is_the_one_asked_for(tmp_path, model, can_ids, sensor, fresh
     rig = SlcanRig(tmp_path, None)
     with open_source(rig.name, model=ID_MAPS[model]) as link:
         scans = rig.read(link, frames_of([*can_ids, can_ids[0]]))
-        assert rig.sent(boards) == [trigger_frame(board) for board in range(1, boards + 1)]
+        assert rig.sent(boards) == [CanFrame(0x200 | board, b"\7\0") for board in range(1, boards + 1)]
     rig.close()
     assert [(scan.sensor, int(scan.fresh.sum())) for scan in scans] == [(sensor, fresh)]
-
-
-def test_old_controllers_are_woken_over_other_adapters_too(monkeypatch):
-    triggers, backend = trigger_frames(ID_MAPS["A"]), GsUsbBackend()
-    monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: backend)
-    with open_source("gs_usb", model=ID_MAPS["A"]):
-        assert backend.ports[0].adapter.sent == list(triggers)
-    with VirtualBus(channel="a:b") as far, open_source("can:virtual:a:b", model=ID_MAPS["A"]):
-        heard = [far.recv(1.0) for _ in triggers]
-        assert [one.arbitration_id for one in heard if one] == [one.can_id for one in triggers]
 
 
 # A port under another name, identified by its serial number or path.

@@ -1,15 +1,16 @@
-"""Messages of the vendor's server, decoded."""
+"""The vendor's server: its messages, and the scans that they make."""
 
 import json
 
 import numpy as np
 import pytest
-from bridge_samples import REST_COUNTS
+from bridge_samples import REST_COUNTS, make_recording
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from xela_server_emulator import UNIX_S, message, sensor_entry
+from xela_server_emulator import MS, UNIX_S, VendorServer, message, sensor_entry
 
-from firmware_bridge.scans.xela_server_messages import LONGEST_MESSAGE_BYTES, ServerDecoder
+from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder
+from firmware_bridge.scans.xela_server_scans import MOST_MISSED, ServerScans
 
 NAN = float("nan")
 VALUES = np.asarray(REST_COUNTS).reshape(3, 16).T.ravel().tolist()
@@ -32,20 +33,20 @@ def only_reading(entry):
 
 def test_a_message_of_1_8_0():
     told, counters = decoded(message(19299, sensor_entry(), sensor_entry(REST_COUNTS + 1)))
-    assert (told.kind, told.sequence, told.sent_s, told.version) == ("readings", 19299, UNIX_S, "1.8.0b_208601")
+    assert (told.sequence, told.sent_s) == (19299, UNIX_S)
     assert counters == {}
     first, second = told.readings
     assert (first.sensor, second.sensor) == ("1", "2")
     assert (first.counts.reshape(3, 4, 4) == REST_COUNTS).all() and first.counts.dtype == np.int32
     assert (second.counts.reshape(3, 4, 4) == REST_COUNTS + 1).all()
-    assert first.ups_hz == (100.0,) * 16 and first.acquired_s == UNIX_S
+    assert first.ups_hz == [100.0] * 16 and first.acquired_s == UNIX_S
     assert first.newtons is not None and first.newtons.shape == (3, 4, 4)
     assert first.temperature_k is not None and (first.temperature_k == np.float32(301.5)).all()
 
 
 def test_axes_and_places():
     """x, y, z of one taxel side by side; taxels row by row from the top left."""
-    entry = sensor_entry(data=list(range(48)), integer=None, calibrated=[float(value) for value in range(48)])
+    entry = sensor_entry(data=list(range(48)), calibrated=[float(value) for value in range(48)])
     reading, _ = only_reading(entry)
     counts = reading.counts.reshape(3, 4, 4)
     assert counts[:, 0, 0].tolist() == [0, 1, 2] and counts[:, 0, 1].tolist() == [3, 4, 5]
@@ -56,22 +57,14 @@ def test_axes_and_places():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"integer": None},
+        {"integer": [7] * 48},
         {"data": VALUES, "integer": None},
-        {"data": None},
-        {"data": "8197,829A"},
         {"data": ",".join(f"{value:x}" for value in VALUES) + ",", "integer": None},
     ],
 )
 def test_every_form_of_the_counts(changes):
     reading, counters = only_reading(sensor_entry(**changes))
-    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all()
-    assert set(counters) <= {"disagreeing"}
-
-
-def test_data_wins_where_the_two_disagree():
-    reading, counters = only_reading(sensor_entry(integer=[7] * 48))
-    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all() and counters == {"disagreeing": 1}
+    assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all() and counters == {}
 
 
 @pytest.mark.parametrize(
@@ -88,7 +81,7 @@ def test_data_wins_where_the_two_disagree():
     ids=str,
 )
 def test_counts_and_numbers_of_taxels_that_are_none(changes):
-    told, counters = decoded(message(5, sensor_entry(**{"integer": None} | changes)))
+    told, counters = decoded(message(5, sensor_entry(**changes)))
     assert told.readings == () and counters == {"bad_sensor": 1}
 
 
@@ -104,24 +97,23 @@ def test_other_sensors_are_named_and_left_out():
 
 
 @pytest.mark.parametrize(
-    ("key", "field", "absent", "counted", "bad"),
+    ("key", "field", "absent", "bad"),
     [
-        ("ups", "ups_hz", [None], "bad_ups", ["58", *([1.0] * 15 + end for end in ([], [-1.0], [1e9], [NAN]))]),
+        ("ups", "ups_hz", [None], ["58", *([1.0] * 15 + end for end in ([], [-1.0], [1e9], [NAN]))]),
         (
             "calibrated",
             "newtons",
             [None],
-            "bad_calibrated",
             [[0.0] * 16, *([0.0] * 47 + [end] for end in (float("inf"), 10**400, 1001, True))],
         ),
-        ("temp", "temperature_k", [None, [0.0] * 16], "bad_temperature", [[25.0] * 16, [300.0] * 17]),
-        ("time", "acquired_s", [None], "bad_time", ["now", True, -1, 1e300, NAN]),
+        ("temp", "temperature_k", [None, [0.0] * 16], [[25.0] * 16, [300.0] * 17]),
+        ("time", "acquired_s", [None], ["now", True, -1, 1e300, NAN]),
     ],
 )
-def test_what_else_is_wrong_costs_itself_alone(key, field, absent, counted, bad):
+def test_what_else_is_wrong_costs_itself_alone(key, field, absent, bad):
     cases = [(sensor_entry() | {key: None}, {})]  # a null is as good as nothing
     cases += [(sensor_entry(**{key: value}), {}) for value in absent]
-    cases += [(sensor_entry(**{key: value}), {counted: 1}) for value in bad]
+    cases += [(sensor_entry(**{key: value}), {"bad_values": 1}) for value in bad]
     for entry, counters in cases:
         reading, counted_now = only_reading(entry)
         assert (reading.counts.reshape(3, 4, 4) == REST_COUNTS).all()
@@ -134,31 +126,35 @@ def test_a_taxel_without_thermometer():
 
 
 @pytest.mark.parametrize(
-    ("text", "kind", "counted"),
+    ("counted", "texts"),
     [
-        ('{"message": "Welcome", "version": "1.7.6"}', "welcome", "welcomes"),
-        ('{"message": 12}', "readings", "without_readings"),
-        ('{"message": 12, "sensors": 0, "type": "welcome"}', "readings", "without_readings"),
-        ('{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}', "readings", "without_readings"),
-        ('{"message": "welcome"}', "bad", "bad_sequence"),
-        ("{}", "bad", "bad_sequence"),
-        ('{"message": true}', "bad", "bad_sequence"),
-        ('{"message": 1.0}', "bad", "bad_sequence"),
-        ('{"message": NaN}', "bad", "bad_sequence"),
-        ('{"message": -1}', "bad", "bad_sequence"),
-        ('{"message": 99999999999999999999}', "bad", "bad_sequence"),
-        ('{"message": 1, "message": 2}', "bad", "duplicate_keys"),
-        ('{"message": 1, "1": {"ups": 1, "ups": 2}}', "bad", "duplicate_keys"),
-        ('{"message": ' + "9" * 6000 + "}", "bad", "bad_json"),
-        *((text, "bad", "bad_json") for text in ("[" * 100_000, '{"1":' * 40_000)),
-        *((text, "bad", "bad_json") for text in (b"\xff\xfe\x00", b"")),
-        *((text, "bad", "bad_json") for text in ("[1]", "null", '{"message": 12, "time": 17', "x" * 50_000)),
-        (" " * (LONGEST_MESSAGE_BYTES + 1), "bad", "too_long"),
+        ("welcomes", ['{"message": "Welcome", "version": "1.7.6"}']),
+        (
+            "without_readings",
+            [
+                '{"message": 12}',
+                '{"message": 12, "sensors": 0, "type": "welcome"}',
+                '{"message": 12, "0x1": {}, "-1": {}, "": {}, "1234": {}, "²": {}, "1": []}',
+            ],
+        ),
+        (
+            "bad_json",
+            [
+                *(
+                    f'{{"message": {number}}}'
+                    for number in ('"welcome"', "true", "1.0", "NaN", "-1", "9" * 20, "9" * 6000)
+                ),
+                *("{}", "[1]", "null", "", b"\xff\xfe\x00", '{"message": 12, "time": 17', "x" * 50_000),
+                *("[" * 100_000, '{"1":' * 40_000),
+            ],
+        ),
     ],
 )
-def test_other_messages(text, kind, counted):
-    told, counters = decoded(text)
-    assert (told.kind, told.readings, counters) == (kind, (), {counted: 1})
+def test_other_messages(counted, texts):
+    for text in texts:
+        told, counters = decoded(text)
+        assert (told.sequence is None) == (counted != "without_readings")
+        assert (told.readings, counters) == ((), {counted: 1}), text[:50]
 
 
 SCRAPS = st.recursive(
@@ -178,3 +174,218 @@ def test_whatever_stands_in_a_key_is_borne(key, scrap, noise, place):
         for reading in told.readings:
             assert reading.counts.shape == (3, 16) and 0 <= reading.counts.min() <= reading.counts.max() <= 65535
             assert reading.ups_hz is None or len(reading.ups_hz) == 16
+
+
+class Server:
+    """Server with messages and times of the test; arrivals are 2 ms after the sending."""
+
+    def __init__(self) -> None:
+        self.scans = ServerScans()
+        self.sequence = 0
+        self.clock_s = UNIX_S
+
+    def say(
+        self, at_ms: float, counts=REST_COUNTS, *, age_ms: float = 0.0, way_ms=2, number: int | None = None, **changes
+    ):
+        """Return the scans that one message about one sensor closes, sent at a time in [ms]."""
+        sent_s = self.clock_s + at_ms / 1e3
+        entry = sensor_entry(counts, **({"time_s": sent_s - age_ms / 1e3} | changes))
+        text = message(self.sequence if number is None else number, entry, time_s=sent_s)
+        self.sequence += 1
+        return self.scans.feed(text, round((at_ms + way_ms) * MS))
+
+    def counted(self, *names: str) -> tuple[int, ...]:
+        counters = self.scans.counters()
+        return tuple(counters[name] for name in names)
+
+
+def cycle(number: int, taxels=range(16)) -> np.ndarray:
+    """Counts in which these taxels are of one cycle, the others at rest."""
+    counts = REST_COUNTS.reshape(3, 16).copy()
+    counts[:, list(taxels)] += number
+    return counts
+
+
+def test_a_scan_for_every_renewal_however_often_it_is_told():
+    """A message every 2 ms, a renewal every 10."""
+    server = Server()
+    scans = [scan for step in range(50) for scan in server.say(2 * step, cycle(1 + step // 5))]
+    assert len(scans) == 10 and all(scan.whole for scan in scans)
+    assert [scan.number for scan in scans] == list(range(10))
+    assert [scan.time_ns for scan in scans] == [(10 * n + 2) * MS for n in range(10)]
+    assert server.counted("scans", "torn_wire", "torn_source", "repeated") == (10, 0, 0, 0)
+
+
+def test_a_still_pad_gives_repeated_scans():
+    server = Server()
+    scans = [scan for step in range(600) for scan in server.say(2 * step)]
+    assert scans[0].whole and all(scan.repeated for scan in scans[1:])
+    assert 72 <= len(scans) <= 81  # 1.2 s of 100 Hz, each due after a period and a half
+    assert server.scans.trouble is None, "it is no dead cable"
+
+
+def test_half_a_cycle_waits_for_the_other_half():
+    """A taxel with the same counts as before is taken as repeated: noise does that, and waiting would cost a cycle."""
+    server = Server()
+    server.say(0)
+    assert server.say(4, cycle(1, range(7))) == []
+    (scan,) = server.say(10, cycle(1))
+    assert scan.whole and (scan.counts.reshape(3, 16) == cycle(1)).all()
+    (scan,) = server.say(20, cycle(2, range(15)) + (np.arange(16) == 15))
+    assert scan.complete and np.flatnonzero(~scan.renewed).tolist() == [15]
+    assert server.counted("torn_source") == (1,)
+
+
+def test_a_taxel_without_updates_is_absent_unless_it_changes():
+    server = Server()
+    ups = [100.0] * 15 + [0.0]
+    server.say(0)
+    for step in range(1, 50):
+        (scan,) = server.say(10 * step, cycle(step, range(15)), ups=ups)
+        assert np.flatnonzero(scan.fresh).tolist() == list(range(15))
+    assert server.counted("torn_wire", "missing_taxels") == (49, 49)
+    (scan,) = server.say(500, cycle(50), ups=ups)
+    assert scan.whole
+
+
+@pytest.mark.parametrize("unknown", [{"ups": 0.0}, {"time_s": UNIX_S}, {"ups": 0.0, "time_s": UNIX_S}])
+def test_a_server_that_states_nothing_but_changes_is_used(unknown):
+    """A third of the taxels in every message: none of the scans is torn for it."""
+    server = Server()
+    scans = []
+    for step in range(600):
+        grown = (step + np.arange(16) % 3) // 3
+        scans += server.say(10 * step / 3, REST_COUNTS.reshape(3, 16) + grown, **unknown)
+    assert 195 <= len(scans) <= 201 and sum(scan.whole for scan in scans) >= 0.98 * len(scans)
+    assert server.scans.trouble is None
+    if "ups" in unknown:
+        assert all(scan.vendor is not None and scan.vendor.ups_hz is None for scan in scans)
+    late = [scan for step in range(200, 600) for scan in server.say(10 * step, cycle(900), **unknown)]
+    assert [scan for scan in late if scan.time_ns > 3100 * MS] == [] and server.scans.trouble is not None
+
+
+@pytest.mark.parametrize(
+    "dead",
+    [
+        pytest.param({"ups": 0.0}, id="ups falls to 0"),
+        pytest.param({"time_s": UNIX_S}, id="its time stands still"),
+        pytest.param({"taxels": 15}, id="nothing usable is said of it"),
+    ],
+)
+def test_a_dead_cable_gives_no_scan_and_is_told_of(dead):
+    """However long the server goes on with the last reading."""
+    server = Server()
+    for step in range(20):
+        assert server.say(10 * step, cycle(step))
+    scans = [scan for step in range(20, 420) for scan in server.say(10 * step, cycle(19), **dead)]
+    assert server.scans.trouble is not None and "nothing arrives from sensor 1: check its cable" in server.scans.trouble
+    assert not any(scan.renewed.any() for scan in scans) and len(scans) <= 67  # a second long it may be a still pad
+    assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
+    server.scans.begin()  # opening it again brings no scan either
+    assert server.say(5000, cycle(19), **dead) == [] and server.scans.trouble is not None
+    server.say(5010, cycle(20))
+    assert server.say(5020, cycle(21)) and server.scans.trouble is None
+
+
+@pytest.mark.parametrize("set_by_s", [0.0, -3600.0, 3600.0])
+def test_a_sensor_that_died_long_ago_stays_dead(set_by_s):
+    """The age of its last reading would then be unreliable, or lie in the future."""
+    server = Server()
+    assert server.say(0, cycle(1))
+    server.clock_s += set_by_s
+    scans = [scan for step in range(1, 200) for scan in server.say(100 * step, cycle(1), time_s=UNIX_S)]
+    assert [scan for scan in scans if scan.time_ns > 1400 * MS] == []
+    assert server.scans.trouble is not None and "nothing arrives from sensor 1" in server.scans.trouble
+    server.scans.begin()
+    assert server.say(20_100, cycle(1), time_s=UNIX_S) == []
+
+
+def test_a_slow_taxel_does_not_hold_up_the_others():
+    server = Server()
+    scans = []
+    for step in range(100):
+        counts = cycle(step, range(15))
+        counts[:, 15] += step // 20
+        scans += server.say(10 * step, counts, ups=[100.0] * 15 + [5.0])
+    assert len(scans) == 100
+    assert sum(scan.complete for scan in scans) in (5, 6, 7, 8, 9, 10)
+
+
+def test_without_ups_the_usual_is_taken():
+    server = Server()
+    assert len([scan for step in range(100) for scan in server.say(10 * step, cycle(step), ups=None)]) == 100
+    assert 40 <= len([scan for step in range(100, 200) for scan in server.say(10 * step, cycle(99), ups=None)]) <= 60
+
+
+def test_what_the_vendor_says_besides():
+    (scan,) = Server().say(0)
+    assert scan.vendor.temperature_k.shape == scan.vendor.ups_hz.shape == (4, 4)
+    assert scan.vendor_force_n == (2.0, 2.0, 2.0)
+    (torn,) = Server().say(0, ups=[100.0] * 15 + [0.0])
+    assert torn.vendor_force_n is None  # of one taxel it is an old one
+
+
+CONNECTED = "connected"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "scans", "counted"),
+    [
+        ([5, 5, 6, 8, 8, 11], [1, 0, 1, 1, 0, 1], {"repeated": 2, "missed": 3}),
+        ([5000, 0, 1], [1, 1, 1], {"restarts": 1}),
+        ([5000, CONNECTED, 0], [1, 1], {}),
+        ([1, 1 << 62, 2, 3], [1, 1, 1, 1], {"restarts": 2}),
+        ([1, 1 + MOST_MISSED, 2 + 2 * MOST_MISSED], [1, 1, 1], {"missed": MOST_MISSED - 1, "restarts": 1}),
+    ],
+)
+def test_messages_are_taken_in_order_and_a_new_count_is_known(numbers, scans, counted):
+    """By a new connection, a number out of a hat, or one below the last: a connection keeps the order."""
+    server, got = Server(), []
+    for step, number in enumerate(numbers):
+        if number == CONNECTED:
+            server.scans.begin()
+        else:
+            got.append(server.say(10 * step, cycle(step), number=number))
+    assert [len(some) for some in got] == scans
+    assert [scan.number for some in got for scan in some] == list(range(sum(scans))), "numbering goes on"
+    told = server.counted("repeated_messages", "missed_messages", "server_restarts")
+    assert told == tuple(counted.get(name, 0) for name in ("repeated", "missed", "restarts"))
+
+
+def test_memory_is_bounded():
+    scans, names = ServerScans(), range(3 * MOST_SENSORS)
+    found = [scan for name in names for scan in scans.feed(message(name, **{str(name): sensor_entry()}), name * MS)]
+    assert len({scan.sensor for scan in found}) == MOST_SENSORS
+
+
+@pytest.mark.parametrize("age_ms", [6, 40, -5, 3_600_000])
+def test_when_it_was_acquired_unless_that_cannot_be(age_ms):
+    server = Server()
+    (scan,) = [*server.say(0), *server.say(10, cycle(1), age_ms=age_ms)][1:]
+    expected_ns = age_ms * MS if 0 < age_ms < 1000 else None
+    assert (scan.device_ns and scan.time_ns - scan.device_ns) == (expected_ns and pytest.approx(expected_ns, abs=2000))
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.05, -0.05])
+def test_a_step_of_the_servers_clock_does_not_hurt(step_s):
+    server = Server()
+    for step in range(20):
+        server.say(10 * step, cycle(step))
+    server.clock_s += step_s
+    scans = [scan for step in range(20, 60) for scan in server.say(10 * step, cycle(step))]
+    assert len(scans) == 40
+    assert all(scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= 51 * MS for scan in scans)
+
+
+@pytest.mark.parametrize(
+    ("spread", "message_hz", "fewest"),
+    [(0.0, 100, 100), (0.9, 100, 99), (0.5, 507, 98), (0.3, 60, 60), (1.0, 333, 80)],
+)
+def test_whatever_the_pace_of_the_messages_scans_are_whole(spread, message_hz, fewest):
+    """A second of 100 Hz. A message with the end of one cycle and the start of another skips a scan."""
+    server = VendorServer([make_recording(100)], spread=spread)
+    scans, found = ServerScans(), []
+    for number in range(message_hz):
+        found += scans.feed(server.message(number, number / message_hz, UNIX_S), round(1e9 * number / message_hz))
+    assert fewest <= len(found) <= 100
+    assert all(scan.complete for scan in found) and sum(scan.whole for scan in found) >= 0.98 * len(found)

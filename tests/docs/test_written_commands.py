@@ -169,9 +169,6 @@ def world(emulated, press, tmp_path, plugged, monkeypatch):
             plugged.append(Port(right.port, (0x0403, 0x6015), "D30BL401", "VScom USB-CAN Plus"))
         if "press.mcap" in command and " record " not in command and "mcap:press.mcap" not in command:
             shutil.copy(press / "press.mcap", "press.mcap")
-        if command.endswith(" bag"):
-            Path("bag").mkdir()
-            shutil.copy(press / "press.mcap", "bag/bag_0.mcap")
         if " doctor " in command and "--out" in command and "--sensor" not in command:
             Path("sensor.toml").unlink()
         if "--forget-gains" in command:

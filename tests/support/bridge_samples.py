@@ -4,6 +4,7 @@ import csv
 import os
 import random
 import select
+import struct
 import time
 import tty
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_bridge.can.slcan import CanFrame
+from firmware_bridge.can.slcan import STAMPED_BYTES, CanFrame, SlcanDecoder
 from firmware_bridge.emulation.slcan_emulator import scan_frames
 from firmware_bridge.errors import LinkLostError
 from firmware_bridge.links.base import Link
@@ -37,18 +38,31 @@ def frames_of(scans: int, controller: int = 4, seed: int = 0) -> list[CanFrame]:
     return [frame for counts in make_counts(scans, seed) for frame in scan_frames(counts, controller, noise)]
 
 
+def decoded(decoder: SlcanDecoder, data: bytes) -> list[CanFrame]:
+    """Return the frames that a decoder finds, one by one."""
+    frames: list[CanFrame] = []
+    for piece in decoder.cut(data):
+        if isinstance(piece, CanFrame):
+            frames.append(piece)
+            continue
+        layout = ">H8sH" if piece.frame_bytes == STAMPED_BYTES else ">H8s"
+        for id_and_length, payload, *stamp in struct.iter_unpack(layout, piece.data):
+            frames.append(CanFrame(id_and_length >> 4, payload, timestamp_ms=stamp[0] if stamp else None))
+    return frames
+
+
 def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recording:
     return Recording(Path("made.csv"), (Track("4", make_counts(scans, seed), None),), rate_hz)
 
 
 def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None) -> Path:
-    """Write a recording as a CSV file, with its rate in a file next to it."""
+    """Write a recording as a CSV file, with times if it has a rate."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(CSV_HEADER)
-        writer.writerows([f"{value}.0" for value in scan.reshape(3, 16).T.ravel()] for scan in counts)
-    if rate_hz is not None:
-        path.with_name("meta_data.csv").write_text(f"frequency_hz\n{rate_hz}\n")
+        writer.writerow(CSV_HEADER if rate_hz is None else ("time_s", *CSV_HEADER))
+        for number, scan in enumerate(counts):
+            time_s = [] if rate_hz is None else [number / rate_hz]
+            writer.writerow([*time_s, *(f"{value}.0" for value in scan.reshape(3, 16).T.ravel())])
     return path
 
 

@@ -46,7 +46,7 @@ class GsUsbAdapter:
         mute: true once it sends no more.
     """
 
-    def __init__(self, limits: BitTimingLimits = CANDLELIGHT, *, channels: int = 1) -> None:
+    def __init__(self, limits: BitTimingLimits = CANDLELIGHT) -> None:
         """Plug it in."""
         self.started = False
         self.right_bitrate = False
@@ -54,7 +54,6 @@ class GsUsbAdapter:
         self.lost_frames = 0
         self.mute = False
         self._limits = limits
-        self._channels = channels
         self._stamped = False
         self._overflowed = False
         self._queue: deque[bytes] = deque()
@@ -99,8 +98,6 @@ class GsUsbAdapter:
         """Answer a request; raises StalledError if it knows none such."""
         if number == gs_usb.BIT_TIMING_LIMITS:
             return struct.pack("<10I", *self._limits)
-        if number == gs_usb.DEVICE_CONFIG:
-            return struct.pack("<4B2I", 0, 0, 0, self._channels - 1, 2, 1)
         raise StalledError(f"request {number}")
 
     def take(self, data: bytes) -> bool:

@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 import can
-from bridge_samples import frames_of, make_counts, read_scans, write_recording
+from bridge_samples import decoded, frames_of, make_counts, read_scans, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
 from xela_server_emulator import ServerEmulator, looping
@@ -136,10 +136,10 @@ class SlcanRig(CanRig):
 
     def sent(self, frames):
         decoder, end_s = SlcanDecoder(), time.monotonic() + 60
-        heard = decoder.feed(b"".join(listen([self._port], 0.1).values()))
+        heard = decoded(decoder, b"".join(listen([self._port], 0.1).values()))
         while len(heard) < frames:
             assert time.monotonic() < end_s, heard
-            heard += decoder.feed(b"".join(listen([self._port], 0.1).values()))
+            heard += decoded(decoder, b"".join(listen([self._port], 0.1).values()))
         return heard
 
     def lose(self):
@@ -259,7 +259,7 @@ def make_network(root: Path, name: str, *, up: bool, kind: str = "280", driver: 
 class ServerRig(Rig):
     """The vendor's server, emulated."""
 
-    sensor = "1"
+    kind, sensor = "device", "1"
     lost, away = "link lost: the server is gone", "connection refused"
     decoder = ServerScans
 

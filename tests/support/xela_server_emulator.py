@@ -27,7 +27,7 @@ from firmware_bridge.errors import LinkLostError
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.scan import ABSENT
-from firmware_bridge.scans.xela_server_messages import PRETENDED_VERSION, WELCOME
+from firmware_bridge.scans.xela_server_messages import WELCOME
 
 UNIX_S: Final = 1_768_365_606.25
 MS: Final = 1_000_000
@@ -83,7 +83,7 @@ class VendorServer:
 
     def welcome(self, unix_s: float) -> str:
         """Return the greeting."""
-        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version + PRETENDED_VERSION})
+        return json.dumps({"message": WELCOME, "time": unix_s, "version": self._version})
 
     def message(self, sequence: int, elapsed_s: float, unix_s: float) -> str:
         """Return the message on all sensors at a time in [s] from its start, `unix_s` [s] on its own clock."""
@@ -92,7 +92,7 @@ class VendorServer:
             "time": unix_s,
             "sensors": len(self._players) + len(self._others),
             "type": "welcome" if self._version == "1.7.7" else "routine",
-            "version": self._version + PRETENDED_VERSION,
+            "version": self._version,
         }
         for index in range(len(self._players)):
             message[str(index + 1)] = self._sensor(index, elapsed_s, unix_s)
@@ -155,14 +155,13 @@ class ServerEmulator:
 
     Attributes:
         url: ws://HOST:PORT, once entered.
-        sent_messages: number of messages sent to a client, without greetings.
         lost_messages: number of messages without room at a client.
     """
 
     def __init__(self, server: VendorServer, *, message_hz: float = 100.0) -> None:
         """Prepare to serve so many messages a second."""
         self.url = ""
-        self.sent_messages = self.lost_messages = 0
+        self.lost_messages = 0
         self._vendor, self._message_hz = server, message_hz
         self._port = 0
         self._sequence = 0
@@ -206,10 +205,6 @@ class ServerEmulator:
         """Go on after `freeze`; the messages of the time between are never sent."""
         self._thawed.set()
 
-    def count_from(self, sequence: int) -> None:
-        """Give the next message this number."""
-        self._sequence = sequence
-
     def say(self, text: str | bytes) -> None:
         """Send any text or bytes to every client; bytes as a binary message."""
         self._ask(self._send(text))
@@ -242,7 +237,6 @@ class ServerEmulator:
             if client.transport.get_write_buffer_size() > 1 << 20:  # unread bytes
                 self.lost_messages += 1
             else:
-                self.sent_messages += 1
                 broadcast([client], text)
 
     async def _close(self, code: int, reason: str) -> None:

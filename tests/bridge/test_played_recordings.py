@@ -1,0 +1,298 @@
+"""Recordings that are played: at their own pace, side by side, from a sign on, and by the emulator of the demo."""
+
+import threading
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from bridge_samples import make_counts, make_recording, read_scans, read_until_lost, stacked, write_npz, write_recording
+from can.interfaces.slcan import slcanBus
+
+from firmware_bridge.can.slcan import CanFrame, encode_frame
+from firmware_bridge.emulation.slcan_emulator import FRAME_S, Controller, Emulator, SlcanAdapter, bus_timeline
+from firmware_bridge.errors import DeviceError, RecordingError, SourceError
+from firmware_bridge.links.demo import DemoLink
+from firmware_bridge.links.registry import open_sources
+from firmware_bridge.links.replay import ReplayLink
+from firmware_bridge.links.slcan_serial import SlcanSerialLink
+from firmware_bridge.recording.tracks import Track
+from firmware_bridge.scans.can_id_maps import USPA44_MAP
+from firmware_bridge.scans.scan import ABSENT
+from firmware_bridge.schedule import NS_PER_S, Ticker, sleep_until
+
+START_NS = 7_000_000_000
+MS = 1_000_000
+
+
+class FakeTime:
+    """A clock that only sleeping moves on, later or earlier than asked for."""
+
+    def __init__(self, *off_by_s: float) -> None:
+        self.now_ns = START_NS
+        self.slept_s: list[float] = []
+        self._off_by_s = list(off_by_s)
+
+    def clock(self) -> int:
+        return self.now_ns
+
+    def sleep(self, time_s: float) -> None:
+        assert time_s > 0
+        self.slept_s.append(time_s)
+        self.pass_s(time_s + (self._off_by_s.pop(0) if self._off_by_s else 0.0))
+
+    def pass_s(self, time_s: float) -> None:
+        self.now_ns += round(time_s * NS_PER_S)
+
+
+def replay(time: FakeTime, *paths, **options) -> ReplayLink:
+    return ReplayLink(paths, clock=time.clock, sleep=time.sleep, **options)
+
+
+def test_a_csv_at_its_recorded_rate(tmp_path):
+    counts = make_counts(5)
+    time = FakeTime()
+    with replay(time, write_recording(tmp_path / "finger.csv", counts, rate_hz=50)) as link:
+        for number in range(5):
+            (scan,) = link.read(1.0)
+            assert time.now_ns == START_NS + number * 20 * MS == scan.time_ns
+            assert (scan.counts == counts[number]).all() and scan.complete and scan.renewed.all()
+            assert link.ended == (number == 4)
+        assert link.read(1.0) == []
+    assert link.counters() == {"scans": 5, "torn_wire": 0, "torn_source": 0, "repeated": 0}
+
+
+def test_waiting_ends_with_the_timeout_and_who_is_late_gets_all(tmp_path):
+    time = FakeTime()
+    with replay(time, write_recording(tmp_path / "finger.csv", make_counts(9)), rate_hz=10) as link:
+        assert len(link.read(0.0)) == 1
+        assert link.read(0.03) == [] and time.now_ns == START_NS + 30 * MS
+        assert link.read(0.0) == [] and time.now_ns == START_NS + 30 * MS
+        assert len(link.read(1.0)) == 1 and time.now_ns == START_NS + 100 * MS
+        time.now_ns += 250 * MS
+        assert [scan.number for scan in link.read(1.0)] == [2, 3]
+        (scan,) = link.read(1.0)
+        assert time.now_ns == scan.time_ns == START_NS + 400 * MS, "the grid stays"
+
+
+def test_sources_without_a_name_are_called_by_their_place(tmp_path):
+    """Not "1/4", which reads like the first of four sensors."""
+    forms = []
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        forms.append(f"replay:{write_recording(tmp_path / folder / '4.csv', make_counts(2), rate_hz=50)}")
+    for texts, names in (
+        (forms, ["source1/4", "source2/4"]),
+        ([forms[0], f"left={forms[1]}"], ["source1/4", "left/4"]),
+        (forms[:1], ["4"]),
+    ):
+        assert [link.__enter__().read(1)[0].sensor for link in open_sources(texts)] == names
+
+
+def test_an_npz_at_its_recorded_times_or_at_another_rate(tmp_path):
+    counts = make_counts(4)
+    times_ns = [500, 500 + 3 * MS, 500 + 30 * MS, 500 + 33 * MS]
+    path = write_npz(tmp_path / "both.npz", counts, times_ns, ["4", "6", "4", "6"], rate_hz=1.0)
+    for rate_hz, due_ms in ((None, [0, 3, 30, 33]), (10, [0, 0, 100, 100])):
+        time, scans = FakeTime(), []
+        with replay(time, path, rate_hz=rate_hz) as link:
+            while not link.ended:
+                scans += link.read(1.0)
+                assert time.now_ns == scans[-1].time_ns
+        assert [scan.time_ns - START_NS for scan in scans] == [due * MS for due in due_ms]
+        assert [(scan.sensor, scan.number) for scan in scans] == [("4", 0), ("6", 0), ("4", 1), ("6", 1)]
+        assert all((scan.counts == one).all() for scan, one in zip(scans, counts, strict=True))
+
+
+def test_torn_and_repeated_scans_are_told(tmp_path):
+    counts = make_counts(2)[[0, 0, 1, 1]]
+    counts[2, :, 1:] = counts[1, :, 1:]
+    counts[3, :, 2, 2] = ABSENT
+    with replay(FakeTime(), write_npz(tmp_path / "one.npz", counts, range(4))) as link:
+        scans = [scan for _ in range(4) for scan in link.read(1.0)]
+    assert [scan.repeated for scan in scans] == [False, True, False, False]
+    assert [scan.torn for scan in scans] == [False, False, True, True]
+    assert not scans[3].fresh[2, 2] and int(scans[3].fresh.sum()) == 15
+    assert link.counters() == {"scans": 4, "torn_wire": 1, "torn_source": 1, "repeated": 1}
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "words"),
+    [
+        (["finger.csv"], {}, r"finger\.csv .* --rate-hz"),
+        (["finger.csv"] * 2, {"rate_hz": 10}, "each sensor once"),
+        *((["finger.csv"], {"rate_hz": rate_hz}, "positive") for rate_hz in (0.0, -1.0, float("nan"), float("inf"))),
+        (["finger.csv"], {"rate_hz": 1e-10}, r"finger\.csv lasts .* give a higher rate"),
+        (
+            ["timed.npz"],
+            {"rate_hz": 100, "paced": False},
+            r"timed\.npz has times of its own.*leave out --rate-hz, or add --paced",
+        ),
+        (["gone.csv"], {}, "cannot be read"),
+    ],
+)
+def test_recordings_that_cannot_be_replayed(tmp_path, names, options, words):
+    write_recording(tmp_path / "finger.csv", make_counts(2))
+    write_npz(tmp_path / "timed.npz", make_counts(1), [5])
+    with pytest.raises(RecordingError if names == ["gone.csv"] else SourceError, match=words):
+        ReplayLink([tmp_path / name for name in names], **options)
+
+
+def test_it_may_wait_for_a_sign_to_begin(tmp_path):
+    time, begins = FakeTime(), threading.Event()
+    with replay(time, write_recording(tmp_path / "finger.csv", make_counts(3)), rate_hz=10, begins=begins) as link:
+        assert link.read(0.01) == [] and link.length_s == 0.2
+        time.now_ns += 900 * MS
+        begins.set()
+        assert [scan.time_ns for _ in range(3) for scan in link.read(1.0)] == [
+            START_NS + (900 + due) * MS for due in (0, 100, 200)
+        ]
+
+
+# The demo: its emulator plays through, and has hung up however the demo ends.
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "demo.csv", make_counts(30), rate_hz=100)
+
+
+@pytest.mark.parametrize(("loop", "rate_hz", "rounds"), [(False, None, 1), (True, 150, 3)])
+def test_it_plays_through_and_ends_or_begins_again(recording, loop, rate_hz, rounds):
+    with DemoLink(recording, rate_hz, loop=loop) as link:
+        scans = read_scans(link, 75)[:75] if loop else read_until_lost(link)
+        assert link.ended != loop
+        assert loop or link.read(0.1) == []
+    assert (stacked(scans) == np.concatenate([make_counts(30)] * rounds)[: len(scans)]).all()
+    assert len(scans) == (75 if loop else 30)
+
+
+def test_leaving_early_and_a_port_that_does_not_open_leave_no_emulator(recording, monkeypatch):
+    def refuse(link):
+        raise DeviceError("no port")
+
+    before = threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))
+    with DemoLink(recording, rate_hz=2) as link:  # fifteen seconds, if it were left to play on
+        read_scans(link, 1)
+    monkeypatch.setattr(SlcanSerialLink, "__enter__", refuse)
+    with pytest.raises(DeviceError, match="no port"):
+        DemoLink(recording).__enter__()
+    assert (threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "words"),
+    [("gone.npz", None, "cannot be read"), ("a.csv", None, "--rate-hz"), ("a.csv", 0, "positive")],
+)
+def test_a_recording_that_cannot_be_played(tmp_path, name, rate_hz, words):
+    write_recording(tmp_path / "a.csv", make_counts(1))
+    with pytest.raises(DeviceError, match=rf"^the emulator did not start: .*{words}"):
+        DemoLink(tmp_path / name, rate_hz).__enter__()
+
+
+# The controller and the adapter that are emulated: their frames, times and answers, on a pseudo-terminal as well.
+
+
+def test_scans_lie_on_the_grid_and_jitter_does_not_add_up():
+    for rate_hz, jitter_s, period_s in ((100.0, 0.0, 0.01), (1000.0, 0.0, 16 * FRAME_S), (100.0, 0.003, 0.01)):
+        controller = Controller(Track("x", make_counts(50, 0), None), 4, rate_hz)
+        times_s = [time_s for time_s, _ in bus_timeline([controller], jitter_s=jitter_s, seed=0, loop=False)]
+        assert abs(np.array(times_s[::16]) - period_s * np.arange(50)).max() <= jitter_s + 1e-9
+        assert np.diff(times_s[:16]) == pytest.approx([FRAME_S] * 15)
+
+
+# Answers of the adapter.
+
+FRAME = CanFrame(0x004, bytes.fromhex("937E317E1593120F"))
+
+
+@pytest.mark.parametrize(
+    ("talk", "hears"),
+    [  # it opens after bitrate and open alone, and what is open is not opened again
+        ([(b"O\rS8\r", b"\a\r"), (b"O\r", b"\r"), (b"O\rS8\rZ1\r", b"\a\a\a"), (b"C\rO\r", b"\r\r")], True),
+        ([(b"S6\rO\r", b"\r\r")], False),  # at another bitrate it hears nothing
+        ([(b"S8\rZ1", b"\r"), (b"\rO\r", b"\r\r"), (b"F\rF1\rt20120700\r", b"F00\r\az\r")], True),
+    ],
+)
+def test_an_adapter_obeys_and_refuses_as_a_strict_one(talk, hears):
+    adapter, stamped = SlcanAdapter(), b"Z1" in talk[0][0]
+    for commands, answers in talk:
+        assert adapter.feed(commands) == answers
+    assert adapter.hears_the_bus == hears
+    line = encode_frame(FRAME._replace(timestamp_ms=59_999 if stamped else None))
+    assert adapter.encode(FRAME, 59.9999) == line and adapter.encode(FRAME, 119.9999) == line
+
+
+def test_what_no_such_sensors_made_is_refused():
+    other = make_recording(1)
+    wide = Track("4", np.zeros((1, 3, 5, 6), dtype=np.int32), None)
+    with pytest.raises(RecordingError, match=r"\(3, 5, 6\)"):
+        Emulator([type(other)(other.path, (wide,), 100.0)])
+    with pytest.raises(ValueError, match="7 sensors on one bus, expected at most 6"):
+        Emulator([other] * 7)
+
+
+# The pseudo-terminal.
+
+
+def test_an_emulator_that_waits_loses_no_frame_by_a_slow_reader():
+    with (
+        Emulator([make_recording(200, rate_hz=450.0)], jitter_s=0, waits=True) as emulator,
+        SlcanSerialLink(emulator.port) as link,
+    ):
+        time.sleep(0.4)  # the terminal is full after .1 s; nor does it take its lateness for a stop, amid a scan
+        scans = read_until_lost(link)
+    assert (stacked(scans) == make_counts(200)).all()
+
+
+def test_python_can_reads_our_emulator():
+    recording, received = make_recording(20), list[can.Message]()
+    with (
+        Emulator([recording], loop=True) as emulator,
+        slcanBus(f"{emulator.port}@3000000", bitrate=1_000_000, rtscts=True, sleep_after_open=0) as bus,
+    ):
+        end_s = time.monotonic() + 60
+        while len(received) < 20 * 16 and time.monotonic() < end_s:
+            received += filter(None, [bus.recv(0.1)])
+    expected = [
+        (can_id, int(scan.reshape(3, 16)[2, taxel]))
+        for scan in recording.tracks[0].counts
+        for can_id, taxel in USPA44_MAP.wire_order("4")
+    ]
+    assert [(one.arbitration_id, int.from_bytes(one.data[5:7], "big")) for one in received] == expected
+
+
+@pytest.mark.parametrize(
+    ("off_by_s", "ticks"),
+    [  # each tick: the time worked before it, its number, and when it came, in [s]
+        ((), [(0.0, 1, 0.01), (0.003, 2, 0.02), (0.0099, 3, 0.03)]),
+        ((), [(0.01, 1, 0.01)]),
+        ((0.004,), [(0.0, 1, 0.014), (0.0, 2, 0.02)]),
+        ((), [(0.0199, 1, 0.0199), (0.0, 2, 0.02)]),
+        ((), [(0.0201, 2, 0.0201), (0.0, 3, 0.03)]),
+        ((), [(0.0349, 3, 0.0349), (0.0, 4, 0.04)]),
+    ],
+)
+def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks):
+    time = FakeTime(*off_by_s)
+    ticker = Ticker(100, time.clock, time.sleep)
+    start_ns = time.now_ns
+    for work_s, tick, at_s in ticks:
+        time.pass_s(work_s)
+        assert (ticker.wait(), time.now_ns - start_ns) == (tick, round(at_s * NS_PER_S))
+
+
+def test_no_rate_drifts():
+    time = FakeTime()
+    ticker, start_ns = Ticker(59.7544117, time.clock, time.sleep), time.now_ns
+    for _ in range(10_000):
+        ticker.wait()
+    assert abs(time.now_ns - start_ns - 10_000 / 59.7544117 * NS_PER_S) < 2
+
+
+def test_sleeping_goes_on_until_the_deadline():
+    time = FakeTime(-0.5, -0.2)
+    assert sleep_until(time.now_ns + NS_PER_S, time.clock, time.sleep) == START_NS + NS_PER_S
+    assert sleep_until(0, time.clock, time.sleep) == START_NS + NS_PER_S
+    assert time.slept_s == pytest.approx([1.0, 0.5, 0.2])
