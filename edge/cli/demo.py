@@ -204,9 +204,8 @@ def _gained(scores: Sequence[TapScore]) -> str:
     last = scores[-1]
     if last.result.taps_used < 2:
         return "Each pattern is of one tap: the model takes one, or the earlier ones were dropped."
-    change = "fell" if last.rmse_percent < last.alone_percent else "did not fall"
-    errors = f"{last.rmse_percent:.2f} % of full scale, {last.alone_percent:.2f} % with it alone"
-    return f"With {last.result.taps_used} taps the last one's error {change}: {errors}."
+    alone = f"by itself the last tap is {last.alone_percent:.2f} % of full scale off"
+    return f"With all {last.result.taps_used} taps the pattern is {last.rmse_percent:.2f} % of full scale off; {alone}."
 
 
 def _score_picture(score: TapScore, coloured: bool) -> str:
