@@ -24,7 +24,7 @@ from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PoseTrack, TimedPose
 from firmware_bridge.recording.cdr import MessageType
 from firmware_bridge.recording.csv_reader import CSV_POSES, EMULATED, csv_header
-from firmware_bridge.recording.mcap_records import DamageError, EncodedMessage, records
+from firmware_bridge.recording.mcap_records import DamageError, messages
 from firmware_bridge.recording.npz_recording import NPZ_FORMAT, NPZ_VERSION
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
@@ -147,8 +147,6 @@ class _Rows:
     def __init__(self, path: Path, geometry: SensorGeometry, origin: str) -> None:
         self._path, self._geometry, self._origin = path, geometry, origin
         self._baselines: dict[str, Baseline] = {}
-        self._types: dict[int, MessageType] = {}
-        self._topics: dict[int, _Topic] = {}
         self._taps = 1
         self._of = ""
         self._row: dict[str, Any] | None = None
@@ -156,16 +154,13 @@ class _Rows:
     def rows(self) -> Iterator[dict[str, Any]]:
         try:
             with self._path.open("rb") as file:
-                for record in records(file):
-                    if not isinstance(record, EncodedMessage):
-                        self._take(record)
+                for one in messages(file, self._topic_of):
+                    if isinstance(one, Metadata):
+                        self._taps = int(one.metadata.get("taps", "1")) if one.name == "contract" else self._taps
                         continue
-                    topic = self._topics.get(record.channel_id)
-                    if topic is None:
-                        continue
-                    if topic.kind.name == SCAN_NAME and self._row is not None:
+                    if one[0].kind.name == SCAN_NAME and self._row is not None:
                         yield self._row
-                    self._read(topic, record.log_ns, record.data)
+                    self._read(*one)
         except DamageError:
             pass  # a note of `load_recording` states it
         except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -173,19 +168,13 @@ class _Rows:
         if self._row is not None:
             yield self._row
 
-    def _take(self, record: Schema | Channel | Metadata) -> None:
-        if isinstance(record, Schema):
-            if record.name in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
-                self._types[record.id] = MessageType.of(record.name, record.data.decode())
-        elif isinstance(record, Channel):
-            sensor, _, name = record.topic.rpartition("/")
-            kind = self._types.get(record.schema_id)
-            if kind is not None:
-                # Earlier releases wrote maps in their own units, and stated none.
-                factor = UNITS[name].factor if name in UNITS and record.metadata.get("unit") else 1.0
-                self._topics[record.id] = _Topic(sensor, name, kind, factor)
-        elif record.name == "contract":
-            self._taps = int(record.metadata.get("taps", "1"))
+    def _topic_of(self, channel: Channel, schema: Schema | None) -> _Topic | None:
+        if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
+            return None
+        sensor, _, name = channel.topic.rpartition("/")
+        # Earlier releases wrote maps in their own units, and stated none.
+        factor = UNITS[name].factor if name in UNITS and channel.metadata.get("unit") else 1.0
+        return _Topic(sensor, name, MessageType.of(schema.name, schema.data.decode()), factor)
 
     def _read(self, topic: _Topic, log_ns: int, data: memoryview) -> None:
         if topic.kind.name == SCAN_NAME:

@@ -16,7 +16,7 @@ from firmware_bridge.errors import CdrError, RecordingError
 from firmware_bridge.pad_geometry import AXES, MOST_TAXELS, PADS, USPA44, SensorGeometry, pad_of
 from firmware_bridge.poses import TimedPose
 from firmware_bridge.recording.cdr import LAST_STAMP_NS, MessageType
-from firmware_bridge.recording.mcap_records import CutOffError, DamageError, EncodedMessage, records, short
+from firmware_bridge.recording.mcap_records import CutOffError, DamageError, messages, short
 from firmware_bridge.recording.scan_messages import (
     BASELINE_NAME,
     POSE,
@@ -85,8 +85,11 @@ def load_mcap(path: Path) -> Recording:
     reading = _Reading(path)
     with path.open("rb") as file:
         try:
-            for record in records(file):
-                reading.take(record)
+            for one in messages(file, reading.topic_of):
+                if isinstance(one, Metadata):
+                    reading.take_metadata(one.name, one.metadata)
+                else:
+                    reading.take_message(*one)
         except CutOffError as end:
             reading.notes.insert(0, f"{path} breaks off ({end}): its recording was killed, or the disk was full")
         except DamageError as damage:
@@ -101,30 +104,22 @@ class _Reading:
     def __init__(self, path: Path) -> None:
         self.notes: list[str] = []
         self._path = path
-        self._schemas: dict[int, MessageType | None] = {}
-        self._topics: dict[int, tuple[str, MessageType | None]] = {}
+        self._topics: dict[int, str] = {}
         self._sensors: dict[str, _Sensor] = {}  # those with scans in the order of the first ones
         self._geometry = USPA44  # for files that name no geometry
         self._named = False  # whether metadata or a message names it
         self._sized = False  # whether a message's definition holds its number of taxels
-        self._described = False  # whether there are metadata of edge-sr
+        self._described = False  # whether there are metadata
         self._offset_ns: int | None = None
         self._kept_bytes = 0
         self._poses: list[TimedPose] = []
         self._origin: Literal["device", "emulated"] | None = None
 
-    def take(self, record: EncodedMessage | Schema | Channel | Metadata) -> None:
-        """Process one record, from a chunk or between chunks."""
-        if isinstance(record, EncodedMessage):
-            self._take_message(record)
-        elif isinstance(record, Schema):
-            self._take_schema(record)
-        elif isinstance(record, Channel):
-            kind = self._schemas.get(record.schema_id) if record.message_encoding == "cdr" else None
-            self._topics[record.id] = record.topic[:60], kind
-        else:
-            self._described = True
-            self._take_metadata(record.name, record.metadata)
+    def topic_of(self, channel: Channel, schema: Schema | None) -> tuple[str, MessageType] | None:
+        """Return the name of a topic and the type of its messages, None for one that is not of edge-sr."""
+        self._topics[channel.id] = name = channel.topic[:60]
+        kind = None if schema is None or channel.message_encoding != "cdr" else self._kind_of(schema)
+        return kind and (name, kind)
 
     def recording(self) -> Recording:
         """Return what was read; a RecordingError without scans."""
@@ -158,7 +153,7 @@ class _Reading:
             self._sensors[name] = _Sensor()
         return self._sensors[name]
 
-    def _take_schema(self, schema: Schema) -> None:
+    def _kind_of(self, schema: Schema) -> MessageType | None:
         sized = re.search(rb"\[([0-9]{1,4})\] counts ", schema.data)
         if schema.name in (SCAN_NAME, BASELINE_NAME) and sized is not None and not self._named:
             self._geometry = _pad_with(int(sized[1]) // len(AXES))
@@ -167,9 +162,14 @@ class _Reading:
         if known is not None and (schema.encoding, schema.data) != ("ros2msg", known.definition.encode()):
             self._refuse(f"its {known.name} is of another release of edge-sr than this one")
         self._sized = self._sized or schema.name in (SCAN_NAME, BASELINE_NAME)
-        self._schemas[schema.id] = known
+        return known
 
-    def _take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
+    def take_metadata(self, name: str, fields: Mapping[str, str]) -> None:
+        """Process a record of metadata."""
+        self._described = True
+        self._take_named(name, fields)
+
+    def _take_named(self, name: str, fields: Mapping[str, str]) -> None:
         if name == SOURCE_METADATA:
             self._origin = origin_of({fields.get("kind", ""), self._origin or ""} - {""})
         elif name == GEOMETRY_METADATA:
@@ -207,27 +207,27 @@ class _Reading:
             return
         try:
             for name, values in json.loads(text).items():
-                self._take_metadata(name, {str(key): str(value) for key, value in values.items()})
+                self._take_named(name, {str(key): str(value) for key, value in values.items()})
         except RecordingError:
             raise
         except (ValueError, AttributeError, RecursionError) as error:
             raise CdrError(f"facts of sensor {sensor[:20]!r} that cannot be read: {short(error)}") from error
         one.facts = text
 
-    def _take_message(self, message: EncodedMessage) -> None:
-        topic, kind = self._topics.get(message.channel_id, ("", None))
-        body = message.data
+    def take_message(self, topic: tuple[str, MessageType], log_ns: int, data: memoryview) -> None:
+        """Process a message of a topic, logged at a time in [ns] since 1970."""
+        name, kind = topic
         try:
             if kind is POSE:
-                self._take_pose(decode_pose(body))
+                self._take_pose(decode_pose(data))
             elif kind is SENSOR:
-                self._take_facts(body)
-            elif kind is not None and kind.name == SCAN_NAME:
-                self._take_scan(decode_scan(body, self._geometry), message.log_ns)
-            elif kind is not None:
-                self._take_baseline(decode_baseline(body, self._geometry))
+                self._take_facts(data)
+            elif kind.name == SCAN_NAME:
+                self._take_scan(decode_scan(data, self._geometry), log_ns)
+            else:
+                self._take_baseline(decode_baseline(data, self._geometry))
         except CdrError as error:
-            raise RecordingError(f"{self._path}, topic {topic!r}: {error}") from error
+            raise RecordingError(f"{self._path}, topic {name!r}: {error}") from error
 
     def _take_scan(self, scan: RecordedScan, log_ns: int) -> None:
         if scan.frame == f"emulated/{scan.sensor}":
@@ -277,7 +277,7 @@ class _Reading:
     def _instead(self) -> str:
         if self.notes:
             return f"; {self.notes[0]}"
-        names = [name for name, _ in self._topics.values()]
+        names = list(self._topics.values())
         if not names:
             return ", and no topics"
         more = f", and {len(names) - MOST_SHOWN_TOPICS} more" if len(names) > MOST_SHOWN_TOPICS else ""

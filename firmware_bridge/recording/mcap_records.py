@@ -1,4 +1,4 @@
-"""Records of an MCAP file, one by one, up to the end of its data or to a damage.
+"""Messages of an MCAP file, one by one, up to the end of its data or to a damage.
 
 A file is not trusted: records are read up to a limit, and a chunk is unpacked up to its stated size.
 """
@@ -6,9 +6,9 @@ A file is not trusted: records are read up to a limit, and a chunk is unpacked u
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
-from typing import BinaryIO, Final, NamedTuple
+from typing import BinaryIO, Final, TypeVar
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -24,6 +24,7 @@ MOST_RECORD_BYTES: Final = 1 << 25
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, and times at which it was logged and published
 _KINDS: Final = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
+_Topic = TypeVar("_Topic")
 _BROKEN: Final = (
     *(struct.error, McapError, zstandard.ZstdError, ValueError, OverflowError, MemoryError),
     *(EOFError, RuntimeError),  # of lz4
@@ -38,16 +39,13 @@ class CutOffError(DamageError):
     """The file ends too early."""
 
 
-class EncodedMessage(NamedTuple):
-    """A message of a channel, logged at a time in [ns] since 1970."""
+def messages(
+    file: BinaryIO, topic_of: Callable[[Channel, Schema | None], _Topic | None]
+) -> Iterator[tuple[_Topic, int, memoryview] | Metadata]:
+    """Yield the messages of a file up to the end of its data, those in chunks one by one, and metadata between them.
 
-    channel_id: int
-    log_ns: int
-    data: memoryview
-
-
-def records(file: BinaryIO) -> Iterator[EncodedMessage | Schema | Channel | Metadata]:
-    """Yield these records of a file up to the end of its data, those in chunks one by one.
+    A message is its topic, the time at which it was logged in [ns] since 1970, and its data. `topic_of` gives the topic
+    for a channel and its schema, None for a channel whose messages are left out.
 
     Raises:
         RecordingError: it is no MCAP file.
@@ -55,18 +53,27 @@ def records(file: BinaryIO) -> Iterator[EncodedMessage | Schema | Channel | Meta
     """
     if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         raise RecordingError(f"{file.name}: not an MCAP file: it does not begin as one")
+    schemas: dict[int, Schema] = {}
+    topics: dict[int, _Topic | None] = {}
     for opcode, data in _undivided(file):
         if opcode == Opcode.MESSAGE:
             if len(data) < _MESSAGE.size:
                 raise DamageError("a message that is cut off")
             channel_id, _, log_ns, _ = _MESSAGE.unpack_from(data)
-            yield EncodedMessage(channel_id, log_ns, data[_MESSAGE.size :])
+            topic = topics.get(channel_id)
+            if topic is not None:
+                yield topic, log_ns, data[_MESSAGE.size :]
         elif opcode in _KINDS:
             try:
                 record = _KINDS[Opcode(opcode)].read(ReadDataStream(BytesIO(data)))
             except _BROKEN as error:
                 raise DamageError(f"a record that cannot be read ({short(error)})") from error
-            yield record
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                topics[record.id] = topic_of(record, schemas.get(record.schema_id))
+            else:
+                yield record
 
 
 def _undivided(file: BinaryIO) -> Iterator[tuple[int, memoryview]]:
