@@ -1,11 +1,26 @@
-"""ROS 2 messages by ROS's own definitions, which the package rosbags carries: DDS types, hashes and decoding."""
+"""ROS 2 messages by ROS's own definitions, which the package rosbags carries: DDS types, hashes and decoding.
 
+    python ros2_messages.py DOMAIN {"topic": "sensor_msgs/msg/Image", ...} [best-effort] [signed-bytes]
+
+subscribes as a ROS node would, and prints a line of JSON for each message. With signed-bytes it describes bytes in
+another way than ROS's definitions, as Fast DDS does.
+"""
+
+import dataclasses
+import json
+import sys
+import time
 from functools import cache
 
 import numpy as np
+from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.annotations import final
 from cyclonedds.idl.types import array, byte, float32, float64, int8, int32, sequence, uint8, uint32
+from cyclonedds.internal import InvalidSample
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
@@ -77,3 +92,45 @@ def plain(value):
     if isinstance(value, np.ndarray):
         return value.tolist()
     return [plain(one) for one in value] if isinstance(value, list) else value
+
+
+def heard(value):
+    """Return a received message as nested dicts and lists, bytes in hexadecimal."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: heard(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, list) and value and isinstance(value[0], int):
+        return bytes(one & 0xFF for one in value).hex()
+    return [heard(one) for one in value] if isinstance(value, list) else value
+
+
+def main(domain, topics, best_effort):
+    participant = DomainParticipant(domain)
+    reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(0)
+
+    def qos(topic):
+        """As rclpy and rmw_cyclonedds ask for: volatile but for static frames, keep last, and plain CDR alone."""
+        return Qos(
+            reliability,
+            Policy.Durability.TransientLocal if topic == "tf_static" else Policy.Durability.Volatile,
+            Policy.History.KeepLast(5 if best_effort else 10),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+
+    readers = {
+        topic: DataReader(participant, Topic(participant, f"rt/{topic}", dds_type(name)), qos(topic))
+        for topic, name in topics.items()
+    }
+    print(json.dumps({"topic": "listening"}), flush=True)
+    while True:
+        for topic, reader in readers.items():
+            for message in reader.take(N=100):
+                if isinstance(message, InvalidSample):  # its writer has gone
+                    continue
+                print(json.dumps({"topic": topic, "message": heard(message)}), flush=True)
+        time.sleep(0.002)
+
+
+if __name__ == "__main__":
+    if "signed-bytes" in sys.argv:
+        IDL["uint8"] = int8
+    main(int(sys.argv[1]), json.loads(sys.argv[2]), "best-effort" in sys.argv)

@@ -78,7 +78,7 @@ class Listener:
             "CYCLONEDDS_URI": LISTENERS_CONFIGURATION + more,
             "PYTHONPATH": PYTHONPATH,
         }
-        command = [sys.executable, str(ROOT / "tests/support/ros2_listener.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
+        command = [sys.executable, str(ROOT / "tests/support/ros2_messages.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
         self.process = subprocess.Popen(
             [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True
         )
