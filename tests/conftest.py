@@ -1,5 +1,6 @@
 """Conditions that hold in every test."""
 
+import os
 import signal
 import sys
 import tracemalloc
@@ -14,6 +15,12 @@ from edge.inference import bundled
 from firmware_bridge.links.serial_ports import Port
 
 MEMORY_LIMIT_BYTES = 60_000_000
+
+ROOT = Path(__file__).parents[1]
+# Programs that tests start find this checkout, whatever is installed; and their output is buffered, as usual, since the
+# rest of an unbuffered write that a signal interrupts is left out.
+os.environ["PYTHONPATH"] = f"{ROOT}:{ROOT / 'tests/support'}"
+os.environ["PYTHONUNBUFFERED"] = ""
 
 # A shell ignores Ctrl-C in what it starts in the background, nohup a hang-up; programs of a test would inherit that.
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):

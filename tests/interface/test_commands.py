@@ -200,7 +200,6 @@ class Terminal:
         self._process, self.leader = pty.fork()
         if self._process == 0:
             os.chdir(ROOT)
-            os.environ["PYTHONPATH"] = str(ROOT)
             os.execv(sys.executable, [sys.executable, "-c", SHELL, *map(str, command)])
         self.until(lambda: not self.line_mode() and self.records.exists() and self.records.stat().st_size > 0)
 

@@ -1,6 +1,5 @@
 """`edge-sr convert`: all that a recording holds is in the new file, and nothing is replaced, lost or left behind."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, fake_source, make_scan
+from edge_samples import fake_source, make_scan
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
 
 from edge.api import PadPose, Result, Scan, TimedPose
@@ -184,9 +183,6 @@ sys.exit(cli.main(["convert", *sys.argv[2:]]))
 """
 
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
-
-
 @pytest.mark.parametrize(
     ("source", "new"), [("press.mcap", "new.npz"), ("old.npz", "new.mcap"), ("press.mcap", "new.csv")]
 )
@@ -196,7 +192,7 @@ def test_a_full_disk_leaves_nothing(source, new, tmp_path):
     arrays_of(tmp_path / "press.mcap")
     (tmp_path / "press.npz").rename(tmp_path / "old.npz")
     command = [sys.executable, "-c", RUN, "10000", source, new]
-    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (5, "") and f"cannot write {new}: File too large" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["old.npz", "press.mcap"]
 
@@ -204,9 +200,7 @@ def test_a_full_disk_leaves_nothing(source, new, tmp_path):
 def test_ctrl_c_leaves_nothing(tmp_path):
     write_recording(tmp_path / "long.csv", np.tile(make_counts(100), (100, 1, 1, 1)), rate_hz=100)
     command = [sys.executable, "-c", RUN, str(10**9), "long.csv", "new.mcap"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         while not list(tmp_path.glob(".new.mcap.*/new.mcap")) and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)

@@ -1,7 +1,6 @@
 """The examples as a user runs them: from an empty directory, without hardware."""
 
 import importlib.util
-import os
 import signal
 import subprocess
 import sys
@@ -28,7 +27,6 @@ def start(folder, name, *arguments):
     return subprocess.Popen(
         [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -126,11 +126,9 @@ def test_a_command_shows_its_bar_on_a_terminal_and_leaves_no_trace_when_it_is_st
     process = subprocess.Popen(
         [*command, "--scans", "360000"],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=terminal.stream,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     said = ""
     while not RATE.search(said):

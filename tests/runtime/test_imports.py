@@ -34,9 +34,9 @@ MOST_MODULES = 101
 
 
 def run(code, *arguments, **environment):
-    command, where = [sys.executable, "-c", code, *map(str, arguments)], os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
     settings = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "timeout": 120, "check": True}
-    return subprocess.run(command, cwd=ROOT, env=where | environment, **settings).stdout.splitlines()
+    return subprocess.run(command, cwd=ROOT, env=os.environ | environment, **settings).stdout.splitlines()
 
 
 def test_no_module_of_the_runtime_loads_a_training_library():
@@ -105,7 +105,7 @@ def test_free_memory_between_used_blocks_is_given_back():
     assert int(run(_GIVEN_BACK)[0]) > 5000, "of the 12,000 pages that are free"
 
 
-NOTHING_INSTALLED = [sys.executable, "-S"]
+NOTHING_INSTALLED = [sys.executable, "-E", "-S"]
 
 
 def test_from_the_sources_their_folder_is_named_and_from_a_wheel_its_name(tmp_path):

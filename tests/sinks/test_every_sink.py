@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ROOT, ListSink, fake_source
+from edge_samples import ListSink, fake_source
 from mcap_samples import messages_of
 from sink_samples import (
     CONTRACT,
@@ -111,10 +111,8 @@ except SinkError as error:
      ("mcap:out.mcap", "recording into out.mcap stopped: File too large; its ")],
 )  # fmt: skip
 def test_a_disk_that_fills_up_is_told_and_what_was_written_is_whole(form, words, tmp_path):
-    where = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, form], cwd=tmp_path, env=where, capture_output=True, text=True, timeout=60
-    )
+    command = [sys.executable, "-c", FULL, form]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.startswith(words) and done.stdout.count("\n") == 1, done.stderr
     if form.startswith("jsonl"):
         lines = (tmp_path / "out.jsonl").read_text().splitlines()

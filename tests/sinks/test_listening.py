@@ -1,6 +1,5 @@
 """Sockets of a running `edge-sr`: others on the network can reach none."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -54,8 +53,7 @@ def test_a_running_demo_can_be_reached_only_where_the_test_opened_a_socket_itsel
     """Planted sockets show that those of the demo would be seen."""
     command = [sys.executable, "-c", RUN, "tcp", "0.0.0.0", "tcp", "127.0.0.1", "udp", "0.0.0.0"]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with ended(subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)) as demo:
+    with ended(subprocess.Popen(command, cwd=ROOT, **pipes)) as demo:
         assert demo.stdout.readline().startswith(b"{"), "the demo says nothing"
         found = reachable(demo.pid)
     assert sorted(one.partition(" ")[0] for one in found) == ["tcp", "udp"]

@@ -16,7 +16,6 @@ from struct import unpack_from
 
 import numpy as np
 import pytest
-import shm_samples
 from edge_samples import ROOT, ended, make_pad_contract, make_wrench_result
 from shm_samples import (
     CONTRACT,
@@ -290,7 +289,7 @@ class TestReading:
         start_writer()
         command = [sys.executable, str(ROOT / "examples" / "shm_read.py"), name, *words]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        with ended(subprocess.Popen(command, env=shm_samples.ENVIRONMENT, text=True, **pipes)) as reader:
+        with ended(subprocess.Popen(command, text=True, **pipes)) as reader:
             while not re.fullmatch(line, told := reader.stdout.readline().rstrip()):
                 assert told.startswith("nothing to act on: the newest reading is")  # its writer had no turn for 50 ms
             Path("/dev/shm", name).unlink()

@@ -19,7 +19,7 @@ from bridge_samples import write_recording
 from edge_samples import ROOT, ended, fake_source, make_scan, wait_for, write_model
 from packed_messages import unpack
 from test_listening import reachable
-from zenoh_samples import CONTRACT, ENVIRONMENT, consume, endpoint, hear_interrupts, listening, make_results
+from zenoh_samples import CONTRACT, consume, endpoint, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
@@ -139,7 +139,7 @@ class TestWhoComesAndGoes:
         consumer = consume(endpoint)
         imports = "from edge.sinks.zenoh import ZenohSink; from edge_samples import fake_source"
         script = f"{imports}; sink = ZenohSink('grip?connect={endpoint}', fake_source()); input()"
-        with subprocess.Popen([sys.executable, "-c", script], env=ENVIRONMENT, stdin=subprocess.PIPE) as writer:
+        with subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE) as writer:
             assert consumer.next()[0] == "came"
             writer.kill()
             assert consumer.next()[0] == "went"
@@ -148,7 +148,7 @@ class TestWhoComesAndGoes:
     def test_the_example_tells_what_comes_and_ends_quietly_with_its_reader_and_with_ctrl_c(self, endpoint, reader_goes):
         command = [sys.executable, str(ROOT / "examples" / "zenoh_listen.py"), "grip/left", endpoint]
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        with ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **streams)) as listener:
+        with ended(subprocess.Popen(command, **streams)) as listener:
             assert listener.stdout.readline() == "listens\n"
             sink, (free, pressed) = ZenohSink(f"grip/left?connect={endpoint}", fake_source()), make_results(2)
             wait_for(lambda: sink.write(free, {}) or sink.trouble is None)
@@ -225,7 +225,7 @@ def sending(*words, **settings):
     """A program that puts every scan, and hears signals as from a terminal."""
     command = [sys.executable, "-m", "edge.cli.main", *words, "--every-scan"]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} | settings
-    return ended(subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes))
+    return ended(subprocess.Popen(command, **pipes))
 
 
 def until_quiet(pipe, quiet_s=1.0):

@@ -99,7 +99,7 @@ def edge_sr(*arguments):
     process = Run(
         [sys.executable, "-m", "edge.cli.main", *command, "--view", "0", *map(str, arguments[len(command) :])],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

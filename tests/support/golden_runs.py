@@ -36,7 +36,7 @@ def edge_sr(folder: Path, *arguments: object) -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "80", "NO_COLOR": "1"}
+    return os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
 
 
 def outcome(code: int, out: str, err: str) -> dict[str, Any]:

@@ -40,7 +40,6 @@ LISTENERS_CONFIGURATION = (
     '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address="localhost"/></Peers></Discovery>'
     f"</Domain></CycloneDDS>,{TAG}"
 )
-PYTHONPATH = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "tests/support"), os.environ.get("PYTHONPATH"))))
 PATIENCE_S = 20
 CDR = Qos(Policy.Reliability.Reliable(0), Policy.DataRepresentation(use_cdrv0_representation=True))
 
@@ -74,10 +73,7 @@ class Listener:
     """A subscriber; its lines are kept as they come."""
 
     def __init__(self, topics, *words, more=""):
-        environment = os.environ | {
-            "CYCLONEDDS_URI": LISTENERS_CONFIGURATION + more,
-            "PYTHONPATH": PYTHONPATH,
-        }
+        environment = os.environ | {"CYCLONEDDS_URI": LISTENERS_CONFIGURATION + more}
         command = [sys.executable, str(ROOT / "tests/support/ros2_messages.py"), ENVIRONMENT["ROS_DOMAIN_ID"]]
         self.process = subprocess.Popen(
             [*command, json.dumps(topics), *words], env=environment, stdout=subprocess.PIPE, text=True

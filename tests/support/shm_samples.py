@@ -18,10 +18,6 @@ sys.path.append(str(ROOT / "examples"))
 import shm_read
 
 CONTRACT = make_contract(interval_factor=1.6)
-ENVIRONMENT = os.environ | {
-    "PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}:{ROOT / 'examples'}",
-    "PYTHONUNBUFFERED": "",
-}
 WRITE = """
 import sys, time
 from dataclasses import replace
@@ -91,7 +87,7 @@ def start_writer(name):
 
     def start():
         command = [sys.executable, "-c", WRITE, name]
-        writer = subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE)
+        writer = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
         writers.append(writer)
         assert writer.stdout is not None and writer.stdout.readline() == b"writes\n"
         return writer

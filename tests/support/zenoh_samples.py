@@ -1,9 +1,7 @@
 """Results over zenoh, and consumers of them in processes of their own."""
 
 import json
-import os
 import queue
-import signal
 import socket
 import subprocess
 import sys
@@ -11,16 +9,13 @@ import threading
 from contextlib import suppress
 
 import pytest
-from edge_samples import BASELINE, ROOT, FakeModel, make_pad_contract, make_scan
+from edge_samples import BASELINE, FakeModel, make_pad_contract, make_scan
 
 from edge.perception.runtime import Runtime
 
 zenoh = pytest.importorskip("zenoh")
 
 CONTRACT = make_pad_contract(interval_factor=1.6)
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
-# Buffered output, whatever the machine sets: the rest of an unbuffered write that SIGSTOP interrupts is left out.
-ENVIRONMENT["PYTHONUNBUFFERED"] = ""
 # Prints each message as it comes: who came and went, or key, encoding, writer and payload; all from one thread.
 CONSUME = """
 import json, sys, time, zenoh
@@ -65,9 +60,7 @@ def listening(endpoint, *connect):
 
 class Consumer:
     def __init__(self, endpoint):
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", CONSUME, endpoint], env=ENVIRONMENT, stdout=subprocess.PIPE
-        )
+        self.process = subprocess.Popen([sys.executable, "-c", CONSUME, endpoint], stdout=subprocess.PIPE)
         self.lines = queue.SimpleQueue()
         self.reader = threading.Thread(target=self.read)  # at once: a full pipe would hold up the consumer
         self.reader.start()
@@ -118,8 +111,3 @@ def make_results(count, **of_the_scans):
     runtime = Runtime(FakeModel(CONTRACT), source="emulated", baselines={"4": BASELINE})
     presses = [0, *(3000 + 200 * (number // 2) for number in range(count - 1))]
     return [runtime.push(make_scan(n, press_counts=press, **of_the_scans)) for n, press in enumerate(presses)]
-
-
-def hear_interrupts():
-    """Restore SIGINT as in a terminal, since the tests may have been started with it ignored."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -10,17 +10,14 @@ import sys
 import termios
 import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, wait_for, write_model
-from packed_messages import unpack
-from view_samples import HANDSHAKE, LONG_PING, Swallowing
-from websockets.sync.client import connect
+from edge_samples import ended, wait_for, write_model
+from view_samples import HANDSHAKE, LONG_PING
 
 from edge.terminal.stop_signals import EXIT_FORCED
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests/support'}"}
 LONG_S = 12.0
 """Five seconds are promised; a busy machine may take longer, and what is mended here took a minute or for ever."""
 EDGE_SR = (sys.executable, "-m", "edge.cli.main")
@@ -39,7 +36,6 @@ def listen(host, port, listen=server.listen):
 server.listen, server.GONE_S = listen, 60.0
 sys.exit(cli.main(sys.argv[1:]))
 """
-WATCHED = (sys.executable, "-c", NARROW, "--source", "demo:loop", "--view", "0")
 # A graph that goes round for ever, which onnxruntime runs without coming back to Python.
 ENDLESS = """
 import onnxruntime, numpy as np, sys
@@ -68,52 +64,14 @@ with stop_on_signals(), terminal_keys(Commands()):
 """
 
 
-@contextmanager
-def running(*command, **settings):
-    """Yield a process that receives signals as from a terminal."""
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
-    with subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=hear_interrupts, **pipes) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def hear_interrupts():
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def page_port(process):
-    for line in process.stderr:
-        if line.startswith(b"live page: "):
-            return int(line.strip().rpartition(b":")[2].strip(b"/"))
-    raise AssertionError("no page")
-
-
-def end(process, number):
-    """Ask it to end; return its exit code and its last lines."""
-    process.send_signal(number)
-    words = process.communicate(timeout=LONG_S)[1]
-    return process.returncode, words.decode()
-
-
-def test_a_viewer_whose_network_vanishes_holds_up_no_end():
-    settings = {"compression": None, "close_timeout": 0, "max_queue": 1000}
-    with (
-        running(*WATCHED) as process,
-        Swallowing(page_port(process)) as network,
-        connect(f"ws://127.0.0.1:{network.port}/ws", **settings) as viewer,
-    ):
-        while unpack(viewer.recv(60))[0].get("state") != "contact":
-            pass
-        network.swallow()
-        time.sleep(2)
-        code, words = end(process, signal.SIGINT)
-    assert code == 0 and "EMULATED demo:" in words
+PIPES = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 
 
 def test_a_local_viewer_that_pings_and_does_not_read_holds_up_no_end():
-    with running(*WATCHED) as process, socket.create_connection(("127.0.0.1", page_port(process))) as viewer:
+    command = [sys.executable, "-c", NARROW, "--source", "demo:loop", "--view", "0"]
+    with ended(subprocess.Popen(command, **PIPES)) as process:
+        address = next(line for line in process.stderr if line.startswith(b"live page: "))
+        viewer = socket.create_connection(("127.0.0.1", int(address.strip().rpartition(b":")[2].strip(b"/"))))
         viewer.sendall(HANDSHAKE)
         stop = threading.Event()
 
@@ -126,18 +84,21 @@ def test_a_local_viewer_that_pings_and_does_not_read_holds_up_no_end():
         pinging.start()
         time.sleep(1.5)  # by then all buffers between us are full
         try:
-            code, words = end(process, signal.SIGTERM)
+            process.send_signal(signal.SIGTERM)
+            words = process.communicate(timeout=LONG_S)[1]
         finally:
             stop.set()
             process.kill()
             pinging.join()
-    assert code == 0 and "EMULATED demo:" in words
+            viewer.close()
+    assert process.returncode == 0 and b"EMULATED demo:" in words
 
 
 def test_a_full_pipe_that_nobody_reads_holds_up_no_end(tmp_path):
     recording = write_recording(tmp_path / "long.csv", make_counts(3000), 100.0)
     options = ("--model", str(write_model(tmp_path / "tiny.onnx")), "--sink", "jsonl:-")
-    with running(*EDGE_SR, "replay", str(recording), *options, bufsize=0) as process:
+    command = [*EDGE_SR, "replay", str(recording), *options]
+    with ended(subprocess.Popen(command, bufsize=0, **PIPES)) as process:
         assert process.stdout.read(1) == b"{"
         time.sleep(2)  # it is waiting for us
         process.send_signal(signal.SIGTERM)
@@ -150,7 +111,6 @@ def test_a_model_that_never_returns_is_ended_by_force_and_gives_the_terminal_bac
     leader, follower = pty.openpty()
 
     def own_terminal():
-        hear_interrupts()
         os.setsid()
         os.close(os.open(os.ttyname(follower), os.O_RDWR))  # the first that a session opens is its own
 
@@ -159,7 +119,7 @@ def test_a_model_that_never_returns_is_ended_by_force_and_gives_the_terminal_bac
 
     command = [sys.executable, "-c", ENDLESS]
     pipes = {"stdin": follower, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, env=ENVIRONMENT, preexec_fn=own_terminal, **pipes) as process:
+    with subprocess.Popen(command, preexec_fn=own_terminal, **pipes) as process:
         try:
             wait_for(lambda: not echoes())
             os.write(leader, b"\x03")
@@ -178,7 +138,7 @@ def test_kill_9_leaves_whole_records(tmp_path):
     command = [*EDGE_SR, "--source", f"replay:{recording}", "--rate-hz", "400"]
     command += ["--sink", f"jsonl:{tmp_path}/out.jsonl", "--sink", "jsonl:-"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
-    with subprocess.Popen(command, env=ENVIRONMENT, **pipes) as process:
+    with subprocess.Popen(command, **pipes) as process:
         shown = [process.stdout.readline() for _ in range(30)]
         process.send_signal(signal.SIGKILL)
         shown += process.stdout.read().split(b"\n")[:-1]

@@ -156,8 +156,10 @@ def test_two_processes_share_every_batch_and_end_where_one_does(tmp_path):
     (tmp_path / "worker.py").write_text(WORKER)
     command = ["torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0", "--rdzv-backend", "c10d"]
     command += ["--rdzv-endpoint", "localhost:0", str(tmp_path / "worker.py"), str(tmp_path)]
-    places = {"cwd": ROOT, "env": os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}}
-    done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, timeout=120, **places)
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     first, second = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
     assert (first[0], second[0], first[1]) == (0, 1, 2)
