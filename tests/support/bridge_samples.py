@@ -7,6 +7,7 @@ import select
 import struct
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -81,26 +82,27 @@ def write_npz(path: Path, counts: np.ndarray, time_ns: Any = None, sensors: Any 
     return path
 
 
-def read_until_lost(link: Link, timeout_s: float = 60.0) -> list[Scan]:
+def wait_for(condition, within_s=60.0):
+    """Return the condition's value as soon as it is true."""
+    end_s = time.monotonic() + within_s
+    while not (value := condition()):
+        assert time.monotonic() < end_s, "it did not come"
+        time.sleep(0.005)
+    return value
+
+
+def read_until_lost(link: Link) -> list[Scan]:
     """Return all scans until the link is lost or ends."""
     scans: list[Scan] = []
-    end_s = time.monotonic() + timeout_s
-    while not link.ended:
-        assert time.monotonic() < end_s, f"still going after {len(scans)} scans: {link.counters()}"
-        try:
-            scans += link.read(0.05)
-        except LinkLostError:
-            break
+    with suppress(LinkLostError):
+        wait_for(lambda: link.ended or scans.extend(link.read(0.05)))
     return scans
 
 
-def read_scans(link: Link, count: int, timeout_s: float = 60.0) -> list[Scan]:
+def read_scans(link: Link, count: int) -> list[Scan]:
     """Return the first scans, at least `count`."""
     scans: list[Scan] = []
-    end_s = time.monotonic() + timeout_s
-    while len(scans) < count:
-        assert time.monotonic() < end_s, f"{len(scans)} scans of {count}: {link.counters()}"
-        scans += link.read(0.05)
+    wait_for(lambda: len(scans) >= count or scans.extend(link.read(0.05)))
     return scans
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+from bridge_samples import wait_for as wait_for
 from onnx import TensorProto, helper, numpy_helper
 
 from edge.inference.contract import (
@@ -247,15 +248,6 @@ class FakeModel:
         self.deviation = None if deviations[0] is None else np.stack(deviations)
         self.traction = None if tractions[0] is None else np.stack(tractions)
         return np.stack(patterns)
-
-
-def wait_for(condition, within_s=60.0):
-    """Return the condition's value as soon as it is true."""
-    end_s = time.monotonic() + within_s
-    while not (value := condition()):
-        assert time.monotonic() < end_s, "it did not come"
-        time.sleep(0.005)
-    return value
 
 
 def inferred(runtime, scans) -> list:

@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 import can
-from bridge_samples import decoded, frames_of, make_counts, read_scans, write_recording
+from bridge_samples import decoded, frames_of, make_counts, read_scans, wait_for, write_recording
 from can.interfaces.virtual import VirtualBus
 from gs_usb_emulator import GsUsbBackend, GsUsbPort
 from xela_server_emulator import ServerEmulator, looping
@@ -135,11 +135,13 @@ class SlcanRig(CanRig):
         assert self._port.write(line) == len(line)
 
     def sent(self, frames):
-        decoder, end_s = SlcanDecoder(), time.monotonic() + 60
-        heard = decoded(decoder, b"".join(listen([self._port], 0.1).values()))
-        while len(heard) < frames:
-            assert time.monotonic() < end_s, heard
-            heard += decoded(decoder, b"".join(listen([self._port], 0.1).values()))
+        decoder, heard = SlcanDecoder(), []
+
+        def hears():
+            heard.extend(decoded(decoder, b"".join(listen([self._port], 0.1).values())))
+            return len(heard) >= frames
+
+        wait_for(hears)
         return heard
 
     def lose(self):

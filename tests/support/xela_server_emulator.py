@@ -17,7 +17,8 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
-from bridge_samples import REST_COUNTS, make_recording
+import pytest
+from bridge_samples import REST_COUNTS, make_recording, wait_for
 from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
@@ -295,21 +296,13 @@ def looping(**options) -> VendorServer:
 
 def lose(link):
     """Read until the link is lost, and return its error's text."""
-    end_s = time.monotonic() + 60
-    while time.monotonic() < end_s:
-        try:
-            link.read(0.05)
-        except LinkLostError as lost:
-            return str(lost)
-    raise AssertionError("the link was never lost")
+    with pytest.raises(LinkLostError) as lost:
+        wait_for(lambda: link.read(0.05) and False)
+    return str(lost.value)
 
 
 def read_notices(link, count):
     """Return the first notices, at least `count`."""
     notices = []
-    end_s = time.monotonic() + 60
-    while len(notices) < count:
-        assert time.monotonic() < end_s, notices
-        link.read(0.05)
-        notices += link.notices()
+    wait_for(lambda: (link.read(0.05), notices.extend(link.notices())) and len(notices) >= count)
     return notices
