@@ -8,14 +8,14 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
+import tempfile
 from importlib import import_module
-from queue import Empty, Queue
+from pathlib import Path
 
 import numpy as np
 import pytest
 from bridge_samples import write_npz
-from edge_samples import ROOT
+from edge_samples import ROOT, wait_for
 from packed_messages import unpack
 
 from edge.api import load_model
@@ -85,7 +85,7 @@ def open_page(browser):
     assert unexpected == []
 
 
-class Run(subprocess.Popen[str]):
+class Run(subprocess.Popen[bytes]):
     """Run of `edge-sr` with the address of its page, and the bus that it reads where that is emulated."""
 
     url: str
@@ -96,37 +96,23 @@ class Run(subprocess.Popen[str]):
 def edge_sr(*arguments):
     """Run `edge-sr --view 0` and yield it with the address that it reports; a command comes first."""
     command = [one for one in arguments[:1] if not str(one).startswith("-")]
-    process = Run(
-        [sys.executable, "-m", "edge.cli.main", *command, "--view", "0", *map(str, arguments[len(command) :])],
-        cwd=ROOT,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    stderr = process.stderr
-    assert stderr is not None
-    lines: Queue[str] = Queue()
-    reader = threading.Thread(target=lambda: [lines.put(line) for line in stderr])
-    reader.start()
-    try:
-        said = []
-        while True:
-            try:
-                said.append(lines.get(timeout=TIMEOUT_MS / 1000))
-            except Empty:
-                raise AssertionError(f"no address in {said}") from None
-            if said[-1].startswith("live page: "):
-                break
-        process.url = said[-1].split(": ", 1)[1].strip()
-        yield process
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        process.wait(timeout=TIMEOUT_MS / 1000)
-        reader.join()
-        stderr.close()
+    with tempfile.NamedTemporaryFile("w") as said:
+        process = Run(
+            [sys.executable, "-m", "edge.cli.main", *command, "--view", "0", *map(str, arguments[len(command) :])],
+            cwd=ROOT,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+        )
+        try:
+            address = re.compile("^live page: (.*)$", re.MULTILINE)
+            process.url = wait_for(lambda: address.search(Path(said.name).read_text()))[1]
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            process.wait(timeout=TIMEOUT_MS / 1000)
 
 
 @pytest.fixture(scope="module")
