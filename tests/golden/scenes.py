@@ -16,7 +16,8 @@ if __name__ == "__main__":  # as pyproject.toml has it for pytest
 
 from bridge_samples import write_npz
 from bridge_samples import write_recording as write_csv
-from golden_runs import EDGE_SR, brief, differences, edge_sr, environment, short
+from cli_samples import EDGE_SR
+from golden_runs import brief, differences, edge_sr, environment, short
 
 from edge.api import demo_recording
 from firmware_bridge.can.slcan import CanFrame

@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -14,8 +13,6 @@ from unittest import mock
 import numpy as np
 from cli_samples import run
 
-EDGE_SR = [sys.executable, "-m", "edge.cli.main"]
-ROOT = Path(__file__).parents[2]
 SAMPLED = 15
 """Every so many records of a sensor one is kept whole, and the first two of each stretch of a state."""
 OF_THE_RUN = {

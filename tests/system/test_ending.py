@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 
 from bridge_samples import make_counts, write_recording
+from cli_samples import EDGE_SR
 from edge_samples import ended, wait_for, write_model
 from view_samples import HANDSHAKE, LONG_PING
 
@@ -20,7 +21,6 @@ from edge.terminal.stop_signals import EXIT_FORCED
 
 LONG_S = 12.0
 """Five seconds are promised; a busy machine may take longer, and what is mended here took a minute or for ever."""
-EDGE_SR = (sys.executable, "-m", "edge.cli.main")
 # The page over a network that takes little at a time, where over loopback the system would take megabytes in; and what
 # ends a viewer that does not read comes much later than the signal.
 NARROW = """
