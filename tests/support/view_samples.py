@@ -3,13 +3,14 @@
 import http.client
 import socket
 import threading
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, fake_source, make_contract, make_scan
+from edge_samples import BASELINE, PERIOD_NS, FakeModel, fake_source, make_contract
 from map_samples import result_of
 from packed_messages import unpack
+from runtime_samples import Pushed
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -31,24 +32,20 @@ HANDSHAKE = (
 LONG_PING = b"\x89\xfd" + bytes(4 + 125)
 
 
-class Press:
+class Press(Pushed):
     """Results of scans, of an emulated sensor, pressed five times in eight."""
 
     def __init__(self, sensor="4", contract=CONTRACT, **settings):
-        settings = {
+        usual = {
             "source": "emulated",
             "baselines": {sensor: BASELINE},
             "options": RuntimeOptions(every_scan=True),
-        } | settings
-        self.runtime = Runtime(FakeModel(contract), **settings)
-        self.sensor = sensor
-        self.number = 0
+        }
+        super().__init__(Runtime(FakeModel(contract), **usual | settings), sensor)
 
     def next(self, press_counts=None, period_ns=PERIOD_NS):
-        number, self.number = self.number, self.number + 1
-        press = (3000 if number % 8 < 5 else 0) if press_counts is None else press_counts
-        scan = make_scan(number, sensor=self.sensor, press_counts=press, time_ns=(number + 1) * period_ns)
-        return self.runtime.push(scan)
+        press = (3000 if self.number % 8 < 5 else 0) if press_counts is None else press_counts
+        return self.push(press, time_ns=(self.number + 1) * period_ns)
 
     def take(self, count, press_counts=None, period_ns=PERIOD_NS):
         return [self.next(press_counts, period_ns) for _ in range(count)]
@@ -121,65 +118,6 @@ class Mapped:
         result = result_of(self.figure, pose, number=self.number, posed=posed, **changes)
         self.number += 1
         self.sink.write(result, {})
-
-
-class Swallowing:
-    """Network between a viewer and the page, which can start to swallow everything.
-
-    Attributes:
-        port: port that leads to the page until then.
-    """
-
-    def __init__(self, port):
-        self._listening = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listening.getsockname()[1]
-        self._onward = port
-        self._swallows = threading.Event()
-        self._closed = threading.Event()
-        self._threads = [threading.Thread(target=self._lead)]
-        self._threads[0].start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc_info):
-        self._swallows.set()
-        self._closed.set()
-        self._listening.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join()
-        self._listening.close()
-
-    def swallow(self):
-        """Hand on nothing from now on, while both ends stay connected."""
-        self._swallows.set()
-
-    def _lead(self):
-        near, _ = self._listening.accept()
-        far = socket.socket()
-        # As on a real network: small segments, and a small window.
-        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-        far.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
-        far.connect(("127.0.0.1", self._onward))
-        with near, far:
-            pumps = [threading.Thread(target=self._pump, args=ends) for ends in ((near, far), (far, near))]
-            for pump in pumps:
-                pump.start()
-            for pump in pumps:
-                pump.join()
-            self._closed.wait()
-
-    def _pump(self, taking, giving):
-        taking.settimeout(0.02)
-        with suppress(ConnectionError):
-            while not self._swallows.is_set():
-                with suppress(TimeoutError):
-                    data = taking.recv(4096)
-                    if not data:
-                        giving.shutdown(socket.SHUT_WR)
-                        return
-                    if not self._swallows.is_set():
-                        giving.sendall(data)
 
 
 @contextmanager
