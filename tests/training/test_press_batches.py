@@ -101,9 +101,14 @@ def wide():
 
 
 def test_the_wide_set_is_the_one_that_figures_are_of(wide):
+    """It is a file of version 2, which has no poses: they follow from its turns."""
     assert wide.presses.sha256() == WIDE_SHA256
     assert set(wide.presses.family) == set(SHARES) and len(np.unique(wide.presses.pad)) == 126
     assert min(np.unique(wide.presses.family, return_counts=True)[1]) >= 30
+    x_mm, y_mm, turn_deg = np.moveaxis(wide.presses.poses, -1, 0)
+    assert not x_mm.any() and not y_mm.any() and np.allclose(np.median(turn_deg, axis=0), (0, 5, 10, 15))
+    moved = replace(wide.presses, poses=wide.presses.poses + np.float32([0.1, 0, 0]))
+    assert moved.sha256() != WIDE_SHA256
 
 
 def test_it_is_written_by_one_command(tmp_path, capsys):

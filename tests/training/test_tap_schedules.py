@@ -1,12 +1,8 @@
 """Schedules of taps: newest first, within reach, each as its name states."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from press_samples import make_press_set
 
-from train.data.presses import PressSet, load_presses
 from train.surfaces.poses import (
     HALF_PITCH_MM,
     HELD_OUT_RADIUS_MM,
@@ -43,19 +39,6 @@ def test_turns_are_the_papers_and_near_poses_are_near():
     poses = np.concatenate([SCHEDULES["near"](np.random.default_rng(seed), MAX_TAPS) for seed in range(40)])
     assert 0.9 * NEAR_MM < np.hypot(*poses[:, :2].T).max() <= NEAR_MM
     assert 0.9 * NEAR_DEG < np.abs(poses[:, 2]).max() <= NEAR_DEG
-
-
-def test_a_file_of_version_2_has_the_poses_of_its_turns(tmp_path):
-    made = make_press_set(taps=3)
-    made.save(tmp_path / "new.npz")
-    with np.load(tmp_path / "new.npz") as new:
-        old = {name: new[name] for name in new.files if name != "poses"} | {"version": 2}
-    np.savez(tmp_path / "old.npz", **old)
-    loaded = load_presses(tmp_path / "old.npz")
-    assert isinstance(loaded, PressSet) and loaded.sha256() == made.sha256()
-    assert np.allclose(loaded.poses, made.poses, atol=1e-3)
-    shifted = replace(made, poses=made.poses + np.float32([0.1, 0, 0]) * (np.arange(3) > 0)[:, None])
-    assert shifted.sha256() != made.sha256() != replace(shifted, poses=2 * shifted.poses).sha256()
 
 
 def test_random_poses_keep_away_from_held_out_positions():
