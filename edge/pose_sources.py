@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from math import acos, atan2, degrees, hypot, isfinite, sqrt
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,15 +95,15 @@ LATE_NS: Final = 250_000_000
 """Longest time after its stamp at which the fastest pose arrives, in [ns]: later, no scan could use it."""
 
 
-class Placed(NamedTuple):
-    """Place of a frame in another, in [m], and its rotation, a matrix."""
+def pad_pose(
+    place: Mapping[str, float], quaternion: Mapping[str, float], covariance: Sequence[float] | NDArray[Any] = ()
+) -> PadPose:
+    """Return the pose of the pad, of a pose or transform of its tool frame in the frame of the plane, in [m].
 
-    place_m: NDArray[np.float64]
-    rotation: NDArray[np.float64]
-
-
-def placed(place: Mapping[str, float], quaternion: Mapping[str, float]) -> Placed:
-    """Return a pose, or a transform, of ROS; a PoseError where it is not finite, or its quaternion is no rotation."""
+    The covariance is (36,) of x, y, z in [m] and of turns about them in [rad], as in PoseWithCovariance; where it is
+    empty, zero or negative, the usual errors hold. Raises a PoseError for numbers that are not finite, a quaternion
+    that is no rotation, a tilted pad, or a place out of range.
+    """
     x, y, z, w = (quaternion[name] for name in "xyzw")
     length = hypot(x, y, z, w)
     place_m = np.array([place[name] for name in "xyz"])
@@ -112,16 +112,7 @@ def placed(place: Mapping[str, float], quaternion: Mapping[str, float]) -> Place
     if abs(length - 1) > 0.01:
         raise PoseError("quaternion", f"its quaternion has length {length:.3g}, expected 1")
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / length  # the cross product with the axis
-    return Placed(place_m, np.eye(3) + 2 * (w / length * across + across @ across))
-
-
-def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> PadPose:
-    """Return the pose of the pad, of its tool frame in the frame of the plane.
-
-    The covariance is (36,) of x, y, z in [m] and of turns about them in [rad], as in PoseWithCovariance; where it is
-    empty, zero or negative, the usual errors hold. Raises a PoseError for a tilted pad, or a place out of range.
-    """
-    rotation = tool.rotation
+    rotation = np.eye(3) + 2 * (w / length * across + across @ across)
     tilt_deg = degrees(acos(min(abs(float(rotation[2, 2])), 1.0)))
     if tilt_deg > MOST_TILT_DEG:
         raise PoseError(
@@ -132,7 +123,7 @@ def pad_pose(tool: Placed, covariance: Sequence[float] | NDArray[Any] = ()) -> P
     # Our z points into the pad, against the tool's, and so does that of the plane. Where z of the frame points from the
     # pad into the object, the plane's axes are the frame's turned by half a turn about x, so that y changes its sign.
     side = 1.0 if rotation[2, 2] < 0 else -1.0
-    x_mm, y_mm, _ = (1e3 * tool.place_m).tolist()
+    x_mm, y_mm, _ = (1e3 * place_m).tolist()
     turn_deg = degrees(atan2(side * float(rotation[1, 0]), float(rotation[0, 0])))
     place_m2, turn_rad2 = (max(covariance[0], covariance[7]), covariance[35]) if len(covariance) else (0.0, 0.0)
     error_mm = 1e3 * sqrt(place_m2) if place_m2 > 0 else PLACE_ERROR_MM
@@ -219,7 +210,7 @@ class Ros2Poses:
     def _take(self, data: bytes, kind: MessageType, arrival_ns: int) -> None:
         try:
             message = kind.decode(data)
-            pose = pad_pose(*_placed(message))
+            pose = pad_pose(*_parts(message))
         except PoseError as error:
             self._queue.refuse(error)
         except CdrError as error:
@@ -230,11 +221,11 @@ class Ros2Poses:
             self._queue.put(TimedPose(pose, time_ns, self._sensor))
 
 
-def _placed(message: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the place in a message of any of the types, and its covariance, which is empty without one."""
+def _parts(message: Mapping[str, Any]) -> tuple[Any, Any, Any]:
+    """Return place, quaternion and covariance of a message of any of the types; the last is empty where it has none."""
     if (transform := message.get("transform")) is not None:
-        return placed(transform["translation"], transform["rotation"]), ()
+        return transform["translation"], transform["rotation"], ()
     pose = message["pose"]
     covariance = pose.get("covariance", ())
     pose = pose.get("pose", pose)
-    return placed(pose["position"], pose["orientation"]), covariance
+    return pose["position"], pose["orientation"], covariance

@@ -13,10 +13,11 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 from bridge_samples import make_recording
 from cli_samples import base_options, files, records, start
 from edge_samples import BASELINE, FakeModel, make_scan, wait_for
+from scipy.spatial.transform import Rotation
 
 from edge.api import Runtime, UsageError
 from edge.pipeline.pose_queue import PoseError, PoseIntake, PoseQueue
-from edge.pose_sources import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, check_poses, open_poses, pad_pose, placed
+from edge.pose_sources import EARLY_NS, LATE_NS, MOST_TILT_DEG, StampClock, check_poses, open_poses, pad_pose
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 
@@ -238,7 +239,7 @@ def named(numbers):
 
 
 def read(place, quaternion, covariance=()):
-    return pad_pose(placed(named(place), named(quaternion)), covariance)
+    return pad_pose(named(place), named(quaternion), covariance)
 
 
 class TestToolFrame:
@@ -263,9 +264,8 @@ class TestToolFrame:
         for turn_deg in (0.0, 40.0):
             place = np.array([*rng.uniform(-0.005, 0.005, 2), 0.0])
             quaternion = times(about((0, 0, 1), turn_deg), up)
-            tool = placed(named(place), named(quaternion))
-            in_tool = tool.rotation.T @ (point - place)
-            seen.append((pad_pose(tool), 1e3 * np.array([in_tool[0], -in_tool[1]])))  # y of the tool is up
+            in_tool = Rotation.from_quat(quaternion).inv().apply(point - place)
+            seen.append((read(place, quaternion), 1e3 * np.array([in_tool[0], -in_tool[1]])))  # y of the tool is up
         (first, at_first), (second, at_second) = seen
         earlier = first.seen_from(second)
         turn = radians(earlier.turn_deg)
