@@ -1,11 +1,14 @@
-"""Run times on a clock of its own, the front, and the cost of the program against an earlier commit."""
+"""Run times on a clock of its own, the front, and the cost of a scan's way against an earlier commit."""
 
 import re
+import shutil
 
+import hot_path
 import numpy as np
 import program_cost
 import pytest
-from program_cost import Ratio, ratio_of, slower
+from hot_path import ROOT, compare, main, report, slower
+from program_cost import Ratio, ratio_of
 from program_cost import main as cost
 
 from edge.bench.command import front
@@ -88,14 +91,27 @@ def test_the_front_is_who_is_not_beaten():
     assert front(points) == [False, True, True, False, True, True]
 
 
-def test_a_tenth_more_processor_time_that_is_no_noise_is_red():
-    assert slower(ratio_of([1.2, 1.22, 1.21], [1.0, 1.01, 1.0]))
+def test_a_way_that_takes_longer_than_the_one_before_is_red(tmp_path, limits, capsys):
+    """The tree before is this one, without the work that the change adds to each scan."""
+    for package in ("edge", "firmware_bridge"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    changed = tmp_path / "firmware_bridge/scans/slcan_scans.py"
+    text = changed.read_text()
+    begin = "        scans: list[Scan] = []\n"
+    assert text.count(begin) == 1
+    changed.write_text(text.replace(begin, f"{begin}        sum(range(40_000))\n"))
+    limits(hot_path, BLOCKS=3)
+    ratio, took_us = compare(tmp_path, ROOT, pairs=1)["at rest"]
+    assert slower(ratio) and took_us > 0
+    assert (
+        report({"at rest": (ratio, took_us)}, "HEAD~1") == 1 and ": more than a tenth slower" in capsys.readouterr().out
+    )
     assert not slower(Ratio(1.05, 1.04, 1.06)) and not slower(Ratio(1.2, 0.9, 1.4))
 
 
 def test_a_commit_that_cannot_be_run_is_named_and_is_not_red(capsys):
-    assert cost(["--against", "no-such-commit"]) == 2
-    assert "no-such-commit: fatal" in capsys.readouterr().err
+    assert main(["no-such-commit"]) == 0
+    assert "no-such-commit: fatal" in capsys.readouterr().out
 
 
 def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
