@@ -44,6 +44,7 @@ PARSED = {
     r"edge-sr bench .*": "measures for minutes; test_bench runs it",
     r"edge-sr models --measure": "measures run times for seconds; test_cli runs it",
     r"edge-sr --source demo:loop --sink ros2:.*": "goes on until it is ended; test_ros2 subscribes to its topics",
+    r"edge-sr --sink rerun:view": "opens a viewer; test_rerun sends to the package's interface",
     r"edge-sr map .*": "is of poses that a robot sends, and without them writes nothing; test_poses_stdin runs it",
     r"python -m (train|export)\..*": "trains, or needs what was trained; their own tests run them, shortened",
     r"torchrun .*": "trains",

@@ -57,13 +57,13 @@ def make_recording(scans: int, rate_hz: float = 100.0, seed: int = 0) -> Recordi
 
 
 def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None) -> Path:
-    """Write a recording as a CSV file, with times if it has a rate."""
+    """Write a recording as a CSV file, with its rate in a file next to it."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(CSV_HEADER if rate_hz is None else ("time_s", *CSV_HEADER))
-        for number, scan in enumerate(counts):
-            time_s = [] if rate_hz is None else [number / rate_hz]
-            writer.writerow([*time_s, *(f"{value}.0" for value in scan.reshape(3, 16).T.ravel())])
+        writer.writerow(CSV_HEADER)
+        writer.writerows([f"{value}.0" for value in scan.reshape(3, 16).T.ravel()] for scan in counts)
+    if rate_hz is not None:
+        path.with_name("meta_data.csv").write_text(f"frequency_hz\n{rate_hz}\n")
     return path
 
 
