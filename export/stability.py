@@ -22,7 +22,7 @@ from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL, bundled_models, f
 from edge.inference.contract import Contract
 from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession
-from edge.perception.pattern_check import PatternCheck
+from edge.perception.trust_check import PatternCheck
 from edge.terminal.progress_bar import tracked
 from export.parity import FULL_RANGE_COUNTS, extreme_windows
 from firmware_bridge.pad_geometry import USPA44

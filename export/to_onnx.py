@@ -27,10 +27,11 @@ from edge.inference.bundled import BUNDLE_DIR, INT8_SUFFIX
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION, TAP_ORDER, Contract
 from edge.inference.intervals import doubt
 from edge.inference.onnx_session import ModelSession, load_session
-from edge.inference.trust import Trust
+from edge.inference.trust_model import Trust
 from edge.perception.runtime import Model
 from edge.terminal.progress_bar import tracked
-from export.graph import calibration_batch, convolutions, outputs, quantised, to_model
+from export.graph import outputs, to_model
+from export.int8 import calibration_batch, convolutions, quantised
 from export.parity import GraphRun, check_parity, run_network
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import pad_of

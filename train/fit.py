@@ -21,7 +21,7 @@ from train.data.presses import SEED, PressSet, join_presses, load_presses
 from train.errors import DatasetError, ended_by_errors
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe, leave_group, rank_and_world
-from train.networks.registry import NETWORKS
+from train.networks.named_networks import NETWORKS
 from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import MAX_TAPS
 

@@ -46,7 +46,7 @@ from train.data.real_grips import Grip, has_hole, play, recorded_grips
 from train.data.recorded_taps import load_tap_parts
 from train.data.world import World, solve_pad
 from train.errors import DatasetError, TrainError, ended_by_errors
-from train.families.catalogue import FIGURES, SHARES
+from train.families.family_shares import FIGURES, SHARES
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.physics.pad_draws import INPUTS, KNOWN, RANGES

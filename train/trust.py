@@ -18,7 +18,15 @@ from google.protobuf.message import DecodeError
 
 from edge.errors import ModelError
 from edge.inference.contract import Contract
-from edge.inference.trust import QUIET_UNITS, ForwardModel, Trust, condensed, features, forward_model, small_network
+from edge.inference.trust_model import (
+    QUIET_UNITS,
+    ForwardModel,
+    Trust,
+    condensed,
+    features,
+    forward_model,
+    small_network,
+)
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.pad_geometry import AXES
 from train.data.press_batches import COUNTS_PER_UNIT

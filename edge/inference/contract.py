@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge.errors import ModelError
 from edge.inference.intervals import is_confidence, is_interval_levels, is_number
-from edge.inference.trust import Trust, trust_of
+from edge.inference.trust_model import Trust, trust_of
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG, PadPose
 from firmware_bridge.scans.pad_constants import LEVEL_90, PAD_RANGES, Pad
@@ -53,7 +53,7 @@ class Contract:
     Attributes:
         confidence: number of taps -> table as edge.inference.intervals takes it.
         test_error: number of taps -> metric name -> value; empty if the test set has another scale.
-        trust: as edge.inference.trust reads it; empty if the model has no checks.
+        trust: as edge.inference.trust_model reads it; empty if the model has no checks.
         interval_levels: percentage -> deviations for each of edge.inference.intervals.REGIONS; empty if not measured.
     """
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.errors import UsageError
-from edge.perception.pattern_check import LEAST_COUNTS
 from edge.perception.result import Result
+from edge.perception.trust_check import LEAST_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 

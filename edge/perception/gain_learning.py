@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from edge.errors import EdgeError
 from edge.inference.bundled import CONTACTS
 from edge.perception.event import Report
-from edge.perception.pattern_check import SensorPad
 from edge.perception.result import Estimate, Step
+from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import AXES, USPA44
 from firmware_bridge.recording.npz_recording import read_npz
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, GAINS, LEVEL_90, PAD_RANGES, UNMEASURED_CERTAINTY, Pad

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
 from edge.inference.intervals import expect
-from edge.inference.trust import GRID, KPA, ForwardModel, Trust, pooling
-from edge.perception.pattern_check import SensorPad
+from edge.inference.trust_model import GRID, KPA, ForwardModel, Trust, pooling
 from edge.perception.result import LEAST_FORCE_N, Estimate, Wrench
+from edge.perception.trust_check import SensorPad
 from firmware_bridge.pad_geometry import SensorGeometry
 
 _N_OF_KPA_MM2: Final = 1e-3

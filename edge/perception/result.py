@@ -79,7 +79,7 @@ class NextTap(NamedTuple):
 class Result:
     """One scan and what was computed from it; every scan has one, whatever its state.
 
-    Attributes that are not listed here are fields of a record: `edge.perception.result_fields` describes them. None
+    Attributes that are not listed here are fields of a record: `edge.perception.record_fields` describes them. None
     stands for an unknown or missing value.
 
     Attributes:

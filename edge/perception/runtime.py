@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from edge.errors import UsageError, WindowError
 from edge.inference.contract import Contract, Model
 from edge.inference.intervals import doubt
-from edge.inference.trust import Trust
+from edge.inference.trust_model import Trust
 from edge.perception.contact_options import DEFAULTS, RuntimeOptions
 from edge.perception.event import OLD_NS, UNCHECKED, EventKind, Untimed, age_notes, notes_on_missing
 from edge.perception.gain_learning import ContactModel, Learn
-from edge.perception.pattern_check import Check, PatternCheck, SensorPad
 from edge.perception.pattern_description import Describe
 from edge.perception.result import Estimate, Origin, Result, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taps import LastPattern, Taps
 from edge.perception.taxel_health import Health, TaxelEstimator
+from edge.perception.trust_check import Check, PatternCheck, SensorPad
 from edge.perception.zeroing import BaselineDoubt, Zeroing
 from edge.validation import check_baselines, check_counts_per_newton, check_mountings, check_pads
 from firmware_bridge.links.base import SourceKind

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from edge.inference.contract import Contract, pose_rows, scheduled_rows
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import EventKind, Report
-from edge.perception.pattern_check import REPEATS
 from edge.perception.result import Estimate, NextTap, Step, Window
 from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import Health
+from edge.perception.trust_check import REPEATS
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose, PoseTrack
 

@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from edge.errors import SinkError
-from edge.perception.result_fields import FIELDS, MAPS, Field, Out
+from edge.perception.record_fields import FIELDS, MAPS, Field, Out
 from edge.sinks.ros2.messages import IMAGE, RESULT, UNITS, image_map
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, SensorGeometry

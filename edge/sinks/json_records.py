@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from edge.errors import SinkClosedError, SinkError, UsageError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
+from edge.perception.record_fields import FIELDS, MAPS, Columns, Out
 from edge.perception.result import Result
-from edge.perception.result_fields import FIELDS, MAPS, Columns, Out
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 

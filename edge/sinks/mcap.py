@@ -21,8 +21,8 @@ from edge import __version__
 from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
+from edge.perception.record_fields import maps_of
 from edge.perception.result import Result, mask_bits
-from edge.perception.result_fields import maps_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import CountersInTurn, record

@@ -24,8 +24,8 @@ import numpy as np
 from edge.errors import SinkError
 from edge.inference.contract import Contract
 from edge.perception.event import Event
+from edge.perception.record_fields import FIELDS, PLACE_IN_HEADER, Column, Columns
 from edge.perception.result import Result
-from edge.perception.result_fields import FIELDS, PLACE_IN_HEADER, Column, Columns
 from edge.pipeline.sink import Sink
 
 FOLDER: Final = Path("/dev/shm")

@@ -17,8 +17,8 @@ import orjson
 
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event
+from edge.perception.record_fields import maps_of
 from edge.perception.result import Result
-from edge.perception.result_fields import maps_of
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import CountersInTurn, event_record, pack, record

@@ -17,20 +17,11 @@ from firmware_bridge.can import gs_usb
 from firmware_bridge.errors import DeviceError, LinkLostError, NoDeviceError
 from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.frame_link import FrameLink
+from firmware_bridge.links.known_adapters import GS_USB_ADAPTERS
 from firmware_bridge.links.serial_ports import Recognised, holders
 from firmware_bridge.scans.can_id_maps import USPA44_MAP, ModelMap
 from firmware_bridge.scans.frame_scans import GsUsbScans
 from firmware_bridge.scans.scan import Scan
-
-GS_USB_IDS: Final = {
-    (0x1D50, 0x606F): "candleLight",  # and most of its kin, CANable among them
-    (0x1209, 0x2323): "candleLight",
-    (0x1209, 0xCA01): "CANnectivity",
-    (0x1CD2, 0x606F): "CES CANext FD",
-    (0x16D0, 0x10B8): "ABE CANdebugger FD",
-}
-"""Adapters by vendor and product id. Source: Linux drivers/net/can/usb/gs_usb.c, and CANnectivity."""
-
 
 INTERFACE: Final = 0
 CHANNEL: Final = 0
@@ -63,7 +54,7 @@ class GsUsbDevice(NamedTuple):
     def __str__(self) -> str:
         serial = f" serial={self.serial_number}" if self.serial_number else ""
         usb_id = f"{self.usb_id[0]:04x}:{self.usb_id[1]:04x}"
-        return f"{self.where} {usb_id}{serial} ({self.product or GS_USB_IDS[self.usb_id]})"
+        return f"{self.where} {usb_id}{serial} ({self.product or GS_USB_ADAPTERS[self.usb_id]})"
 
 
 class GsUsbLink(FrameLink):
@@ -292,7 +283,7 @@ def _found(backend: IBackend | None) -> Sequence[tuple[GsUsbDevice, usb.core.Dev
         found = list(usb.core.find(find_all=True, backend=backend) or ())
     except (usb.core.USBError, NotImplementedError) as error:
         raise DeviceError(f"USB cannot be read: {error}") from error
-    devices = [device for device in found if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_IDS]
+    devices = [device for device in found if isinstance(device, usb.core.Device) and _usb_id(device) in GS_USB_ADAPTERS]
     return sorted(((_describe(device), device) for device in devices), key=lambda one: one[0][:2])
 
 

@@ -11,14 +11,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from firmware_bridge.errors import NoDeviceError
-
-FTDI_X: Final = (0x0403, 0x6015)  # id of FTDI's chip, in the adapter that XELA ships, but also in grippers and cables
-
-KNOWN_ADAPTERS: Final = {
-    FTDI_X: "VScom USB-CAN Plus",
-    (0xAD50, 0x60C4): "CANable, slcan firmware",  # the id of CANtact, from which its firmware is derived
-    (0x16D0, 0x117E): "CANable 2, slcan firmware",
-}
+from firmware_bridge.links.known_adapters import FTDI_X, SLCAN_ADAPTERS
 
 LATENCY_ROOT: Final = Path("/sys/bus/usb-serial/devices")
 NO_PERMISSION: Final = (
@@ -58,7 +51,7 @@ class Port(NamedTuple):
         can = re.search(r"\bCAN\b|CAN-?USB|USB-?CAN", words)
         if self.usb_id is None or (self.usb_id == FTDI_X and words and not can):
             return None
-        return KNOWN_ADAPTERS.get(self.usb_id)
+        return SLCAN_ADAPTERS.get(self.usb_id)
 
     def __str__(self) -> str:
         usb = f" {self.usb_id[0]:04x}:{self.usb_id[1]:04x}" if self.usb_id else ""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from edge.perception.result_fields import FIELDS, Field, Out
+from edge.perception.record_fields import FIELDS, Field, Out
 from edge.sinks.shm import IN_MEMORY, MAPS_IN_MEMORY, MEMBERS, offsets_of
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -14,7 +14,7 @@ from train.errors import CheckpointError
 from train.experiments import trust_checks
 from train.experiments.__main__ import run
 from train.experiments.sensor_faults import FAULTS
-from train.families.catalogue import SHARES
+from train.families.family_shares import SHARES
 
 
 def press(z=3000.0, x=0.0):

@@ -32,7 +32,7 @@ from train.errors import CheckpointError
 from train.learning.checkpoint import infer, load_network, network_of, origin_of
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
-from train.networks.registry import build
+from train.networks.named_networks import build
 from train.trust import load_trust
 
 

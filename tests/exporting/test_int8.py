@@ -8,7 +8,8 @@ from export_samples import PRESSES, made_once, small_models
 
 from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
-from export.graph import ExportError, calibration_batch, convolutions, integer_nodes, quantised
+from export.graph import ExportError
+from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
 from train.data.press_batches import Batch
 
 

@@ -14,7 +14,7 @@ from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, recor
 
 from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
-from edge.perception.result_fields import MAPS
+from edge.perception.record_fields import MAPS
 from edge.sinks.registry import open_sink
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording

@@ -22,7 +22,7 @@ from edge.perception.gain_learning import (
     Learn,
     load_contact_model,
 )
-from edge.perception.pattern_check import PatternCheck, SensorPad
+from edge.perception.trust_check import PatternCheck, SensorPad
 from edge.pipeline.gain_keeper import GainKeeper, forget_learned, keep_learned
 from firmware_bridge.scans.pad_constants import GAINS, Pad
 from firmware_bridge.scans.scan import ScanSeries

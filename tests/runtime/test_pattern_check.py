@@ -12,7 +12,7 @@ from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.pattern_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, foreign_taps
+from edge.perception.trust_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, foreign_taps
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)

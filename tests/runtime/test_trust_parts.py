@@ -13,9 +13,9 @@ from edge_samples import write_model
 from trust_samples import CONSTANTS, make_forward, make_trust, make_trusted_contract
 
 from edge.api import Contract, ModelError
-from edge.inference import trust as networks
+from edge.inference import trust_model as networks
 from edge.inference.onnx_session import ModelSession
-from edge.inference.trust import (
+from edge.inference.trust_model import (
     GRID,
     KPA,
     MOST_INPUTS,

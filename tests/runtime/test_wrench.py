@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
 from edge.api import USPA44, find_model, load_model
-from edge.inference.trust import features
+from edge.inference.trust_model import features
 from edge.perception.pattern_description import Balance, wrench_of
 from edge.perception.result import LEAST_FORCE_N
 from edge.sinks.mcap import McapSink

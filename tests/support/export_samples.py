@@ -18,7 +18,7 @@ from train.learning.checkpoint import Training, fit_network, load_network
 from train.learning.training_loop import Recipe
 from train.networks.blocks import PatternNet
 from train.networks.fusion import FusionNet
-from train.networks.registry import build
+from train.networks.named_networks import build
 from train.physics.pad_draws import KNOWN
 from train.trust import load_trust
 

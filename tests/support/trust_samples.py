@@ -5,7 +5,17 @@ from edge_samples import make_pad_contract
 from pose_samples import make_posed_contract
 
 from edge.inference.contract import POSE_WIDTH, Contract
-from edge.inference.trust import FEATURES, GRID, KPA, PLACE_MM, Check, ForwardModel, SmallNetwork, Trust, pair_width
+from edge.inference.trust_model import (
+    FEATURES,
+    GRID,
+    KPA,
+    PLACE_MM,
+    Check,
+    ForwardModel,
+    SmallNetwork,
+    Trust,
+    pair_width,
+)
 
 CONSTANTS = 2
 UNFAMILIAR = 0.5

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from train.errors import MeshError, SurfaceError
-from train.families.catalogue import SHARES, draw_shape
-from train.families.shape import NOWHERE_MM
+from train.families.family_shares import SHARES, draw_shape
+from train.families.shapes import NOWHERE_MM
 from train.physics.contact import BARE
 from train.physics.gripped import SAMPLES, GrippedPad
 from train.physics.pad_draws import NOMINAL

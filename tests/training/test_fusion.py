@@ -7,7 +7,7 @@ from press_samples import make_press_set
 from train.data.press_batches import PosedBatches
 from train.networks.compact import CompactNet, HeteroscedasticError
 from train.networks.fusion import FusionNet
-from train.networks.registry import grown
+from train.networks.named_networks import grown
 
 KNOWN = 5
 REACHES = (torch.tensor(0.1), torch.tensor(0.1))

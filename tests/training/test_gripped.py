@@ -7,8 +7,8 @@ import pytest
 
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import SurfaceError
-from train.families.catalogue import heights_of
-from train.families.shape import NOWHERE_MM
+from train.families.family_shares import heights_of
+from train.families.shapes import NOWHERE_MM
 from train.physics.contact import BARE, Cover
 from train.physics.gripped import (
     FINE_SCALE,

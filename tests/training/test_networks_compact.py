@@ -23,7 +23,7 @@ def truth_like(pattern, seed=5):
 @pytest.mark.parametrize(("taps", "channels", "said"), [(0, 16, "at least 1"), (1, 6, "multiple of the 4 symmetries")])
 def test_taps_and_channels_out_of_range_are_refused(taps, channels, said):
     with pytest.raises(ValueError, match=said):
-        CompactNet(taps, 4, channels)
+        CompactNet(taps, 4, channels, 1)
 
 
 def test_absent_taps_are_the_same_as_fewer_taps(net):

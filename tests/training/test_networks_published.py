@@ -6,8 +6,8 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from train.data.press_batches import Batch
+from train.networks.named_networks import build, grown
 from train.networks.published import SrganObjective
-from train.networks.registry import build, grown
 from train.networks.symmetric import write_out
 
 PUBLISHED = {

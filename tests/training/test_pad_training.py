@@ -12,7 +12,7 @@ from firmware_bridge.pad_geometry import USPA44, USPA46
 from train.data.frozen_presses import freeze_presses
 from train.data.world import World, solve_pad
 from train.errors import DatasetError
-from train.families.catalogue import tap
+from train.families.family_shares import tap
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
 from train.networks.compact import CompactNet

@@ -8,7 +8,7 @@ from press_samples import make_press_set
 
 from train.data.frozen_presses import freeze_presses, load_frozen_presses, main
 from train.data.press_batches import COUNTS_PER_UNIT, PressBatches
-from train.families.catalogue import SHARES
+from train.families.family_shares import SHARES
 from train.physics.pad_draws import INPUTS
 from train.physics.sensor_noise import NAMES, Nuisances
 

@@ -14,7 +14,7 @@ from train.fit import bundled, given_taps, main
 from train.learning.checkpoint import Training, fit_network, infer, load_network
 from train.learning.interval_fit import interval_coverage
 from train.learning.training_loop import Recipe
-from train.networks.registry import grown
+from train.networks.named_networks import grown
 from train.physics.pad_draws import KNOWN
 
 SMALL = {"channels": 16, "blocks": 1, "known": KNOWN}

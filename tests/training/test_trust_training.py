@@ -10,7 +10,7 @@ from edge_samples import write_model
 from press_samples import make_press_set
 from trust_samples import make_trusted_contract
 
-from edge.inference.trust import small_network
+from edge.inference.trust_model import small_network
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.poses import PadPose
 from train import trust

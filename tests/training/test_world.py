@@ -18,7 +18,7 @@ from train.data.make_presses import main, make_presses, quiet_workers
 from train.data.presses import load_presses
 from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError
-from train.families.catalogue import SHARES
+from train.families.family_shares import SHARES
 from train.physics.gripped import MOST_FORCE_N
 from train.physics.pad_draws import INPUTS
 from train.surfaces.poses import REACH_MM

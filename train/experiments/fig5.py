@@ -16,7 +16,7 @@ from torch import Tensor
 
 from firmware_bridge.pad_geometry import USPA44
 from train.experiments.workbench import Workbench
-from train.families.catalogue import tap
+from train.families.family_shares import tap
 from train.networks.tactile_psf import PsfNet, PsfParameters, fit_psf_net, pressed
 from train.physics.gripped import FINE_SCALE, FRAMES, SCALE, GrippedPad, Taps
 from train.physics.pad_draws import NOMINAL

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge.evaluation.metrics import psnr_db
 from edge.inference.bundled import DEFAULT_MODEL, POSED_MODEL
 from edge.inference.onnx_session import ModelSession
-from edge.perception.pattern_check import NOT_OF_IT, PatternCheck
+from edge.perception.trust_check import NOT_OF_IT, PatternCheck
 from edge.terminal.progress_bar import tracked
 from firmware_bridge.poses import PLACE_ERROR_MM, TURN_ERROR_DEG
 from train.data.frozen_presses import FrozenPresses, freeze_presses
@@ -21,7 +21,7 @@ from train.data.press_batches import stated_poses
 from train.data.presses import SEED, PressSet
 from train.data.world import World
 from train.experiments.workbench import Workbench, infer, known_pads, name_of
-from train.families.catalogue import FIGURES, SHARES
+from train.families.family_shares import FIGURES, SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, with_interval
 from train.surfaces.poses import MAX_TAPS

@@ -26,7 +26,7 @@ from train.data.world import World
 from train.errors import CheckpointError
 from train.experiments.sensor_faults import FAULTS, FIELDS, PushedSensor
 from train.experiments.workbench import Workbench, known_pads
-from train.families.catalogue import SHARES
+from train.families.family_shares import SHARES
 from train.physics.gripped import MAX_INDENTATION_MM
 from train.report import Report, Row, bootstrap_interval, with_interval
 

@@ -37,8 +37,8 @@ from train.learning.training_loop import (
 )
 from train.networks.blocks import Objective, PatternNet, RelativeError
 from train.networks.compact import CompactNet, HeteroscedasticError
+from train.networks.named_networks import build, grown
 from train.networks.published import SrganObjective, TactileSRGAN
-from train.networks.registry import build, grown
 from train.networks.symmetric import read_back
 
 _CONTACT_LEVELS: Final = tuple(np.arange(0.3, 0.95, 0.05).round(2).tolist())
@@ -54,7 +54,7 @@ class Training:
     """
 
     name: str  # of the checkpoint
-    network: str  # a name of train.networks.registry
+    network: str  # a name of train.networks.named_networks
     recipe: Recipe
     scale: int = 10  # pattern pixels per taxel pitch
     start: str | None = None  # checkpoint whose weights it starts from, or NAME.onnx of a bundled model

@@ -14,9 +14,16 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional as F
 
-from edge.inference.trust import Check, SmallNetwork, contact_features, pair_width, pose_tap_features, small_network
+from edge.inference.trust_model import (
+    Check,
+    SmallNetwork,
+    contact_features,
+    pair_width,
+    pose_tap_features,
+    small_network,
+)
 from edge.perception.contact_options import OFF_COUNTS
-from edge.perception.pattern_check import LEAST_COUNTS
+from edge.perception.trust_check import LEAST_COUNTS
 from firmware_bridge.pad_geometry import USPA44
 from train.data.press_batches import in_units, read_presses, stated_poses
 from train.data.presses import PressSet

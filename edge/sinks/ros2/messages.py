@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, EventKind
+from edge.perception.record_fields import FIELDS, Columns, Out
 from edge.perception.result import Result
-from edge.perception.result_fields import FIELDS, Columns, Out
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
 from firmware_bridge.scans.scan import ABSENT, Scan

@@ -22,7 +22,7 @@ function takeToken() {
 
 // ---- Frames ----
 
-/** Unpack a frame of the program (edge/sinks/json_encoding.py): {header, maps by name}. */
+/** Unpack a frame of the program (edge/sinks/json_records.py): {header, maps by name}. */
 function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));

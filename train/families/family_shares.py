@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from train.errors import MeshError, SurfaceError
-from train.families.shape import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
+from train.families.shapes import NOWHERE_MM, SHAPES, SLOPE, Lie, drawn, log_uniform
 from train.physics.contact import BARE, Cover
 from train.physics.gripped import SAMPLES, GrippedPad, Taps
 from train.surfaces.depth_image import Pose, depth_image

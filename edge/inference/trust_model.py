@@ -231,7 +231,7 @@ class Check:
     """Network that scores readings, and the score from which they are not believed."""
 
     network: SmallNetwork  # higher scores are less familiar
-    limit: float  # score that one in a hundred simulated contacts exceeds
+    limit: float  # score that one in 200 simulated contacts exceeds, and one in 100 earlier taps
 
     def to_json(self) -> dict[str, Any]:
         """Return the check as JSON."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.inference.contract import Contract
-from edge.inference.trust import Trust, contact_features, pose_tap_features
+from edge.inference.trust_model import Trust, contact_features, pose_tap_features
 from edge.perception.event import Report
 from edge.perception.result import Estimate, Reason, Step, Window, WrenchOrigin
 from edge.perception.tap_tracker import TapTracker
