@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
-from bridge_samples import REAL_RECORDINGS
 
 from firmware_bridge.errors import BaselineRefusedError
-from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ABSENT
 from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED, free_stretch
 
@@ -72,18 +70,3 @@ def test_repeated_and_incomplete_scans_are_no_samples():
     counts = scans((60, 0), (60, None))
     counts[5, :, 1, 1] = ABSENT
     assert 5 not in free_stretch(counts).rows
-
-
-GRIPS = sorted(REAL_RECORDINGS.glob("*/xela_sensor?.csv"))
-
-
-@pytest.mark.skipif(not GRIPS, reason=f"no recordings in {REAL_RECORDINGS} (set TACTILE_RECORDINGS)")
-def test_of_real_grips_the_stretch_with_the_lowest_z_is_taken():
-    """Three trials hold the box to their end. One lets go: it is still at first, too, with 12,000 counts on the pad."""
-    for path in GRIPS:
-        counts = load_recording(path).tracks[0].counts
-        stretch = free_stretch(counts)
-        z = counts[:, 2].sum(axis=(1, 2))
-        assert stretch.rows[0] > len(counts) / 2 and not stretch.opens, path
-        assert np.median(z[stretch.rows]) < np.quantile(z, 0.4), path
-        assert stretch.touched == ("2022-02-22" in path.parent.name), path

@@ -186,13 +186,6 @@ def test_the_rate_of_a_csv_comes_from_its_times(tmp_path, name, times, rate_hz):
         assert recording.notes == (), "its unit is certain"
 
 
-def test_other_columns_of_a_csv_are_named_and_left_out(tmp_path):
-    recording = load_recording(write_csv(tmp_path, with_columns(",label", ["0,grasp", "1,"])))
-    assert (recording.tracks[0].counts[1] == load_recording(write_csv(tmp_path, PLAIN)).tracks[0].counts[0] + 1).all()
-    (note,) = recording.notes
-    assert "column 'label' is left out" in note and "rename it" in note
-
-
 def test_the_vendors_log(tmp_path):
     """Its columns of force are left out: a MCAP of the vendor's server holds newtons."""
     taxels = [f"{taxel}{axis}" for taxel in range(1, 17) for axis in "XYZ"]
@@ -202,7 +195,11 @@ def test_the_vendors_log(tmp_path):
     assert recording.rate_hz == pytest.approx(80, rel=0.01)
     assert (recording.tracks[0].counts[1, :, 0, 0] == [1, 5001, 9001]).all()
     times, others = recording.notes
-    assert "'Receive time' is left out as times" in times and "'Message number', 'Force 1X' are left out" in others
+    assert (
+        "'Receive time' is left out as times" in times
+        and "'Message number', 'Force 1X' are left out" in others
+        and "rename it" in others
+    )
 
 
 def test_npz(tmp_path):
