@@ -55,54 +55,37 @@ def _shown(value: Any) -> str:
     return text[:60] + "..." * (len(text) > 60)
 
 
-def one_of(*values: str | int) -> Callable[[Any], Any]:
-    """Return a reader that accepts one of these values, of its type."""
+def reader(right: Callable[[Any], bool], expected: str) -> Callable[[Any], Any]:
+    """Return a reader that accepts a value that is `right`, as it is, and otherwise states what it expected."""
 
     def read(value: Any) -> Any:
-        if not any(type(value) is type(one) and value == one for one in values):
-            raise ValueError(" or ".join(map(repr, values)))
+        if not right(value):
+            raise ValueError(expected)
         return value
 
     return read
 
 
-def text_value(value: Any) -> str:
-    """Read a printable text."""
-    if not isinstance(value, str) or not value or not value.isprintable():
-        raise ValueError("a text of printable characters")
-    return value
+text_value: Final = reader(
+    lambda value: isinstance(value, str) and value != "" and value.isprintable(), "a text of printable characters"
+)
+a_table: Final = reader(lambda value: isinstance(value, dict), "a table")  # whose keys a Table of its own checks
+truth: Final = reader(lambda value: isinstance(value, bool), "true or false")
+whole: Final = reader(lambda value: type(value) is int and 1 <= value < 2**31, "a whole number from 1")
 
 
-def a_table(value: Any) -> dict[str, Any]:
-    """Read a table, whose keys a Table of its own checks."""
-    if not isinstance(value, dict):
-        raise ValueError("a table")
-    return value
+def one_of(*values: str | int) -> Callable[[Any], Any]:
+    """Return a reader that accepts one of these values, of its type."""
+    known = [(type(one), one) for one in values]
+    return reader(lambda value: (type(value), value) in known, " or ".join(map(repr, values)))
 
 
-def truth(value: Any) -> bool:
-    """Read true or false."""
-    if not isinstance(value, bool):
-        raise ValueError("true or false")
-    return value
+def between(low: float, high: float) -> Callable[[Any], Any]:
+    """Return a reader that accepts a number in this range, both ends included, in its written type.
 
-
-def whole(value: Any) -> int:
-    """Read a whole number from 1."""
-    if type(value) is not int or not 1 <= value < 2**31:
-        raise ValueError("a whole number from 1")
-    return value
-
-
-def between(low: float, high: float) -> Callable[[Any], float]:
-    """Return a reader that accepts a number in this range, both ends included, in its written type."""
-
-    def read(value: Any) -> float:
-        if not is_number(value, low, high):
-            raise ValueError(f"a number from {low:g} to {high:g}")
-        return value  # not as a float: a baseline's id differs between 1000 and 1000.0
-
-    return read
+    Not as a float: a baseline's id differs between 1000 and 1000.0.
+    """
+    return reader(lambda value: is_number(value, low, high), f"a number from {low:g} to {high:g}")
 
 
 def cells(shape: tuple[int, ...], right: Callable[[list[Any]], bool], expected: str) -> Callable[[Any], Any]:

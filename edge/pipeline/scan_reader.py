@@ -13,8 +13,9 @@ from edge.errors import UsageError
 from edge.pipeline.cadence import Pace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
-from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind, one_origin
+from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind
 from firmware_bridge.poses import PadPose, TimedPose
+from firmware_bridge.recording.tracks import origin_of
 from firmware_bridge.scans.scan import Scan
 from firmware_bridge.schedule import POLL_S
 from firmware_bridge.sensor_file.model import SensorFile
@@ -175,7 +176,7 @@ class Source:
     @property
     def origin(self) -> SourceKind | None:
         """Kind of source that the scans of a recording come from; None if unknown, or equal to `kind`."""
-        return one_origin(reader.link.origin for reader in self._readers)
+        return origin_of(reader.link.origin for reader in self._readers)
 
     def unix_time_s(self) -> float:
         """Return the time in [s] since 1970: now, or for a patient source that of the last scan taken."""

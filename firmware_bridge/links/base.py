@@ -7,7 +7,7 @@ network libraries stop: each is the loss of one link.
 
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -135,14 +135,6 @@ class Link(Protocol):
 def not_open() -> ValueError:
     """Return the error of a link that is read before it was opened, or after it was closed."""
     return ValueError("the link is not open: use it in a with statement")
-
-
-def one_origin(origins: Iterable[SourceKind | None]) -> SourceKind | None:
-    """Return the common origin of recordings played together: "emulated" if one is; None if they differ otherwise."""
-    found = set(origins)
-    if "emulated" in found:
-        return "emulated"
-    return found.pop() if len(found) == 1 else None
 
 
 LONG_UNREAD_NS: Final = 50_000_000

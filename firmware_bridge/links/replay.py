@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_bridge.errors import SourceError, harmless
-from firmware_bridge.links.base import Link, Notice, SourceKind, one_origin
+from firmware_bridge.links.base import Link, Notice, SourceKind
 from firmware_bridge.poses import GAP_NS, TimedPose
 from firmware_bridge.recording.formats import load_recording
-from firmware_bridge.recording.tracks import Recording, Track
+from firmware_bridge.recording.tracks import Recording, Track, origin_of
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 from firmware_bridge.schedule import LAST_TIME_NS, NS_PER_S, Clock, Sleep, sleep_until
@@ -63,7 +63,7 @@ class ReplayLink(Link):
         self.kind: SourceKind = "replay"
         self.lasts = False
         self.patient = not paced
-        self.origin = one_origin(recording.origin for recording in self.recordings)
+        self.origin = origin_of(recording.origin for recording in self.recordings)
         self.mountings = {
             track.sensor: recording.mountings.get(track.sensor, Mounting(taxel_count=track.geometry.taxel_count))
             for recording in self.recordings

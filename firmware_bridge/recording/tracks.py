@@ -90,8 +90,8 @@ class Recording:
     poses_by_row: bool = False
 
 
-def origin_of(kinds: Iterable[str]) -> Literal["device", "emulated"] | None:
-    """Return the origin of scans whose file names these kinds of sources, None if it is uncertain."""
+def origin_of(kinds: Iterable[str | None]) -> Literal["device", "emulated"] | None:
+    """Return the origin of scans of these kinds of sources together, None if it is uncertain."""
     found = set(kinds)
     if "emulated" in found:
         return "emulated"

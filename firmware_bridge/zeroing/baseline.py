@@ -19,7 +19,7 @@ from firmware_bridge.in_place import read_bounded, write_in_place
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, LONGEST_SENSOR_NAME, Scan, is_sensor_name
-from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, whole
+from firmware_bridge.strict_table import LEAST_POSITIVE, Table, is_number, numbers, one_of, reader, whole
 
 COUNTS_ON_CIRCLE: Final = 0x10000
 FEWEST_SCANS: Final = 100
@@ -38,6 +38,17 @@ FILE_FORMAT: Final = "tactile-baseline"
 FILE_VERSION: Final = 1
 LAST_UNIX_S: Final = 1e11  # latest valid time, in [s] since 1970 (the year 5138)
 _FILE_REMEDY: Final = "zero again and save a new file"
+_read_entries: Final = reader(
+    lambda value: isinstance(value, list) and value != [] and all(isinstance(one, dict) for one in value),
+    "a list of at least one object",
+)
+_read_sensor: Final = reader(
+    lambda value: isinstance(value, str) and is_sensor_name(value),
+    f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters",
+)
+_read_date: Final = reader(
+    lambda value: value is None or is_number(value, LEAST_POSITIVE, LAST_UNIX_S), "seconds since 1970, or null"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,24 +304,6 @@ def _sha256_hex(data: bytes) -> str:
         with suppress(ImportError):
             return import_module(name).sha256(data).hexdigest()
     return import_module("hashlib").sha256(data).hexdigest()
-
-
-def _read_entries(value: Any) -> list[Any]:
-    if not isinstance(value, list) or not value or not all(isinstance(one, dict) for one in value):
-        raise ValueError("a list of at least one object")
-    return value
-
-
-def _read_sensor(value: Any) -> str:
-    if not isinstance(value, str) or not is_sensor_name(value):
-        raise ValueError(f"a name of 1 to {LONGEST_SENSOR_NAME} printable characters")
-    return value
-
-
-def _read_date(value: Any) -> float | None:
-    if value is not None and not is_number(value, LEAST_POSITIVE, LAST_UNIX_S):
-        raise ValueError("seconds since 1970, or null")
-    return value
 
 
 def _read_counts(value: Any) -> NDArray[np.float64]:
