@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.errors import BridgeError, DeviceError, LinkLostError
-from firmware_bridge.links.base import Link, SourceKind, not_open
+from firmware_bridge.links.base import SourceKind, not_open
+from firmware_bridge.links.serial_ports import PluggedAdapter
 from firmware_bridge.links.slcan_serial import SlcanSerialLink
 from firmware_bridge.poses import PadPose, TimedPose
 from firmware_bridge.recording.formats import load_recording
@@ -99,8 +100,8 @@ def tap_options(path: Path) -> dict[str, NDArray[Any]]:
         return {name: data[name] for name in names} if set(names) <= set(data.files) else {}
 
 
-class DemoLink(Link):
-    """Link to a recording played by the emulator, through the ordinary serial path.
+class DemoLink(SlcanSerialLink):
+    """Link to a recording played by the emulator, over the ordinary serial path.
 
     Attributes:
         emulator: the emulator, once the link was open.
@@ -109,18 +110,16 @@ class DemoLink(Link):
     def __init__(
         self, recording: str | Path, rate_hz: float | None = None, *, loop: bool = False, model: ModelMap = USPA44_MAP
     ) -> None:
+        super().__init__("", model=model)
         self.name = "demo"
-        self.lasts = False
+        self.lasts = self.fetches = False
         self.kind: SourceKind = "emulated"
         self.states_poses = True  # those of its robot
         self.emulator: Emulator | None = None
         self._recording = Path(recording)
         self._rate_hz = rate_hz
         self._loop = loop
-        self._model = model
         self._robot: Robot | None = None
-        self._link: SlcanSerialLink | None = None
-        self._open = False
 
     def __enter__(self) -> Self:
         try:
@@ -132,38 +131,29 @@ class DemoLink(Link):
             raise DeviceError(f"the emulator did not start: {error}") from error
         emulator.__enter__()
         self._robot, self.emulator = robot, emulator
-        self._link, self._open = SlcanSerialLink(emulator.port, model=self._model), True
+        self._plugged = PluggedAdapter(emulator.port)
         try:
-            self._link.__enter__()
+            return super().__enter__()
         except BaseException:
-            self.__exit__()
+            emulator.hang_up()
             raise
-        return self
 
     def __exit__(self, *exc_info: object) -> None:
-        if not self._open or self._link is None or self.emulator is None:
-            return
-        self._open = False
-        try:
-            self._link.__exit__(*exc_info)
-        finally:
+        super().__exit__(*exc_info)
+        if self.emulator is not None:
             self.emulator.hang_up()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""
-        if not self._open or self._link is None or self.emulator is None:
-            raise not_open()
         if self.ended:
             return []
         try:
-            scans = self._link.read(timeout_s)
+            return super().read(timeout_s)
         except LinkLostError:
-            if not self.emulator.played_out:  # else it has hung up, as everything was played
+            if self.emulator is None or not self.emulator.played_out:  # else it has hung up, as everything was played
                 raise
             self.ended = True
             return []
-        self.trouble = self._link.trouble
-        return scans
 
     def poses(self) -> list[TimedPose]:
         """Return the poses that the robot has stated since the last call."""
@@ -176,7 +166,3 @@ class DemoLink(Link):
             raise not_open()
         self._robot.steered = True
         return self._robot.asked.append
-
-    def counters(self) -> dict[str, int]:
-        """Return the counts of the serial link, the last ones after it was closed."""
-        return self._link.counters() if self._link else {}
