@@ -54,6 +54,10 @@ class DemoRecording:
         for tap, (scans, depths_mm) in enumerate(options, self.figure_taps):
             self.taps |= {_key(scan): (tap, depth_mm) for scan, depth_mm in zip(scans, depths_mm, strict=True)}
 
+    def place_of(self, tap: int) -> tuple[str, int]:
+        """Return how the names of a tap's arrays begin, and its row in them."""
+        return ("", tap) if tap < self.figure_taps else ("option_", tap - self.figure_taps)
+
 
 def _key(counts: NDArray[np.integer]) -> bytes:
     return counts.astype(np.int32).tobytes()
@@ -149,13 +153,21 @@ class DemoScore:
         """Return the scores of the taps that got a pattern."""
         return [self._score(number, *peak) for number, peak in enumerate(self._peaks)]
 
+    def truth(self, result: Result) -> NDArray[np.float32] | None:
+        """Return the true pattern (H, W) in [mm] of a scan of the figure; None of any other."""
+        known = self._recording.taps.get(_key(result.scan.counts))
+        return None if known is None else self._true_pattern(*known)
+
+    def _true_pattern(self, tap: int, indentation_mm: float) -> NDArray[np.float32]:
+        whose, row = self._recording.place_of(tap)
+        return self._recording.arrays[f"{whose}unit_patterns"][row].astype(np.float32) * np.float32(indentation_mm)
+
     def _score(self, number: int, result: Result, tap: int, indentation_mm: float) -> TapScore:
         if result.pattern is None:
             raise ValueError("peak has no pattern, expected one kept by add")
-        arrays, full_scale = self._recording.arrays, self._model.contract.output_full_scale
-        whose, row = ("", tap) if tap < self._recording.figure_taps else ("option_", tap - self._recording.figure_taps)
-        truth = arrays[f"{whose}unit_patterns"][row].astype(np.float32) * indentation_mm
-        x_mm, y_mm, turn_deg = arrays["tap_pose" if whose == "" else "option_pose"][row, :3].tolist()
+        full_scale, truth = self._model.contract.output_full_scale, self._true_pattern(tap, indentation_mm)
+        whose, row = self._recording.place_of(tap)
+        x_mm, y_mm, turn_deg = self._recording.arrays[f"{whose or 'tap_'}pose"][row, :3].tolist()
         alone = result.pattern if result.taps_used < 2 else self._alone(result)
         error_db = float(psnr_db(result.pattern, truth, full_scale))
         errors = (float(rmse_percent(one, truth, full_scale)) for one in (result.pattern, alone))
@@ -292,6 +304,8 @@ class Demo(Sink):
         self._recording = recording = DemoRecording(demo_recording())
         self._stream, self._view, self._loops = stream, view, loops
         self._score = DemoScore(recording, model)
+        if view is not None:
+            view.show_truth(self._score.truth)
         self.map = DemoMap(recording, None if view is None else view.show_map) if maps else None
         self._unprinted = [self._score, *([] if self.map is None else [self.map])]
         # Without poses a model's taps must follow the paper's schedule, as the recording does.

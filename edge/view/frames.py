@@ -10,6 +10,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from edge.inference.contract import Contract
 from edge.mapping.sink import MapState
 from edge.perception.event import Event
@@ -34,6 +37,7 @@ MOST_VIEWERS: Final = 8
 LATE_S: Final = 0.5
 """Age of an unanswered ping, in [s], from which nothing more is sent: the frames on their way are old already."""
 _PERIOD_NS: Final = round(1e9 / MAX_FPS)
+Truth = Callable[[Result], NDArray[np.float32] | None]
 
 
 class Point(NamedTuple):
@@ -73,6 +77,7 @@ class RunSnapshot(Sink):
         newest: by sensor.
         first_ns: time of the run's first scan, in [ns]; None before.
         map: newest state of the map; None where none is made.
+        truth_of: the true pattern of a result, (H, W) in its unit, where the simulation states one; else None.
         wake: called when there is something to show, MAX_FPS times a second at most; it never waits. So viewers are
             served after a scan's last work and not by a clock of their own, while the loop sleeps.
     """
@@ -81,6 +86,7 @@ class RunSnapshot(Sink):
         self.newest: dict[str, Newest] = {}
         self.first_ns: int | None = None
         self.map: MapState | None = None
+        self.truth_of: Truth = lambda result: None
         self.wake: Callable[[], object] = lambda: None
         self._clock_ns = clock_ns
         self._traces: dict[str, _Trace] = {}
@@ -242,6 +248,7 @@ class Frames:
         }
         taps = None if result.window is None else result.window[: result.taps_used, 2]
         maps = {"zeroed": result.zeroed, "pattern": result.pattern, "deviation": result.deviation, "taps": taps}
+        maps["truth"] = None if result.pattern is None else self._snapshot.truth_of(result)
         return pack(header, {name: values for name, values in maps.items() if values is not None})
 
 

@@ -35,7 +35,7 @@ from edge.pipeline.pose_queue import LONGEST_BYTES
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.view.access import SOCKET, grant, is_everything, own_addresses
-from edge.view.frames import MOST_VIEWERS, Frames, RunSnapshot, Viewer, execute, hello, refused, state
+from edge.view.frames import MOST_VIEWERS, Frames, RunSnapshot, Truth, Viewer, execute, hello, refused, state
 from firmware_bridge.links.base import SourceKind
 
 FOLDER: Final = Path(__file__).with_name("page")
@@ -181,6 +181,10 @@ class LiveView:
         """Show a state of the map. Never waits."""
         self._snapshot.map = state
         self._wake_if_watched()
+
+    def show_truth(self, truth_of: Truth) -> None:
+        """Show the true pattern (H, W) of each result that has one, as a simulation states it."""
+        self._snapshot.truth_of = truth_of
 
     def _wake_if_watched(self) -> None:
         if self._watched:

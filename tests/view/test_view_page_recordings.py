@@ -64,6 +64,8 @@ def test_the_demo_shows_its_letter_ends_and_is_followed(open_page, demo):
             return len(forces) > 20 and max(likenesses) > 0.95
 
         wait_for(seen)
+        playwright.expect(part(page, "truth-error")).to_have_text(re.compile(r"^\d\d?\.\d\s%$"))
+        playwright.expect(part(page, "truth-shown")).to_be_visible()
         best = demo["unit_patterns"][int(np.argmax(likenesses))].astype(float)
         others = [best[::-1], best[:, ::-1], best.T, best[::-1].T]
         assert max(likeness(shown, turned) for turned in others) < 0.8, likenesses

@@ -3,7 +3,7 @@
 class Sensor {
   constructor(name) {
     Object.assign(this, { result: null, receivedS: 0, zeroed: null, taps: null }); // of the newest scan
-    Object.assign(this, { pattern: null, deviation: null, touched: null, touchedS: 0 }); // of the newest with a pattern
+    Object.assign(this, { pattern: null, deviation: null, truth: null, touched: null, touchedS: 0 }); // of the newest with a pattern
     Object.assign(this, { name, cursor: null, trace: new Trace(), silentS: null, highest: 0, noteKinds: "", dirty: true });
     const root = byId("sensor").content.firstElementChild.cloneNode(true);
     this.root = root;
@@ -72,7 +72,7 @@ class Sensor {
     this.trace.add(header.trace ?? []);
     const receivedS = nowS() - (header.age_s ?? 0);
     Object.assign(this, { result: header, receivedS, zeroed: maps.zeroed ?? null, taps: maps.taps ?? null });
-    if (maps.pattern) Object.assign(this, { pattern: maps.pattern, deviation: maps.deviation ?? null, touched: header, touchedS: receivedS });
+    if (maps.pattern) Object.assign(this, { pattern: maps.pattern, deviation: maps.deviation ?? null, truth: maps.truth ?? null, touched: header, touchedS: receivedS });
     else if (header.baseline === null) this.pattern = this.deviation = null; // no earlier pattern is valid without a baseline
     if (maps.pattern) this.highest = largest(maps.pattern.values, this.highest);
     this.logNotes(header, first);
@@ -250,6 +250,7 @@ class Sensor {
     paintMap(pattern, this.pattern, high, VIRIDIS);
     const most = this.pattern !== null && live ? largest(this.pattern.values) : null;
     say(this.part["pattern-most"], most === null ? "" : `deepest ${amount(most, 3, unit)}${most > high ? ", beyond the scale" : ""}`);
+    this.paintTruth(high);
     const verdict = this.verdict();
     show(this.part.verdict, verdict !== null);
     say(this.part.verdict, verdict ?? "");
@@ -257,6 +258,15 @@ class Sensor {
     paintOver(this, over, live);
     readout.classList.toggle("read", this.cursor !== null);
     say(readout, this.cursor === null ? (matchMedia("(hover: none)").matches ? "tap the pattern to read a pixel" : "hover, or use the arrow keys, to read a pixel") : this.reading());
+  }
+
+  paintTruth(high) {
+    const known = this.pattern !== null && this.truth !== null;
+    show(this.part["truth-shown"], known);
+    if (!known) return;
+    paintMap(this.part.truth, this.truth, high, VIRIDIS);
+    const squares = this.pattern.values.reduce((sum, value, at) => sum + (value - this.truth.values[at]) ** 2, 0);
+    say(this.part["truth-error"], amount((100 * Math.sqrt(squares / this.pattern.values.length)) / (page.hello.full_scale || 1), 1, "%"));
   }
 
   stampText() {
