@@ -31,7 +31,7 @@ class BenchError(EdgeError, RuntimeError):
     """Error of a measurement that could not be made, or of a page that cannot be written."""
 
 
-class Page:
+class BenchPage:
     """Page of `lines` that are shown at once and kept; a progress bar makes room for them."""
 
     def __init__(self, out: TextIO, err: TextIO) -> None:
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     """
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends its child processes with it
-    page, command = Page(out, err), options.typed
+    page, command = BenchPage(out, err), options.typed
     try:
         if options.out is not None:
             options.out.mkdir(parents=True, exist_ok=True)
@@ -113,7 +113,9 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     return 0
 
 
-def _errors(everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: Page) -> list[ErrorRow]:
+def _errors(
+    everyone: Sequence[Subject], frozen: FrozenSet, lines: list[dict[str, Any]], page: BenchPage
+) -> list[ErrorRow]:
     text = (
         f"Frozen test set, means over all frames. Force error is RMS in % of {FORCE_RANGE_N:g} N, of what patterns sum "
         f"up to, by the one factor that suits true patterns best: those themselves are "
@@ -150,7 +152,7 @@ def _run_times(
     options: argparse.Namespace,
     frozen: FrozenSet,
     lines: list[dict[str, Any]],
-    page: Page,
+    page: BenchPage,
 ) -> None:
     columns = ("method", "threads", *(f"back to back {figure}" for figure in _FIGURES.values()))
     columns += (*(f"{options.rate_hz:g} Hz {figure}" for figure in _FIGURES.values()), "missed", "CPU %")
@@ -216,7 +218,7 @@ def _percentiles(times: dict[str, Any]) -> tuple[str, str, str, str]:
     return f"{times['p50_us']:.0f}", f"{times['p99_us']:.0f}", p999, f"{times['max_us']:.0f}"
 
 
-def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads: int, page: Page) -> None:
+def _front(errors: Sequence[ErrorRow], lines: Sequence[dict[str, Any]], threads: int, page: BenchPage) -> None:
     paced_us = {row["method"]: row["paced_p50_us"] for row in lines if row.get("threads") == threads}
     rows = sorted((row for row in errors if row.name in paced_us), key=lambda row: paced_us[row.name])
     if not rows:
@@ -235,7 +237,9 @@ def front(points: Sequence[tuple[float, float]]) -> list[bool]:
     return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
 
 
-def _write(folder: Path, command: str, page: Page, lines: Sequence[dict[str, Any]], models: Sequence[Path]) -> None:
+def _write(
+    folder: Path, command: str, page: BenchPage, lines: Sequence[dict[str, Any]], models: Sequence[Path]
+) -> None:
     sources = ("edge/bench/accuracy.py", "edge/bench/timing.py")
     made = provenance(command, sources, [*models, contenders.FROZEN_FILE])
     columns = dict.fromkeys(column for row in lines for column in row)

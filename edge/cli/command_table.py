@@ -100,7 +100,7 @@ RUN: Final = (_READ, *RESULTS)
 # fmt: on
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """Command: what does it, and its help: what it does, its options, and what is below them."""
 
     does: str  # module and function, loaded when it is used
@@ -114,7 +114,7 @@ def _lines(forms: Mapping[str, str]) -> str:
 
 
 TABLE: Final = {
-    "": Command(
+    "": Subcommand(
         "edge.cli.run_command:follow",
         "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
         "pattern: a fine map of how deep an object presses into the pad, in mm.",
@@ -156,14 +156,14 @@ examples:
 Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
 """,
     ),
-    "demo": Command(
+    "demo": Subcommand(
         "edge.cli.run_command:show_demo",
         "Shows what edge-sr does without hardware: an emulated sensor taps a figure four times, and each pattern is "
         "compared with the simulated truth. With --view on a terminal it continues until Ctrl-C.",
         (Group("sensor", Option("--rate-hz R", positive, "scans a second (default 100)")), *RESULTS),
         "examples:\n  edge-sr demo\n  edge-sr demo --view\n",
     ),
-    "record": Command(
+    "record": Subcommand(
         "edge.cli.run_command:record",
         "Runs like edge-sr, and records scans, patterns and events.",
         (Group("file", Option("file FILE", str, "new file, .mcap")), *RUN),
@@ -175,7 +175,7 @@ examples:
 All other options are those of edge-sr: its --help lists sources, outputs and keys.
 """,
     ),
-    "replay": Command(
+    "replay": Subcommand(
         "edge.cli.run_command:replay",
         "Computes the patterns of a recording.",
         (
@@ -222,7 +222,7 @@ examples:
           --sink mcap:again.mcap
 """,
     ),
-    "convert": Command(
+    "convert": Subcommand(
         "edge.cli.convert_command:run",
         "Writes a recording in another format: that of the ending of the new name.",
         (
@@ -244,7 +244,7 @@ examples:
   edge-sr convert old.npz old.mcap
 """,
     ),
-    "map": Command(
+    "map": Subcommand(
         "edge.cli.run_command:map_object",
         "Runs like edge-sr, and fuses the patterns into a map of the object.",
         (
@@ -281,12 +281,12 @@ A line of poses:
 All other options are those of edge-sr: its --help lists sources, outputs and keys.
 """,
     ),
-    "models": Command(
+    "models": Subcommand(
         "edge.cli.listings:show_models",
         "Lists the bundled models, with their error.",
         (Group(None, Option("--measure", bool, "measure the run time of each here, 1.5 s a model")),),
     ),
-    "baseline": Command(
+    "baseline": Subcommand(
         "edge.cli.run_command:baseline",
         "Measures the free pad once, and stores its readings: the baseline, which is subtracted from each scan.",
         (
@@ -315,14 +315,14 @@ Of a recording it takes the scans during which the pad is still and pressed leas
           --skip 190 --scans 60
 """,
     ),
-    "devices": Command(
+    "devices": Subcommand(
         "edge.cli.listings:show_devices",
         "Lists serial ports, CAN adapters and CAN interfaces, what to type after --source for each, and what prevents "
         "its use.",
         (Group(None, Option("--json", bool, "write JSON, for programs")),),
         "Exit code: 3 if there is no adapter.",
     ),
-    "doctor": Command(
+    "doctor": Subcommand(
         "edge.doctor.command:run",
         "Examines sensor and adapter, reports faults with their remedies, and measures how the pad is mounted.",
         (
@@ -363,7 +363,7 @@ free pad is measured.
 Exit codes: 0 no fault, 1 a fault, or a request that was not fulfilled, 2 wrong usage, 3 sensor, 130 Ctrl-C.
 """,
     ),
-    "bench": Command(
+    "bench": Subcommand(
         "edge.bench.command:run",
         "Measures error against run time of the bundled models and of methods without a network.",
         (

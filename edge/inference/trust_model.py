@@ -227,7 +227,7 @@ _POSE_FEATURES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class FamiliarityCheck:
     """Network that scores readings, and the score from which they are not believed."""
 
     network: SmallNetwork  # higher scores are less familiar
@@ -238,8 +238,8 @@ class Check:
         return {"layers": self.network.to_json(), "limit": self.limit}
 
 
-def check_of(value: Any) -> Check:
-    """Return the check of a value that `Check.to_json` has made.
+def check_of(value: Any) -> FamiliarityCheck:
+    """Return the check of a value that `FamiliarityCheck.to_json` has made.
 
     Raises:
         ValueError: it is none.
@@ -249,7 +249,7 @@ def check_of(value: Any) -> Check:
     limit = value["limit"]
     if not isinstance(limit, float) or not math.isfinite(limit):
         raise ValueError(f"limit is {limit!r}, expected a number")
-    return Check(small_network(value["layers"]), limit)
+    return FamiliarityCheck(small_network(value["layers"]), limit)
 
 
 def contact_features(tap: NDArray[np.float32], pad_row: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -303,8 +303,8 @@ class Trust:
     """Content of a model's contract under `trust`."""
 
     forward: ForwardModel  # explains readings by a pattern
-    contact: Check  # tells readings that a contact makes from others
-    tap: Check  # tells earlier taps of the same contact from others
+    contact: FamiliarityCheck  # tells readings that a contact makes from others
+    tap: FamiliarityCheck  # tells earlier taps of the same contact from others
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""

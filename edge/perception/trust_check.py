@@ -40,7 +40,7 @@ SAME_STRENGTH: Final = 0.85
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
-class Verdict(NamedTuple):
+class TrustVerdict(NamedTuple):
     """Outcome of the checks of one pattern."""
 
     trusted: bool | None  # None for a contact that is too light to tell
@@ -94,7 +94,7 @@ class PatternCheck:
         doubt: float | None,
         traction: NDArray[np.float32] | None,
         repeats: int,
-    ) -> Verdict:
+    ) -> TrustVerdict:
         """Return the verdict on a contact's pattern, and remember what the contact shows of the sensor.
 
         Readings (3, rows, cols) are in network units, the pattern (H, W) in [mm], its doubt as `intervals.doubt` gives
@@ -104,7 +104,7 @@ class PatternCheck:
         strength = float(newest[2].max())
         z_counts = strength * self._unit_counts
         if z_counts < LEAST_COUNTS:
-            return Verdict(False, "stuck") if repeats >= REPEATS else Verdict(None)
+            return TrustVerdict(False, "stuck") if repeats >= REPEATS else TrustVerdict(None)
         trust = self._trust
         (score,) = trust.contact.network(contact_features(newest, self._pad_row))
         self._weigh(tap, strength, score)
@@ -127,7 +127,7 @@ class PatternCheck:
             reason = "uncertain"
         elif self.suspected:
             reason = "sensor"
-        return Verdict(reason is None, reason, mismatch)
+        return TrustVerdict(reason is None, reason, mismatch)
 
     def _weigh(self, tap: int, strength: float, score: float) -> None:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""

@@ -121,7 +121,7 @@ class Cadence:
         return mean_ns if scans >= 32 else max(period_ns, mean_ns)
 
 
-class Pace(NamedTuple):
+class ReadingPace(NamedTuple):
     """Times of reading, the same for all links."""
 
     every_s: float = 0.0  # time between two reads, in [s]; 0: as scans come
@@ -143,7 +143,7 @@ class Cadences:
         """Begin without a scan, with the sensors that should be there; a recording has no cable to check."""
         self.missed = self.late = 0
         self.patience_s = self.waited_ns = 0.0
-        self.pace = Pace()
+        self.pace = ReadingPace()
         self._recorded, self._rate_hz = recorded, rate_hz
         self._expected = set(expected)
         self._sensors: dict[str, Cadence] = {}
@@ -216,11 +216,11 @@ class Cadences:
         period_s = math.inf
         for cadence in self._sensors.values():
             period_s = min(period_s, (cadence.period_ns or math.inf) / NS_PER_S)
-        pace, before = Pace(), self.pace
+        pace, before = ReadingPace(), self.pace
         if rests and 0.005 <= period_s < min(LONGEST_PERIOD_S, self.patience_s / 2):  # faster ones never wait
-            pace = Pace(period_s, int(self.patience_s / period_s))
+            pace = ReadingPace(period_s, int(self.patience_s / period_s))
         elif len(self._sensors) >= FEWEST_TOGETHER and period_s < LONGEST_PERIOD_S:
-            pace = Pace(period_s / 4)
+            pace = ReadingPace(period_s / 4)
         if (pace.reads > 1) == (before.reads > 1) and abs(pace.every_s - before.every_s) < 0.1 * pace.every_s:
             return  # a measured period jitters
         if pace.reads > 1:

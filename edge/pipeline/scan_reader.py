@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Final, Self
 
 from edge.errors import UsageError
-from edge.pipeline.cadence import Pace
+from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.errors import SourceError
 from firmware_bridge.links.base import Link, LinkReader, Notice, SourceKind
@@ -70,7 +70,7 @@ class Source:
         self.rate_hz = rate_hz
         self._force = force
         self.overruns = 0
-        self.pace = Pace()
+        self.pace = ReadingPace()
         self._stop = threading.Event()
         self._readers = [LinkReader(link, give_up_s, sleep=self._stop.wait) for link in links]
         self._last_ns = 0

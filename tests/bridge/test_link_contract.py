@@ -9,7 +9,7 @@ from bridge_samples import frames_of, make_counts, read_scans
 from link_rigs import DemoRig, GsUsbRig, PythonCanRig, ReplayRig, ServerRig, SlcanRig
 
 from edge.errors import UsageError
-from edge.pipeline.cadence import Pace
+from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.scan_reader import Source
 from firmware_bridge.can.slcan import CanFrame, encode_frame
 from firmware_bridge.errors import DeviceError, LinkLostError
@@ -79,7 +79,7 @@ def test_it_is_closed_while_another_thread_waits_for_it(rig):
     link = rig.link()
     source = Source(link)
     with source:
-        source.pace = Pace(0.003, 20)
+        source.pace = ReadingPace(0.003, 20)
         readers = threading.active_count()
     assert threading.active_count() < readers
     source.close()

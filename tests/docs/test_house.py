@@ -63,3 +63,14 @@ def shown(source):
 def test_a_planted_word_of_the_dialect_is_seen_in_shown_text(planted):
     assert shown(f"raise UsageError({planted!r})") == [planted]
     assert plain_english.shown_dialect(planted)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_class_has_a_name_of_its_own(package):
+    names = Counter(
+        node.name
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert [name for name, count in names.items() if count > 1] == []

@@ -15,7 +15,7 @@ from edge.pipeline.cadence import (
     SETTLING_SCANS,
     Cadence,
     Cadences,
-    Pace,
+    ReadingPace,
 )
 
 MS = 1_000_000
@@ -200,24 +200,24 @@ def rest(scans, *states, cadences=None, begin=0, period_ms=10, stamped=True, sen
 
 def test_rest_is_a_second_without_contact():
     cadences = rest(50, "contact", "idle", "idle")
-    assert cadences.pace == Pace() and cadences.waited_ns <= 1490 * MS
+    assert cadences.pace == ReadingPace() and cadences.waited_ns <= 1490 * MS
     rest(2, "idle", cadences=cadences, begin=150)
-    assert cadences.pace == Pace(0.01, 10) and cadences.waited_ns > 1600 * MS
+    assert cadences.pace == ReadingPace(0.01, 10) and cadences.waited_ns > 1600 * MS
     rest(1, "contact", cadences=cadences, begin=152)
-    assert cadences.pace == Pace()
+    assert cadences.pace == ReadingPace()
     assert 1520 * MS < cadences.waited_ns <= 1540 * MS, "what was on its way, and nothing after it"
 
 
 @pytest.mark.parametrize(
     ("pace", "scans", "state", "settings"),
     [
-        (Pace(), 0, "idle", {}),
-        (Pace(), 200, "idle", {"stamped": False}),
-        (Pace(), 1000, "idle", {"period_ms": 2}),
-        (Pace(), 200, "idle", {"patience_s": 0.0}),
-        (Pace(), 9, "contact", {"sensors": 3}),
-        (Pace(0.0025), 9, "contact", {"sensors": 4}),
-        (Pace(), 9, "contact", {"sensors": 4, "period_ms": 100}),
+        (ReadingPace(), 0, "idle", {}),
+        (ReadingPace(), 200, "idle", {"stamped": False}),
+        (ReadingPace(), 1000, "idle", {"period_ms": 2}),
+        (ReadingPace(), 200, "idle", {"patience_s": 0.0}),
+        (ReadingPace(), 9, "contact", {"sensors": 3}),
+        (ReadingPace(0.0025), 9, "contact", {"sensors": 4}),
+        (ReadingPace(), 9, "contact", {"sensors": 4, "period_ms": 100}),
     ],
 )
 def test_rest_needs_stamps_and_a_usual_rate_and_four_are_read_together(pace, scans, state, settings):

@@ -10,7 +10,7 @@ from edge.inference.trust_model import (
     GRID,
     KPA,
     PLACE_MM,
-    Check,
+    FamiliarityCheck,
     ForwardModel,
     SmallNetwork,
     Trust,
@@ -46,8 +46,8 @@ def make_forward() -> ForwardModel:
 
 def make_trust() -> Trust:
     """Return checks: x on taxel 0 is unfamiliar, and so is an earlier tap that was less on the newest one's taxel 5."""
-    contact = Check(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
-    tap = Check(linear(pair_width(48), {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
+    contact = FamiliarityCheck(linear(48 + 1 + 2 * CONSTANTS + 1, {0: 10.0}), 10 * UNFAMILIAR)
+    tap = FamiliarityCheck(linear(pair_width(48), {48 + 32 + FOREIGN_TAXEL: -4.0}), 2.0)
     return Trust(make_forward(), contact, tap)
 
 
@@ -55,7 +55,7 @@ def make_posed_trust(farthest_mm: float) -> Trust:
     """Return checks of a model that takes poses: an earlier tap belongs up to a distance along x."""
     trust = make_trust()
     width = pair_width(48)
-    tap = Check(linear(width, {width - POSE_WIDTH - 1: 20 * PLACE_MM}), 20 * farthest_mm)
+    tap = FamiliarityCheck(linear(width, {width - POSE_WIDTH - 1: 20 * PLACE_MM}), 20 * farthest_mm)
     return Trust(trust.forward, trust.contact, tap)
 
 

@@ -35,7 +35,7 @@ _PAD_PX: Final = 42
 Maps = NDArray[np.float32]  # maps (surfaces, steps, 40, 40) in [mm]
 
 
-class Method(NamedTuple):
+class FemMethod(NamedTuple):
     """Maps of all surfaces and steps by a method, and its time for one surface's steps, of the fastest run.
 
     Where `scaled`, maps are in its own unit: one factor brings all to [mm], by least squares against the truth.
@@ -61,13 +61,13 @@ def fig7(bench: Workbench, report: Report) -> None:
     """Compare the methods with finite elements, which take half an hour on one core."""
     surfaces, meshes, steps = (LETTERS[:2], (Mesh(4, 2), Mesh(3, 2)), 2) if bench.quick else (LETTERS, MESHES, 10)
     indentation_mm = np.linspace(MAX_INDENTATION_MM / steps, MAX_INDENTATION_MM, steps)
-    by_fem: dict[str, Method] = {}
+    by_fem: dict[str, FemMethod] = {}
     forces_n: list[NDArray[np.float32]] = []
     for mesh in meshes:
         names = tracked(surfaces, f"FEM {mesh}", "surface")
         found = [press_surface(name, mesh, indentation_mm) for name in names]
         maps = np.stack([one.patterns_mm for one in found])
-        by_fem[f"FEM {mesh}"] = Method(maps, float(np.mean([one.run_s.sum() for one in found])))
+        by_fem[f"FEM {mesh}"] = FemMethod(maps, float(np.mean([one.run_s.sum() for one in found])))
         forces_n.append(np.stack([one.force_n for one in found]))
     truth = by_fem[f"FEM {meshes[0]}"].maps
     methods, beta_mm = _methods(surfaces, indentation_mm, forces_n[0], truth)
@@ -88,7 +88,7 @@ def fig7(bench: Workbench, report: Report) -> None:
 
 def _methods(
     surfaces: tuple[str, ...], indentation_mm: NDArray[np.floating], force_n: NDArray[np.floating], truth: Maps
-) -> tuple[dict[str, Method], float]:
+) -> tuple[dict[str, FemMethod], float]:
     """Return the methods that are faster than finite elements, by name, and the beta of the best PSF in [mm]."""
     margin = (_PAD_PX - 4 * SCALE) // 2
     depth_mm = np.stack([depth_image(relief(name), CENTRE, _PAD_PX, _PIXEL_MM) for name in surfaces])
@@ -105,9 +105,9 @@ def _methods(
         unit = solver.displacement_mm(solver.solve(depth_mm[i : i + 1])[0])[:, window, window]
         return unit * step_mm[:, None, None]
 
-    def made(make: Callable[[int], Maps], *, scaled: bool = False) -> Method:
+    def made(make: Callable[[int], Maps], *, scaled: bool = False) -> FemMethod:
         maps = np.stack([make(i) for i in range(len(surfaces))])
-        return Method(maps, min(repeat(partial(make, 0), number=1)), scaled)
+        return FemMethod(maps, min(repeat(partial(make, 0), number=1)), scaled)
 
     psfs = {beta_mm: made(partial(by_psf, beta_mm), scaled=True) for beta_mm in PSF_BETAS_MM}
     best_mm = min(psfs, key=lambda beta_mm: float(psfs[beta_mm].rms_mm(truth).mean()))
@@ -121,7 +121,7 @@ def _methods(
     return methods, best_mm
 
 
-def _cells(method: Method, truth: Maps, layer: Maps, indentation_mm: NDArray[np.floating]) -> Row:
+def _cells(method: FemMethod, truth: Maps, layer: Maps, indentation_mm: NDArray[np.floating]) -> Row:
     percent = 100 * method.rms_mm(truth) / indentation_mm
     by_surface = percent.mean(axis=1)
     pressed = np.maximum(truth, 0)

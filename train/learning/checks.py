@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from edge.inference.trust_model import (
-    Check,
+    FamiliarityCheck,
     SmallNetwork,
     contact_features,
     pair_width,
@@ -187,13 +187,13 @@ def in_contact(counts: Counts) -> NDArray[np.bool_]:
     return (z.max(axis=(1, 2)) > LEAST_COUNTS) & (z.sum(axis=(1, 2)) >= OFF_COUNTS)
 
 
-def limited(network: SmallNetwork, features: NDArray[np.float32], false_alarms: float) -> Check:
+def limited(network: SmallNetwork, features: NDArray[np.float32], false_alarms: float) -> FamiliarityCheck:
     """Return the check whose limit a share of these right rows exceeds."""
     scores = np.array(network(features))
-    return Check(network, float(np.quantile(scores, 1 - false_alarms, method="higher")))
+    return FamiliarityCheck(network, float(np.quantile(scores, 1 - false_alarms, method="higher")))
 
 
-def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+def contact_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> FamiliarityCheck:
     """Return the check whose limit a share of these presses exceeds, read by sensors of several certainties."""
     readings, pads = drawn_readings(presses, seed)
     met = in_contact(readings)
@@ -227,7 +227,7 @@ def fit_tap_network(presses: PressSet, seed: int, steps: int) -> SmallNetwork:
     return fit_classifier(np.concatenate(right), np.concatenate(wrong), (192, 96), steps, seed, 0.1)
 
 
-def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> Check:
+def tap_check(network: SmallNetwork, presses: PressSet, false_alarms: float, seed: int = 0) -> FamiliarityCheck:
     """Return the check whose limit a share of the earlier taps of these presses exceeds, with usual errors of poses."""
     rng = np.random.default_rng([seed, 8])
     readings, poses = strong_taps(presses, seed)

@@ -12,7 +12,7 @@ from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
-from edge.perception.trust_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, Verdict, foreign_taps
+from edge.perception.trust_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, TrustVerdict, foreign_taps
 
 CONTRACT = make_trusted_contract()
 PAD_ROW = CONTRACT.pad_row(None)
@@ -31,7 +31,7 @@ def make_tap(z=2.0, x=0.0):
     return tap
 
 
-def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> Verdict:
+def judge(check, tap, number=0, repeats=0, factor=1.0, doubt=0.1) -> TrustVerdict:
     """Return the verdict on the pattern that the fake model makes of a tap, times a factor."""
     model = FakeModel(CONTRACT)
     window = np.zeros((4, *tap.shape), dtype=np.float32)
