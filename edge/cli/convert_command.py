@@ -40,8 +40,9 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
     if was in _WRITERS and (was, ending) not in _WITHOUT:
         made = source.with_suffix(".mcap").name
+        rate = f" --rate-hz {options.rate_hz or 'R'}" if was == ".csv" else ""
         raise UsageError(
-            f"{source} becomes no {ending}: edge-sr convert {source} {made}; edge-sr convert {made} {target}"
+            f"{source} becomes no {ending}: edge-sr convert {source} {made}{rate}; edge-sr convert {made} {target}"
         )
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")

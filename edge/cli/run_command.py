@@ -261,8 +261,9 @@ def run(
 
                 closing.callback(open_poses(text, commands.poses).close)
             pump(source, runtime, sinks, statistics, stop=stop, duration_s=options.duration_s, commands=commands)
-        # A run that its user ends before the first scan was due is no fault of the sensor.
-        if not statistics.scans and (statistics.events.keys() - {"note"} or not stop.is_set()):
+        # To end before the first scan was due, or before anybody looked at the page, is no fault of the sensor.
+        unseen = looked_at is not None and not looked_at.is_set()
+        if not statistics.scans and not unseen and (statistics.events.keys() - {"note"} or not stop.is_set()):
             raise DeviceError(f"no scan came from {source.name}: {hint()}")
         if played is not None:
             played.finish()

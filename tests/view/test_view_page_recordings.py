@@ -146,6 +146,8 @@ def test_a_recording_begins_when_its_page_is_opened_and_ends(demo, tmp_path, ope
         time.sleep(1.0)
         unseen.send_signal(signal.SIGINT)  # before anybody looks: no fault of the recording
         assert unseen.wait(60) == 0
+    with edge_sr("replay", "--example", "--duration-s", "0.5") as unseen:
+        assert unseen.wait(60) == 0
 
 
 HAND = ("4", "6", "8", "10")
