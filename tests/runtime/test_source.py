@@ -12,7 +12,7 @@ from edge_samples import REST, FakeLink, ListSink, make_scan
 from runtime_samples import presses, pumped
 
 from edge.api import LinkLostError, Scan, Source, SourceError, UsageError
-from edge.pipeline.cadence import Pace
+from edge.pipeline.cadence import ReadingPace
 from edge.pipeline.scan_reader import CAPACITY_SCANS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.base import Notice
@@ -148,7 +148,7 @@ def recording(scans, pressed):
     return Recording(Path("made.csv"), tracks, 100.0)
 
 
-@pytest.mark.parametrize("pace", [Pace(0.01, 8), Pace()])
+@pytest.mark.parametrize("pace", [ReadingPace(0.01, 8), ReadingPace()])
 def test_what_is_read_does_not_depend_on_when(pace):
     """Cycles of two sensors mix on each of two buses, and reads end within them."""
     played = recording(100, 60)
