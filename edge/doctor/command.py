@@ -120,8 +120,10 @@ class Visit:
 
     def _grip(self, names: tuple[str, str], examined: Examined) -> None:
         """Ask for a grip of two pads, in which each is the other's reference."""
+        if self._stop.is_set() or self._link.ended:
+            return
         grip = Grip(names)
-        self._say(GRIP)
+        self._say(GRIP + " Enter skips." * _stdin_is_terminal())
         end_s = time.monotonic() + PATIENCE_S
         while not (grip.over or self._stop.is_set() or self._link.ended or time.monotonic() > end_s):
             for scan in self._reader.read(POLL_S):
