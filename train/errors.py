@@ -33,10 +33,19 @@ def ended_by_errors(program: str) -> Iterator[None]:
     """End a program by an error of its user, in one line and with exit code 1, or with 130 when interrupted."""
     try:
         yield
-    except (TrainError, BridgeError, EdgeError) as error:
-        sys.exit(f"{program}: {error}")
-    except OSError as error:
-        sys.exit(f"{program}: {error.filename}: {error.strerror}")
-    except KeyboardInterrupt:
-        sys.stderr.write(f"{program}: interrupted; the same command continues\n")
-        sys.exit(130)
+    except BaseException as error:
+        if _interrupted(error):
+            sys.stderr.write(f"{program}: interrupted; the same command continues\n")
+            sys.exit(130)
+        if isinstance(error, (TrainError, BridgeError, EdgeError)):
+            sys.exit(f"{program}: {error}")
+        if isinstance(error, OSError):
+            sys.exit(f"{program}: {error.filename}: {error.strerror}")
+        raise
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C came, also where what it cut off failed then: zipfile closes no archive in mid-array."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error is not None

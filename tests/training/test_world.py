@@ -17,7 +17,7 @@ from edge_samples import ROOT
 from train.data.make_presses import main, make_presses, quiet_workers
 from train.data.presses import load_presses
 from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
-from train.errors import DatasetError
+from train.errors import DatasetError, ended_by_errors
 from train.families.family_shares import SHARES
 from train.physics.gripped import MOST_FORCE_N
 from train.physics.pad_draws import INPUTS
@@ -122,6 +122,15 @@ def test_the_command_says_what_it_made_and_what_is_left_out(tmp_path, capsys):
         count == len(made) < 30
         and last == f"{30 - count} of 30 presses left out: lighter than 0.1 N, or off the pattern"
     )
+
+
+def test_ctrl_c_within_a_write_is_no_error_of_the_file(capsys):
+    with pytest.raises(SystemExit, match="130"), ended_by_errors("program"):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise ValueError("an archive that is cut off cannot be closed")  # noqa: B904, as zipfile does
+    assert capsys.readouterr().err == "program: interrupted; the same command continues\n"
 
 
 def test_ctrl_c_ends_in_one_line_that_says_how_to_go_on(tmp_path):
