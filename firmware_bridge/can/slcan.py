@@ -36,7 +36,7 @@ STATUS_FLAGS: Final = b"F\r"
 BUS_FLAGS: Final = 0xA0  # flags of errors on the bus, and of a controller that these have made passive
 
 LONGEST_LINE: Final = 30  # most characters before the CR: T, 8 of id, 1 of length, 16 of data, 4 of time stamp
-LAST_TIMESTAMP_MS: Final = 59_999  # of an adapter whose clock counts milliseconds; others count on
+LAST_TIMESTAMP_MS: Final = 59_999  # where the clock starts anew each minute; some adapters count to 65,535
 
 LINES_TO_LEARN: Final = 4
 """Frames in a row of one form after which it is learnt: damage to lines does not make so many of them."""
@@ -91,7 +91,7 @@ class SlcanDecoder:
         flags: flags that the adapter has answered last.
         status_answers: number of these answers so far.
         frames: number of frames so far, of any kind.
-            usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
+        usual_line_bytes: length of a usual frame's line as the adapter sends it, with its CR; that of the shorter
             form until the form is learnt.
         pending_bytes: number of bytes of an unfinished line.
     """

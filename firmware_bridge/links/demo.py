@@ -139,9 +139,11 @@ class DemoLink(SlcanSerialLink):
             raise
 
     def __exit__(self, *exc_info: object) -> None:
-        super().__exit__(*exc_info)
-        if self.emulator is not None:
-            self.emulator.hang_up()
+        try:
+            super().__exit__(*exc_info)
+        finally:
+            if self.emulator is not None:
+                self.emulator.hang_up()
 
     def read(self, timeout_s: float) -> list[Scan]:
         """Return the scans that closed since the last call; raises LinkLostError if the emulator ended too early."""

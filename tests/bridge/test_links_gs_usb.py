@@ -199,6 +199,23 @@ def test_of_two_with_one_serial_number_each_has_its_place():
             assert link.name == f"gs_usb:{place}" and port.adapter.started and not other.adapter.started
 
 
+def test_a_serial_number_that_was_seen_twice_identifies_nothing():
+    known, other = (GsUsbPort(serial_number="AB", sockets=(socket,)) for socket in (2, 3))
+    backend = GsUsbBackend(known)
+    link = GsUsbLink("AB", backend=backend)
+    with link:
+        pass
+    backend.ports.append(other)
+    with link:
+        assert known.adapter.started
+    known.adapter.unplug()
+    with pytest.raises(NoDeviceError, match="surely the one: plug it in where it was, at 1-2"):
+        link.__enter__()
+    known.plug()
+    with link:
+        assert known.adapter.started and not other.adapter.started
+
+
 class Deaf(GsUsbAdapter):
     def request_out(self, number, payload):
         raise libusb_error(TIMEOUT)
