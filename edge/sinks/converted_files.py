@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from edge.errors import SinkError
 from edge.perception.record_fields import FIELDS, MAPS, Field, Out
-from edge.sinks.ros2.messages import IMAGE, RESULT, UNITS, image_map
+from edge.sinks.ros2.map_messages import UNITS, recorded_map
+from edge.sinks.ros2.messages import GRID, IMAGE, RESULT
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.pad_geometry import AXES, SensorGeometry
 from firmware_bridge.poses import PoseTrack, TimedPose
@@ -169,7 +170,7 @@ class _Rows:
             yield self._row
 
     def _topic_of(self, channel: Channel, schema: Schema | None) -> _Topic | None:
-        if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, IMAGE.name):
+        if schema is None or schema.name not in (SCAN_NAME, BASELINE_NAME, RESULT.name, GRID.name, IMAGE.name):
             return None
         sensor, _, name = channel.topic.rpartition("/")
         # Earlier releases wrote maps in their own units, and stated none.
@@ -228,8 +229,8 @@ def _value(field: Field, record: Mapping[str, Any], taps: int) -> Any:
 
 
 def _map(topic: _Topic, data: memoryview) -> NDArray[np.float32]:
-    values = image_map(data) / np.float32(topic.factor)
-    return values.reshape(3, -1, values.shape[-1]) if topic.name == "traction" else values
+    values = recorded_map(topic.kind.name, data) / np.float32(topic.factor)
+    return values.reshape(3, -1, values.shape[-1]) if topic.name == "traction" else values  # rows of an Image
 
 
 def _flat(value: Any) -> list[float | None]:

@@ -26,16 +26,14 @@ from edge.perception.result import Result, mask_bits
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import CountersInTurn, record
+from edge.sinks.ros2.map_messages import UNITS, grid
 from edge.sinks.ros2.messages import (
-    IMAGE,
+    GRID,
     LOG,
     RESULT,
     TF_MESSAGE,
-    UNITS,
     WRENCH_STAMPED,
     frame_of,
-    image,
-    in_si,
     log_message,
     result_message,
     sensor_path,
@@ -344,7 +342,7 @@ class McapSink(Sink):
         to.add_scan(scan, self._origin or result.source, frame, result.baseline, result.baseline_age_s)
         to.add(sensor, "result", RESULT, unix_ns, result_message(result, fields, on_bus_unix_ns))
         for name, values in maps_of(result).items():
-            to.add(sensor, name, IMAGE, unix_ns, image(in_si(name, values), frame, on_bus_unix_ns))
+            to.add(sensor, name, GRID, unix_ns, grid(name, values, frame, on_bus_unix_ns, self._geometry))
         force = wrench(result, self._geometry, on_bus_unix_ns)
         if force is not None:
             to.add(sensor, "wrench", WRENCH_STAMPED, unix_ns, force)

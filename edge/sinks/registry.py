@@ -199,7 +199,7 @@ def open_sink(
             with needs_cyclone_dds(text):
                 from edge.sinks.ros2.sink import Ros2Sink
             topic, accepts = _ros2_topic(target)
-            return Ros2Sink(topic, source, commands if accepts else None)
+            return Ros2Sink(topic, contract, source, commands if accepts else None)
         case _:
             from edge.sinks.status_line import StatusSink
 

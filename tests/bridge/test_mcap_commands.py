@@ -23,7 +23,8 @@ from edge.cli import main as cli
 from edge.doctor.examine import prepare
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import messages as ros_messages
-from edge.sinks.ros2.messages import image_map, in_si
+from edge.sinks.ros2.map_messages import in_si, recorded_map
+from edge.sinks.ros2.messages import GRID
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.recording.scan_messages import decode_scan
 from firmware_bridge.scans.mounting import Mounting
@@ -74,7 +75,10 @@ def patterns(path):
     by_topic = messages_of(path)
     said = {at: ros_messages.RESULT.decode(data) for at, data in by_topic["/finger/result"]}
     made_for = {at: json.loads(one["record"])["reused_from"] is None for at, one in said.items()}
-    return {said[at]["scan"]: (made_for[at], image_map(data).tobytes()) for at, data in by_topic["/finger/pattern"]}
+    return {
+        said[at]["scan"]: (made_for[at], recorded_map(GRID.name, data).tobytes())
+        for at, data in by_topic["/finger/pattern"]
+    }
 
 
 class TestOffline:

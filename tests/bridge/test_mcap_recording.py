@@ -1,6 +1,5 @@
 """Recordings in MCAP: read by public packages, played again bit for bit, whole whatever ended their writer."""
 
-import ast
 import json
 import threading
 import time
@@ -36,7 +35,8 @@ from edge.sinks import mcap
 from edge.sinks.mcap import CHUNK_S, McapSink
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import messages as ros_messages
-from edge.sinks.ros2.messages import RESULT, image_map, in_si
+from edge.sinks.ros2.map_messages import in_si, recorded_map
+from edge.sinks.ros2.messages import GRID
 from firmware_bridge.errors import RecordingError
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.pad_geometry import SensorGeometry
@@ -83,7 +83,7 @@ class TestSink:
                 for (_, data), one in zip(by_topic[f"{topic}/scan"], own, strict=True)
             )
             for name in ("pattern", "deviation"):
-                maps = [image_map(data).tobytes() for _, data in by_topic[f"{topic}/{name}"]]
+                maps = [recorded_map(GRID.name, data).tobytes() for _, data in by_topic[f"{topic}/{name}"]]
                 made = [in_si(name, getattr(one, name)).tobytes() for one in own if one.pattern is not None]
                 assert maps == made != []
             said = [json.loads(ros_messages.RESULT.decode(data)["record"]) for _, data in by_topic[f"{topic}/result"]]
@@ -230,15 +230,19 @@ def test_public_readers_find_units_frames_and_marks(tmp_path):
     assert units == ["m", "m", None]
     for what in ("scan", "result", "pattern", "deviation", "baseline"):
         for sensor in ("4", "left/6"):
-            header = messages[f"/{'s4' if sensor == '4' else 'left/s6'}/{what}"].header
-            assert header.frame_id == f"emulated/{sensor}", "a scan of no sensor that is not marked"
+            message = messages[f"/{'s4' if sensor == '4' else 'left/s6'}/{what}"]
+            frame = message.frame_id if what in ("pattern", "deviation") else message.header.frame_id
+            assert frame == f"emulated/{sensor}", "a scan of no sensor that is not marked"
     (transform,) = messages["/tf_static"].transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("tool0", "emulated/4")
     assert transform.transform.translation.z == 0.0505 and transform.transform.rotation.w == 1
     newest = [one for one in results if one.scan.sensor == "4" and one.pattern is not None][-1]
     pattern = messages["/s4/pattern"]
     assert np.frombuffer(bytes(pattern.data), "<f4").max() == np.float32(newest.pattern.max()) * np.float32(1e-3)
-    stamp_ns = pattern.header.stamp.sec * 10**9 + pattern.header.stamp.nanosec
+    rows, pitch_m = len(pattern.data) // pattern.row_stride, pattern.cell_size.x
+    assert rows * pitch_m == pattern.column_count * pitch_m == pytest.approx(4 * 4.7e-3), "on the whole face, in metres"
+    assert pattern.pose.position.x == pattern.pose.position.y == pytest.approx(-2 * 4.7e-3), "about its middle"
+    stamp_ns = pattern.timestamp.sec * 10**9 + pattern.timestamp.nanosec
     assert stamp_ns == newest.scan.time_ns - 2_000_000 + OFFSET_NS, "of arrival, though the device states a time"
 
 
@@ -258,24 +262,18 @@ def test_the_layout_for_foxglove_shows_what_a_recording_holds(tmp_path):
         return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
 
     assert sorted(leaves(layout["layout"])) == sorted(panels), "a panel that is not there, or not shown"
-    images = [panel["imageMode"] for panel in panels.values() if "imageMode" in panel]
-    assert {one["imageTopic"] for one in images} == {"/s4/pattern", "/s4/deviation"}
-    assert all(one["imageTopic"] in recorded and one["maxValue"] < 1e-3 for one in images), "in metres"
+    maps = {topic: shown for panel in panels.values() for topic, shown in panel.get("topics", {}).items()}
+    assert maps.pop("/s4/points"), "live, over the bridge of ROS 2"
+    assert maps.keys() == {"/s4/pattern", "/s4/deviation"}
+    for topic, shown in maps.items():
+        assert [field.name for field in recorded[topic][0].fields] == [shown["colorField"]]
+        assert shown["maxValue"] < 1e-3, "in metres"
     paths = [line["value"] for panel in panels.values() for line in panel.get("paths", ())]
     assert len(paths) == 7
     for path in paths:
         topic, *fields = path.split(".")
         assert isinstance(reduce(getattr, fields, recorded[topic][0]), float), path
     assert panels["RosOut!events"]["topicToRender"] in recorded and "/tf_static" in recorded
-
-
-def test_the_layout_for_rerun_plots_numbers_that_a_result_has():
-    """Rerun itself, of 170 MB, is not installed for the tests."""
-    tree = ast.parse((ROOT / "examples/viewers/rerun_view.py").read_text())
-    assigned = {one.targets[0].id: one.value for one in tree.body if isinstance(one, ast.Assign)}
-    plots = ast.literal_eval(assigned["PLOTS"])
-    assert ast.literal_eval(assigned["RESULT"]) == RESULT.name
-    assert {number for numbers in plots.values() for number in numbers} <= {field.name for field in RESULT.fields}
 
 
 # Recordings that a tool has copied in part: messages alone, some of their topics, or those from some time on.

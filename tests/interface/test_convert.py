@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import fake_source, make_scan
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_samples import SURE, TURNED, arrays_of, make_results, odd_scans, record_into, same_scan
 
 from edge.api import PadPose, Result, Scan, TimedPose
 from edge.cli import main as cli
 from edge.perception.record_fields import MAPS
 from edge.sinks.registry import open_sink
+from edge.sinks.ros2.map_messages import image, recorded_map
+from edge.sinks.ros2.messages import GRID, IMAGE
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
 
@@ -78,6 +82,30 @@ def test_arrays_hold_every_scan_with_its_result_maps_baseline_and_poses(made):
                 assert not rows[field.name][row].any()
     assert set(arrays["origin"]) == {"emulated"} and arrays["pose_sensor"].tolist() == ["4"] * 6
     assert arrays["pose"][1].tolist() == [4.0, -4 / 3, 40.0, 0.4, 0.5]
+
+
+def test_maps_that_an_earlier_release_recorded_as_images_are_converted_alike(made, tmp_path):
+    path, _ = made
+    with path.open("rb") as file, (tmp_path / "old.mcap").open("wb") as old:
+        writer = Writer(old)
+        writer.start("ros2")
+        reader = make_reader(file)
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        known = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            kind, definition, data = schema.name, schema.data, message.data
+            if kind == GRID.name:
+                data = image(recorded_map(kind, data), "emulated/4", message.log_time)
+                kind, definition = IMAGE.name, IMAGE.definition.encode()
+            if channel.topic not in known:
+                number = writer.register_schema(kind, "ros2msg", definition)
+                known[channel.topic] = writer.register_channel(channel.topic, "cdr", number, channel.metadata)
+            writer.add_message(known[channel.topic], message.log_time, data, message.publish_time)
+        writer.finish()
+    new, old = (arrays_of(one) for one in (path, tmp_path / "old.mcap"))
+    assert new.keys() == old.keys() and new["pattern"].any() and new["deviation"].any()
+    assert all((new[field.name] == old[field.name]).all() for field in MAPS if field.name in new)
 
 
 def test_scans_poses_mountings_and_baselines_survive_the_way_there_and_back(made, tmp_path):

@@ -14,7 +14,7 @@ pytest.importorskip("cyclonedds", reason="of the extra `ros2`")
 
 from edge_samples import fake_source, make_contract, make_wrench_result, wait_for
 
-from edge.api import Command, Commands, Event
+from edge.api import Command, Commands, Event, patches
 from edge.sinks.registry import open_sink
 from edge.sinks.ros2 import dds_domain as ros2_domain
 from edge.sinks.ros2 import messages as ros_messages
@@ -31,6 +31,7 @@ TOPICS = {
     "skin/s4/pattern": IMAGE,
     "skin/s4/deviation": IMAGE,
     "skin/s4/points": CLOUD,
+    "skin/s4/contacts": CLOUD,
     "skin/s4/wrench": WRENCH,
     "skin/s4/state": STRING,
     "skin/s4/trusted": "std_msgs/msg/Int8",
@@ -97,6 +98,8 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
             assert (pixels(image).reshape(3, 4, 4) == counts).all()
         for cloud in listener.of("skin/s4/points"):
             check_points(cloud, talker.wrote["4", stamp_ns(cloud)])
+        for cloud in listener.of("skin/s4/contacts"):
+            check_contacts(cloud, talker.wrote["4", stamp_ns(cloud)])
         for message in listener.of("skin/s4/wrench"):
             force, torque = message["wrench"]["force"], message["wrench"]["torque"]
             assert force == {"x": 0.25, "y": -0.5, "z": 2.0}
@@ -126,6 +129,7 @@ def test_subscribers_get_patterns_bit_for_bit_and_hear_when_they_hold_no_more(si
         assert not pixels(zeros).any() and np.isnan(pixels(unknown)).all()
         listener.until(lambda: np.isnan(pixels(listener.of("skin/s4/deviation")[-1])).all())
         listener.until(lambda: listener.of("skin/s4/points")[-1]["width"] == 0)
+        listener.until(lambda: listener.of("skin/s4/contacts")[-1]["width"] == 0)
         listener.until(lambda: listener.of("skin/s4/state")[-1]["data"] == "lost")
         listener.until(lambda: math.isnan(listener.of("skin/s4/area_m2")[-1]["data"]))
         listener.until(lambda: listener.of("skin/s4/trusted")[-1]["data"] == -1)
@@ -160,6 +164,20 @@ def check_points(cloud, result):
         return
     sums = [points[axis].astype(np.float64).sum() for axis in ("fx", "fy", "fz")]
     np.testing.assert_allclose(sums, result.wrench.force_n, rtol=1e-4, atol=1e-4)
+
+
+def check_contacts(cloud, result):
+    """By the fields that the message names, against those of `edge.api.patches`, in SI units."""
+    names = [field["name"] for field in cloud["fields"]]
+    rows = np.frombuffer(bytes.fromhex(cloud["data"]), [(name, "<f4") for name in names])
+    expected = patches(result, make_contract())
+    assert len(rows) == len(expected) == cloud["width"] > 0
+    for row, one in zip(rows, expected, strict=True):
+        assert [row["x"], row["y"], row["z"]] == pytest.approx([*(place / 1e3 for place in one.centre_mm), 0], rel=1e-5)
+        assert [row["nx"], row["ny"], row["nz"]] == pytest.approx(one.normal, rel=1e-5)
+        assert (row["area"], row["length"]) == pytest.approx((one.area_mm2 / 1e6, one.size_mm[0] / 1e3), rel=1e-5)
+        assert math.degrees(row["long_axis"]) == pytest.approx(one.long_axis_deg, rel=1e-5)
+        assert one.force_n is None and np.isnan([row["fx"], row["fy"], row["fz"]]).all()
 
 
 def test_who_joins_late_stops_or_dies_holds_up_nobody(sink):
@@ -228,7 +246,7 @@ def test_subscribers_get_force_and_torque_of_a_model_with_traction(sink):
 def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back():
     frames = {"left": PadFrame("tool0", (0.0, 12.5, 50.0), (0.0, 1.0, 0.0, 0.0)), "far": PadFrame("base")}
     commands = Commands()
-    sink = Ros2Sink("skin", fake_source(frames=frames), commands, environment=ENVIRONMENT)
+    sink = Ros2Sink("skin", make_contract(), fake_source(frames=frames), commands, environment=ENVIRONMENT)
     for _ in range(2):
         sink.write(contact(1, sensor="left", source="emulated"), {})
     with Listener({"tf_static": FRAMES}) as listener:
@@ -276,7 +294,9 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
     assert fast_dds in ros2_domain.configuration({})
     cyclone_dds = f"<Compatibility>{fast_dds.replace('1.15', '1.16')}</Compatibility>"
     there = f",<CycloneDDS><Domain>{cyclone_dds}</Domain></CycloneDDS>"
-    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there})
+    sink = Ros2Sink(
+        "skin", make_contract(), fake_source("device"), environment=ENVIRONMENT | {"CYCLONEDDS_URI": TAG + there}
+    )
     try:
         talker = Talker(sink)
         with Listener({"skin/s4/pattern": IMAGE}, "signed-bytes", more=there) as listener:
@@ -289,7 +309,7 @@ def test_a_node_that_describes_its_types_in_another_way_is_heard_as_one_of_fast_
 
 def test_a_wrench_ends_with_its_contact_and_is_never_nan():
     published = []
-    sink = Ros2Sink("skin", fake_source("emulated"), environment=ENVIRONMENT)
+    sink = Ros2Sink("skin", make_contract(), fake_source("emulated"), environment=ENVIRONMENT)
     keep_published(sink, published)
 
     def forces():

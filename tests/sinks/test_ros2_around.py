@@ -19,7 +19,7 @@ import numpy as np
 import ros2_messages
 import yaml
 from cyclonedds.idl import IdlStruct, types
-from edge_samples import BASELINE, ROOT, fake_source, make_scan, make_wrench_result
+from edge_samples import BASELINE, ROOT, fake_source, make_contract, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
@@ -29,6 +29,7 @@ from edge.api import Event, Note, Result, SinkError, UsageError
 from edge.cli.main import parser
 from edge.sinks.json_records import record
 from edge.sinks.registry import check_sink
+from edge.sinks.ros2 import map_messages
 from edge.sinks.ros2 import messages as ros_messages
 from edge.sinks.ros2.dds_domain import TYPE_HASHES, dds_type
 from edge.sinks.ros2.diagnostics import ERROR, OK, STALE, WARN
@@ -55,7 +56,7 @@ DAYS_NS = 3 * 86_400 * 10**9
 
 def test_diagnostics_come_once_a_second_and_tell_of_silence_and_its_reason():
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
+    sink = Ros2Sink("skin", make_contract(), fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
     keep_published(sink, published)
     idle = Result(make_scan(1), "device", "m", "idle", contact=False, baseline=BASELINE, baseline_age_s=3.0)
 
@@ -97,7 +98,9 @@ def test_what_is_not_of_now_has_the_times_of_its_recording():
     """Recorded on a machine that was up for three days more than this one."""
     recorded_ns, offset_ns = time.monotonic_ns() + DAYS_NS, 1_600_000_000 * 10**9
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", fake_source(unix_offset_ns=offset_ns), environment=ENVIRONMENT, clock_ns=clock)
+    sink = Ros2Sink(
+        "skin", make_contract(), fake_source(unix_offset_ns=offset_ns), environment=ENVIRONMENT, clock_ns=clock
+    )
     clock.now_ns += 60 * 10**9
     keep_published(sink, published)
     result = contact(1, source="replay", force_n=1.0)
@@ -109,7 +112,14 @@ def test_what_is_not_of_now_has_the_times_of_its_recording():
 
 def test_stamps_of_now_are_wall_time_by_the_clock_at_the_start():
     clock, published, began_ns = Clock(), [], 1_700_000_000_123_456_789
-    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock, unix_ns=lambda: began_ns)
+    sink = Ros2Sink(
+        "skin",
+        make_contract(),
+        fake_source("device"),
+        environment=ENVIRONMENT,
+        clock_ns=clock,
+        unix_ns=lambda: began_ns,
+    )
     keep_published(sink, published)
     result = contact(1)
     sink.write(replace(result, scan=replace(result.scan, time_ns=clock.now_ns + 5_000_000_000)), {})
@@ -120,7 +130,7 @@ def test_stamps_of_now_are_wall_time_by_the_clock_at_the_start():
 
 def test_an_outage_of_one_link_takes_nothing_from_the_sensors_of_another():
     clock, published = Clock(), []
-    sink = Ros2Sink("skin", fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
+    sink = Ros2Sink("skin", make_contract(), fake_source("device"), environment=ENVIRONMENT, clock_ns=clock)
     for name in ("left/4", "right/4"):
         sink.write(contact(1, sensor=name), {})
     keep_published(sink, published)
@@ -165,7 +175,7 @@ NONSENSE = "<CycloneDDS><Domain><Nonsense/></Domain></CycloneDDS>"
 )
 def test_an_environment_that_ros_would_not_take_is_refused(environment, error, said):
     with pytest.raises(error, match=said):
-        Ros2Sink("skin", fake_source(), environment=environment)
+        Ros2Sink("skin", make_contract(), fake_source(), environment=environment)
 
 
 def test_without_the_package_one_line_says_how_to_get_it():
@@ -254,7 +264,7 @@ def test_messages_are_the_bytes_that_cyclonedds_makes_of_the_same_values(sink):
 
 
 def test_a_taxel_that_gave_no_reading_is_not_a_number_of_counts():
-    image = ros_messages.image(ros_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
+    image = map_messages.image(map_messages.taxels(make_scan(absent=(6,))), "4", UNIX_NS)
     values = np.frombuffer(bytes(ros2_messages.decode("sensor_msgs/msg/Image", image)["data"]), "<f4")
     assert np.isnan(values.reshape(3, 16)[:, 6]).all() and np.isnan(values).sum() == 3
 
@@ -263,9 +273,9 @@ UNIX_NS = 1_700_000_000_123_456_789
 
 
 def test_another_image_is_not_taken_for_a_map():
-    said = ros_messages.IMAGE.decode(ros_messages.image(np.zeros((2, 2), np.float32), "4", 0))
+    said = ros_messages.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
-        ros_messages.image_map(ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+        map_messages.recorded_map(ros_messages.IMAGE.name, ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():

@@ -22,9 +22,18 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
+FOXGLOVE = {  # as https://docs.ros.org/en/api/foxglove_msgs/html/msg/Grid.html states them
+    "Vector2": "float64 x\nfloat64 y",
+    "PackedElementField": "string name\nuint32 offset\nuint8 type",
+    "Grid": "builtin_interfaces/Time timestamp\nstring frame_id\ngeometry_msgs/Pose pose\nuint32 column_count\n"
+    "foxglove_msgs/Vector2 cell_size\nuint32 row_stride\nuint32 cell_stride\n"
+    "foxglove_msgs/PackedElementField[] fields\nuint8[] data",
+}
+for _name, _text in FOXGLOVE.items():
+    ROS.register(get_types_from_msg(_text, f"foxglove_msgs/msg/{_name}"))
 IDL = {
     "int8": int8,
     "int32": int32,

@@ -19,7 +19,7 @@ import ros2_messages
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
-from edge_samples import ROOT, fake_source, make_scan
+from edge_samples import ROOT, fake_source, make_contract, make_scan
 
 from edge.perception.result import Result
 from edge.sinks.ros2 import dds_domain as ros2_domain
@@ -137,7 +137,7 @@ class Speaker:
 
 @pytest.fixture
 def sink():
-    made = Ros2Sink("/skin", fake_source("device"), environment=ENVIRONMENT)
+    made = Ros2Sink("/skin", make_contract(), fake_source("device"), environment=ENVIRONMENT)
     yield made
     if hasattr(made, "_domain"):
         made.close()

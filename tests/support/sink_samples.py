@@ -18,7 +18,8 @@ from edge.perception.result import Result
 from edge.perception.runtime import Runtime
 from edge.pipeline.sink import Sink
 from edge.sinks.registry import open_sink
-from edge.sinks.ros2.messages import LOG, RESULT, image_map
+from edge.sinks.ros2.map_messages import recorded_map
+from edge.sinks.ros2.messages import GRID, LOG, RESULT
 
 RUN = {"dropped": 2, "overruns": 1, "torn_wire": 3, "torn_source": 4}
 CONTRACT = make_contract(interval_factor=1.6)
@@ -147,7 +148,7 @@ class Mcap(Opened):
         by_topic = messages_of(self.path)
         found = []
         for sensor in SENSORS:
-            patterns = {at: image_map(data) * 1e3 for at, data in by_topic[f"/s{sensor}/pattern"]}
+            patterns = {at: recorded_map(GRID.name, data) * 1e3 for at, data in by_topic[f"/s{sensor}/pattern"]}
             for at, data in by_topic[f"/s{sensor}/result"]:
                 found.append(of_record(json.loads(RESULT.decode(data)["record"]), patterns.get(at)))
         return sorted(found, key=lambda one: one.scan or 0)
@@ -232,7 +233,7 @@ class Ros2(Opened):
 
         from edge.sinks.ros2.sink import Ros2Sink
 
-        self.sink = Ros2Sink("/skin", fake_source("device"), environment=ENVIRONMENT)
+        self.sink = Ros2Sink("/skin", CONTRACT, fake_source("device"), environment=ENVIRONMENT)
         self._kept: list[Any] = []
         self._found: list[Back] = []
         self._events: list[tuple[str, str]] = []

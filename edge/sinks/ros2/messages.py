@@ -6,12 +6,10 @@ Lengths are in metres, as ROS has them. A value that is not available is NaN, or
 import math
 import re
 from collections.abc import Mapping
-from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from edge.errors import SinkError, UsageError
 from edge.perception.event import Event, EventKind
@@ -19,7 +17,6 @@ from edge.perception.record_fields import FIELDS, Columns, Out
 from edge.perception.result import Result
 from firmware_bridge.pad_geometry import SensorGeometry
 from firmware_bridge.recording.cdr import STD_HEADER, TIME, MessageType, stamp
-from firmware_bridge.scans.scan import ABSENT, Scan
 from firmware_bridge.sensor_file.model import PadFrame
 
 _TYPE_FIELDS: Final = {
@@ -40,6 +37,11 @@ _TYPE_FIELDS: Final = {
     "geometry_msgs/PointStamped": "std_msgs/Header header, geometry_msgs/Point point",
     "geometry_msgs/Quaternion": "float64 x, float64 y, float64 z, float64 w",
     "geometry_msgs/Pose": "geometry_msgs/Point position, geometry_msgs/Quaternion orientation",
+    "foxglove_msgs/Vector2": "float64 x, float64 y",
+    "foxglove_msgs/PackedElementField": "string name, uint32 offset, uint8 type",
+    "foxglove_msgs/Grid": "builtin_interfaces/Time timestamp, string frame_id, geometry_msgs/Pose pose, "
+    "uint32 column_count, foxglove_msgs/Vector2 cell_size, uint32 row_stride, uint32 cell_stride, "
+    "foxglove_msgs/PackedElementField[] fields, uint8[] data",
     "geometry_msgs/PoseStamped": "std_msgs/Header header, geometry_msgs/Pose pose",
     "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose, float64[36] covariance",
     "geometry_msgs/PoseWithCovarianceStamped": "std_msgs/Header header, geometry_msgs/PoseWithCovariance pose",
@@ -67,6 +69,7 @@ def _types() -> dict[str, MessageType]:
 
 TYPES: Final = _types()
 IMAGE: Final = TYPES["sensor_msgs/Image"]
+GRID: Final = TYPES["foxglove_msgs/Grid"]
 WRENCH_STAMPED: Final = TYPES["geometry_msgs/WrenchStamped"]
 LOG: Final = TYPES["rcl_interfaces/Log"]
 STRING: Final = TYPES["std_msgs/String"]
@@ -183,122 +186,6 @@ def log_message(event: Event, unix_ns: int) -> bytes:
             "line": 0,
         }
     )
-
-
-_POINT_FIELDS: Final = ("x", "y", "z", "fx", "fy", "fz", "sigma")
-_FLOAT32: Final = 7  # number of float32 in sensor_msgs/PointField
-
-
-class Unit(NamedTuple):
-    """Unit of a map in messages, and the factor to it from the map's own."""
-
-    name: str
-    factor: float
-
-
-UNITS: Final[Mapping[str, Unit]] = {
-    "pattern": Unit("m", 1e-3),
-    "deviation": Unit("m", 1e-3),
-    "traction": Unit("Pa", 1e3),
-}
-
-
-def in_si(name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the map of this name in its unit of UNITS."""
-    return values * np.float32(UNITS[name].factor)
-
-
-def image(values: NDArray[np.float32], frame: str, unix_ns: int) -> bytes:
-    """Return a map (H, W) as an Image of encoding 32FC1, x to the right and y down.
-
-    A map (3, H, W) of vectors becomes one of 3 H rows: x, below it y, below it z.
-    """
-    pixels = np.ascontiguousarray(values.reshape(-1, values.shape[-1]), dtype="<f4")
-    height, width = pixels.shape
-    return IMAGE.encode(
-        {
-            "header": header(frame, unix_ns),
-            "height": height,
-            "width": width,
-            "encoding": "32FC1",
-            "is_bigendian": 0,
-            "step": 4 * width,
-            "data": pixels.view(np.uint8),
-        }
-    )
-
-
-def image_map(data: bytes | memoryview) -> NDArray[np.float32]:
-    """Return the map (H, W) in an Image that `image` made, or (3, H, W) of an earlier release's traction.
-
-    Raises a CdrError where it is no Image, a ValueError where that is of another encoding or byte order.
-    """
-    image = IMAGE.decode(data)
-    if image["encoding"] not in ("32FC1", "32FC3") or image["is_bigendian"]:
-        raise ValueError(f"an image of encoding {image['encoding'][:20]!r}, expected 32FC1, little-endian")
-    values = image["data"].view("<f4").reshape(image["height"], image["width"], -1)
-    return values[..., 0] if image["encoding"] == "32FC1" else values.transpose(2, 0, 1)
-
-
-def taxels(scan: Scan) -> NDArray[np.float32]:
-    """Return the raw counts (3, rows, cols) of a scan, NaN where a taxel gave no reading."""
-    counts = scan.counts.astype(np.float32)
-    counts[scan.counts == ABSENT] = np.nan
-    return counts
-
-
-def points(result: Result, geometry: SensorGeometry, frame: str, unix_ns: int) -> bytes:
-    """Return a pattern as a cloud of a point per pixel; without a pattern, an empty cloud.
-
-    The fields are float32: x and y on the pad's face and z into it, in [m]; the force on the pixel fx, fy, fz in [N]
-    and the standard deviation sigma of z in [m], NaN where the model gives none.
-    """
-    cloud = np.empty((0, 0, len(_POINT_FIELDS)), dtype="<f4")
-    if result.pattern is not None:
-        height, width = result.pattern.shape
-        cloud = np.full((height, width, len(_POINT_FIELDS)), np.nan, dtype="<f4")
-        cloud[..., :2] = _pixel_places_m(height, width, geometry)
-        cloud[..., 2] = in_si("pattern", result.pattern)
-        if result.traction is not None:
-            cloud[..., 3:6] = _pixel_forces_n(result.traction, height, width, geometry)
-        if result.deviation is not None:
-            cloud[..., 6] = in_si("deviation", result.deviation)
-    height, width, numbers = cloud.shape
-    return POINT_CLOUD.encode(
-        {
-            "header": header(frame, unix_ns),
-            "height": height,
-            "width": width,
-            "fields": [
-                {"name": name, "offset": 4 * index, "datatype": _FLOAT32, "count": 1}
-                for index, name in enumerate(_POINT_FIELDS)
-            ],
-            "is_bigendian": False,
-            "point_step": 4 * numbers,
-            "row_step": 4 * numbers * width,
-            "data": cloud.view(np.uint8),
-            "is_dense": bool(np.isfinite(cloud).all()),
-        }
-    )
-
-
-@lru_cache(maxsize=8)
-def _pixel_places_m(height: int, width: int, geometry: SensorGeometry) -> NDArray[np.float32]:
-    """Return x and y of the pixels (H, W, 2) from the middle of the face, in [m]."""
-    pitch_m = geometry.pixel_pitch_mm(height // geometry.rows) / 1e3
-    y, x = np.indices((height, width), dtype=np.float32)
-    return np.stack([x - (width - 1) / 2, y - (height - 1) / 2], axis=2) * np.float32(pitch_m)
-
-
-def _pixel_forces_n(
-    traction_kpa: NDArray[np.float32], height: int, width: int, geometry: SensorGeometry
-) -> NDArray[np.float32]:
-    """Return the force on each pixel (H, W, 3) of a traction (3, h, w) over the same face."""
-    _, rows, cols = traction_kpa.shape
-    pixel_m2 = (geometry.pixel_pitch_mm(height // geometry.rows) / 1e3) ** 2
-    at_rows, at_cols = np.arange(height) * rows // height, np.arange(width) * cols // width
-    forces = traction_kpa * np.float32(UNITS["traction"].factor * pixel_m2)
-    return forces[:, at_rows][:, :, at_cols].transpose(1, 2, 0)
 
 
 LONGEST_TOPIC: Final = 247  # limit of ROS; DDS takes 255, some of which are for prefixes

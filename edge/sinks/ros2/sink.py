@@ -14,7 +14,9 @@ from cyclonedds.core import DDSException
 from cyclonedds.pub import DataWriter
 
 from edge.errors import SinkError
+from edge.inference.contract import Contract
 from edge.perception.event import Event
+from edge.perception.patches import patches
 from edge.perception.result import Result
 from edge.pipeline.commands import Command, Commands, runtime_command
 from edge.pipeline.scan_reader import Source
@@ -22,6 +24,7 @@ from edge.pipeline.sink import Sink
 from edge.sinks.json_records import event_record
 from edge.sinks.ros2.dds_domain import join, reader, taken, writer
 from edge.sinks.ros2.diagnostics import OUTAGES, Diagnostics
+from edge.sinks.ros2.map_messages import contacts, image, in_si, points, taxels
 from edge.sinks.ros2.messages import (
     DIAGNOSTIC_ARRAY,
     FLOAT64,
@@ -35,11 +38,7 @@ from edge.sinks.ros2.messages import (
     base_topic,
     frame_of,
     header,
-    image,
-    in_si,
-    points,
     sensor_topic,
-    taxels,
     transforms,
     wrench,
     wrench_message,
@@ -79,6 +78,7 @@ class Ros2Sink(Sink):
     def __init__(
         self,
         topic: str,
+        contract: Contract,
         source: Source,
         commands: Commands | None = None,
         *,
@@ -91,6 +91,7 @@ class Ros2Sink(Sink):
         `clock_ns` is the clock of scans of now; wall time is read once, because the clock may be set during the run.
         """
         self._base, self._source, self._clock_ns = base_topic(topic), source.kind, clock_ns
+        self._contract = contract
         self._geometry, self._frames = source.sensor_file.geometry, source.sensor_file.frames
         offset_ns = source.unix_offset_ns
         self._of_now = offset_ns is None
@@ -207,6 +208,8 @@ class Ros2Sink(Sink):
             message = {"header": header(frame, unix_ns), "point": {"x": x, "y": y, "z": 0.0}}
             self._publish_to(sensor, "centroid", POINT_STAMPED, lambda: POINT_STAMPED.encode(message))
         self._publish_to(sensor, "points", POINT_CLOUD, lambda: points(result, self._geometry, frame, unix_ns))
+        found = partial(patches, result, self._contract)  # as long as the pattern takes: only for a subscriber
+        self._publish_to(sensor, "contacts", POINT_CLOUD, lambda: contacts(found(), frame, unix_ns))
 
     def _clear(self, sensor: _Sensor, unix_ns: int, pattern_value: float) -> None:
         """Publish once, where there were maps, that they no longer hold: zeros, or NaN where nothing is known.
@@ -226,6 +229,7 @@ class Ros2Sink(Sink):
         sensor.shown.clear()
         empty = partial(points, replace(sensor.last, pattern=None), self._geometry, sensor.frame, unix_ns)
         self._publish_to(sensor, "points", POINT_CLOUD, empty)
+        self._publish_to(sensor, "contacts", POINT_CLOUD, partial(contacts, (), sensor.frame, unix_ns))
 
     def _clear_of_all(self, sensor: _Sensor, time_ns: int, why: str) -> None:
         self._clear(sensor, time_ns + self.unix_offset_ns, np.nan)
