@@ -149,7 +149,7 @@ def record(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     finally:
         if path.exists():
             size_mb = path.stat().st_size / 1e6
-            emulated = ", EMULATED" if statistics.source == "emulated" else ""
+            emulated = ", EMULATED" if "emulated" in (statistics.source, statistics.origin) else ""
             sure = sys.exception() is None and not statistics.unwritten  # else a sink has reported what it lacks
             held = f"{'' if sure else 'at most '}{statistics.scans} scans, {statistics.duration_s():.1f} s"
             with suppress(OSError):  # the terminal may have gone
@@ -260,6 +260,7 @@ def run(
                 from edge.api import open_poses
 
                 closing.callback(open_poses(text, commands.poses).close)
+            statistics.origin = source.origin
             pump(source, runtime, sinks, statistics, stop=stop, duration_s=options.duration_s, commands=commands)
         # To end before the first scan was due, or before anybody looked at the page, is no fault of the sensor.
         unseen = looked_at is not None and not looked_at.is_set()
@@ -297,6 +298,7 @@ def _summary(statistics: Statistics, source: Source) -> Iterator[None]:
     finally:
         if statistics.scans or sys.exception() is None:
             name = source.name if source.kind == "device" else f"{source.kind.upper()} {source.name}"
+            name += " (EMULATED)" * (source.origin == "emulated")
             with contextlib.suppress(OSError):  # the terminal may have gone, which must not spoil a clean end
                 print(statistics.summary(source=name, wanted_rate_hz=source.rate_hz), file=sys.stderr)
                 received = ", ".join(f"{name} {count}" for name, count in source.counters().items() if count)

@@ -68,6 +68,7 @@ class Statistics:
     """Statistics of a run, for its summary; there is a result for every scan."""
 
     source: str = ""  # kind of source of the last scan; empty before the first
+    origin: str | None = None  # kind of source that a recording is of, where it states one
     scans: int = 0
     patterns: int = 0
     reused: int = 0  # results with the last pattern, since nothing had changed

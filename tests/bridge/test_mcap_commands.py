@@ -145,7 +145,16 @@ class TestRecord:
         assert cli.main(["record", f"{tmp_path}/run.1", *source_of(made, 2000)]) == 0
         assert len(load_recording(tmp_path / "run.1.mcap").tracks[0].counts) == 160
         said = capsys.readouterr().err.splitlines()[-1]
-        assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said
+        assert f"recorded {tmp_path}/run.1.mcap: 160 scans, 0.1 s, " in said and "EMULATED" not in said
+
+    def test_a_copy_of_what_is_emulated_is_called_so_in_its_summary(self, made, tmp_path, capsys):
+        scans = [make_scan(number, noise=3) for number in range(5)]
+        path = record_into(tmp_path / "first.mcap", make_results(scans, source="emulated"))
+        model = ["--model", f"{made}/tiny.onnx"]
+        assert cli.main(["record", f"{tmp_path}/again.mcap", *model, "--source", f"replay:{path}"]) == 0
+        said = capsys.readouterr().err.splitlines()
+        assert any(line.startswith("REPLAY ") and "(EMULATED): 5 scans" in line for line in said)
+        assert said[-1].endswith(", EMULATED") and load_recording(tmp_path / "again.mcap").origin == "emulated"
 
     @pytest.mark.parametrize(
         ("name", "code", "words"),
