@@ -114,7 +114,9 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     entry = file.sensors[name]
     pad = entry.used_pad or Pad()
     if entry.counts_per_newton is not None and pad.counts_per_newton is None:
-        pad = replace(pad, counts_per_newton=entry.counts_per_newton)
+        ends = entry.counts_per_newton_interval
+        intervals = dict(pad.intervals) | ({} if ends is None else {"counts_per_newton": ends})
+        pad = replace(pad, counts_per_newton=entry.counts_per_newton, intervals=intervals)
     ranges = dict(RANGES)
     for constant, value in pad.constants.items():
         apart = _FIFTH * (RANGES[constant][1] - RANGES[constant][0]) / 2

@@ -20,7 +20,7 @@ import numpy as np
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
 from edge.doctor.grip import ASK as GRIP
 from edge.doctor.grip import Grip
-from edge.doctor.guided_press import PATIENCE_S, GuidedPress, judge_force, judge_press
+from edge.doctor.guided_press import PARTLY_ERROR, PATIENCE_S, GuidedPress, Weighed, judge_force, judge_press
 from edge.doctor.rehearsal import WATCHED_S, Rehearsal
 from edge.doctor.taxel_checks import Finding, Verdict
 from edge.errors import UsageError
@@ -56,7 +56,7 @@ def _stdin_is_terminal() -> bool:
 class Visit:
     """Visit to the sensors of one link: what is asked of a person, and what that gives.
 
-    `mountings` are corrections of the mountings, and `newtons` the counts per newton of those that were weighed, by
+    `mountings` are corrections of the mountings, and `weighed` the counts per newton of those that were weighed, by
     sensor; `unfinished` is true when a measurement was asked of a person, and not made.
     """
 
@@ -71,7 +71,7 @@ class Visit:
     ) -> None:
         """Prepare the visit; requests to a person, or to a `rehearsal`, go to `err`."""
         self.mountings: dict[str, Mounting] = {}
-        self.newtons: dict[str, float] = {}
+        self.weighed: dict[str, Weighed] = {}
         self.unfinished = False
         self._options, self._reader, self._known = options, reader, known
         self._link = reader.link
@@ -110,11 +110,11 @@ class Visit:
         self._lead(guide, name, examined, whose)
         findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)
         if weight_g is not None:
-            findings.append(judge_force(guide.counts_per_newton, kept=self._options.out is not None))
+            findings.append(judge_force(guide.weighed, kept=self._options.out is not None))
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
-        if guide.counts_per_newton is not None:
-            self.newtons[name] = guide.counts_per_newton
+        if guide.weighed is not None:
+            self.weighed[name] = guide.weighed
         if found is not None:
             self.mountings[name] = found
 
@@ -133,8 +133,11 @@ class Visit:
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
             if enter_pressed():
                 return
-        examined.findings.extend(grip.judge({**self._known.counts_per_newton, **self.newtons}))
-        self.newtons.update(grip.counts_per_newton)
+        errors = self._known.scale_errors
+        before = self._known.counts_per_newton.items()
+        known = {name: Weighed(value, errors.get(name, PARTLY_ERROR)) for name, value in before}
+        examined.findings.extend(grip.judge(known | self.weighed))
+        self.weighed.update(grip.weighed)
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
@@ -241,7 +244,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         if options.out is not None and failed is None and whole:
             free = {name: one for name, one in examined.baselines.items() if name not in examined.loaded}
             try:
-                keep(options.out, known, watched.facts.port, free, visit.mountings, visit.newtons, emulated=emulated)
+                keep(options.out, known, watched.facts.port, free, visit.mountings, visit.weighed, emulated=emulated)
                 kept = True
             except SensorFileError as error:
                 failed = error
@@ -310,7 +313,7 @@ def keep(
     port: str | None,
     baselines: Mapping[str, Baseline],
     found: Mapping[str, Mounting],
-    counts_per_newton: Mapping[str, float],
+    weighed: Mapping[str, Weighed],
     *,
     emulated: bool = False,
 ) -> SensorFile:
@@ -324,16 +327,19 @@ def keep(
         if path.exists():  # a run may have learned gains meanwhile
             for name, entry in load_sensor_file(path).sensors.items():
                 entries[name] = replace(entries.get(name, entry), learned=entry.learned)
-        for name in sorted({*baselines, *found, *counts_per_newton}):
+        for name in sorted({*baselines, *found, *weighed}):
             entry = entries.get(name, SensorEntry(as_wired, assumed=frozenset({"mounting"})))
-            parts = {"mounting": found, "force": counts_per_newton, "baseline": baselines}
+            parts = {"mounting": found, "force": weighed, "baseline": baselines}
             renewed = frozenset(part for part, of_sensors in parts.items() if name in of_sensors)
             turned = found.get(name, as_wired)
             baseline = baselines.get(name, entry.baseline)
             if baseline is not None and turned.moves_taxels:
                 counts = baseline.counts.reshape(3, -1)[:, list(turned.order)].reshape(baseline.counts.shape)
                 baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
-            per_newton = counts_per_newton.get(name, entry.counts_per_newton)
+            per_newton, interval = entry.counts_per_newton, entry.counts_per_newton_interval
+            if name in weighed:
+                per_newton, error = (round(one, 4) for one in weighed[name])
+                interval = (round(per_newton * (1 - error), 1), round(per_newton * (1 + error), 1))
             pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
             entries[name] = SensorEntry(
                 entry.mounting.then(turned),
@@ -343,6 +349,7 @@ def keep(
                 assumed=entry.assumed - renewed,
                 emulated=entry.emulated | renewed if emulated else entry.emulated - renewed,
                 frame=entry.frame,
+                counts_per_newton_interval=interval,
             )
         # A sensor of a named source is one of several, each with an adapter of its own.
         serial_number = None if port is None or any("/" in name for name in entries) else _serial_number(port)

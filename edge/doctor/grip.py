@@ -1,27 +1,30 @@
 """Check of two pads against each other: a grip presses both alike, so that each is the other's reference."""
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 
+from edge.doctor.guided_press import Weighed
 from edge.doctor.taxel_checks import Finding, judged
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 
 ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
 HELD_SCANS: Final = 100  # scans of each pad in the grip, before its end is waited for
 FREE_SCANS: Final = 20
+GRIP_ERROR: Final = 0.045  # 90 % of the ratio of two pads' summed z; seven real grips scatter by 0.027
 
 
 class Grip:
     """Course of one grip, by the summed z of two pads in counts over their baselines.
 
     Attributes:
-        counts_per_newton: of a pad that was not weighed, by those of its partner; empty before `judge`.
+        weighed: counts per newton of a pad that was not weighed, by those of its partner; empty before `judge`.
     """
 
     def __init__(self, names: tuple[str, str]) -> None:
-        self.counts_per_newton: dict[str, float] = {}
+        self.weighed: dict[str, Weighed] = {}
         self._names = names
         self._z: dict[str, list[tuple[float, float]]] = {name: [] for name in names}  # (time in [s], counts)
 
@@ -39,8 +42,8 @@ class Grip:
                 return False
         return True
 
-    def judge(self, weighed: Mapping[str, float]) -> list[Finding]:
-        """Return the findings; `weighed` holds counts per newton of pads on which a weight was laid, by name."""
+    def judge(self, weighed: Mapping[str, Weighed]) -> list[Finding]:
+        """Return the findings; `weighed` holds what a weight showed of the pads on which one was laid, by name."""
         first, second = self._names
         remedy = "grip something firm with both pads: run the doctor once more"
         unclear = [Finding("grip", "not known", "the pads were not pressed together", "", remedy)]
@@ -60,15 +63,15 @@ class Grip:
             findings.append(judged("zero after a grip", verdict, f"sensor {name}: {rest:.0f} counts", norm, lost))
         ratio = float(here[gripped] @ there[gripped] / (there[gripped] @ there[gripped]))
         if first in weighed and second in weighed:
-            share = ratio * weighed[second] / weighed[first]
+            share = ratio * weighed[second].counts_per_newton / weighed[first].counts_per_newton
             off = "lay the weight on both again: the one that has changed has lost its scale"
             verdict = "ok" if 1 / 1.1 <= share <= 1.1 else "wrong"
             measured = f"sensor {first} reads {share:.2f} of the newtons of sensor {second}"
             return [*findings, judged("scale in a grip", verdict, measured, "alike within 10 %", off)]
-        if first in weighed:
-            self.counts_per_newton = {second: weighed[first] / ratio}
-        elif second in weighed:
-            self.counts_per_newton = {first: weighed[second] * ratio}
+        for name, partner, factor in ((second, first, 1 / ratio), (first, second, ratio)):
+            if partner in weighed:
+                known = weighed[partner]
+                self.weighed = {name: Weighed(known.counts_per_newton * factor, math.hypot(known.error, GRIP_ERROR))}
         measured = f"sensor {first} reads {ratio:.2f} of the counts of sensor {second}"
         # Sensors differ by a quarter either way.
         off = "sensors differ less: lay a weight on each (--weight-g)"

@@ -45,7 +45,7 @@ class Rehearsal(Emulator):
             row, col = np.unravel_index(z.argmax(), z.shape)
             load[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
         elif request.startswith("Lay"):
-            load[2] = self._newtons * _COUNTS_PER_N * _pressed(1.5, 1.5)
+            load[2] = self._newtons * _COUNTS_PER_N / USPA44.taxel_count
         self._next_s, self._next = time.monotonic() + _LATE_S, load
 
     def _scans(self, track: Track) -> Iterator[NDArray[np.int32]]:

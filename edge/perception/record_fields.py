@@ -359,6 +359,9 @@ FIELDS: Final = (
           out=_RECORD_NPZ, byte=76),
     Field("gains_certainty", _REAL, "gains_certainty", "how certain the gains of the sensor's channels are: 1 exact, "
           "0 as uncertain as those of a new sensor; unknown without gains", decimals=3, out=_RECORD_NPZ),
+    Field("scale_error", _REAL, "scale_error", "by what share all newtons of this sensor may be off together: half of "
+          "the 90 % interval of its counts per newton; unknown where these were given without one", decimals=3,
+          out=_RECORD_NPZ),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),
     Field("event", _TEXT, "event", "what happened before this scan: earlier taps forgotten, what came of zeroing "

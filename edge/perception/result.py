@@ -138,6 +138,7 @@ class Result:
     dead: Mapping[int, str] = field(default_factory=dict)
     filled: Filled | None = None
     gains_certainty: float | None = None
+    scale_error: float | None = None
     notes: tuple[Note, ...] = ()
     events: tuple[Event, ...] = ()
 
@@ -265,6 +266,7 @@ class Step:
     drift: Drift | None = None
     dead: Mapping[int, str] = _NONE_DEAD
     gains_certainty: float | None = None
+    scale_error: float | None = None
     notes: tuple[Note, ...] = ()
     events: tuple[Event, ...] = ()
 

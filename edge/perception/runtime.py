@@ -54,6 +54,7 @@ class Settings:
     counts_per_newton: float | Mapping[str, float] | None
     pad: Pad | Mapping[str, Pad] | None
     measured: Mapping[str, Pad] | None
+    scale_errors: Mapping[str, float]
 
 
 class Sensor:
@@ -75,7 +76,9 @@ class Sensor:
         check = None if settings.trust is None else PatternCheck(settings.trust, contract)
         self.events: list[Untimed] = []
         self.last = LastPattern(geometry.scan_shape, every_scan=options.every_scan)
-        self.pad = SensorPad(contract, pad, _of(name, settings.counts_per_newton), check)
+        self.pad = SensorPad(
+            contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_errors)
+        )
         self._name = name
         self._received_ns: int | None = None
         self._checked, self._follows_drift = check is not None, options.follow_drift
@@ -136,7 +139,7 @@ class Sensor:
             step.notes = (*step.notes, *self._doubt.notes)
         elif step.contact and not self._checked:
             step.notes = (*step.notes, UNCHECKED)
-        step.gains_certainty = self.pad.gains_certainty
+        step.gains_certainty, step.scale_error = self.pad.gains_certainty, self.pad.scale_error
         per_newton = self.pad.counts_per_newton
         if per_newton is not None and step.force_counts is not None:
             step.force_n = step.force_counts / per_newton
@@ -205,6 +208,7 @@ class Runtime:
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
+        scale_errors: halves of the 90 % intervals of counts per newton, as a share of them, by name.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
 
@@ -232,6 +236,7 @@ class Runtime:
         mountings: Mapping[str, Mounting] | None = None,
         pad: Pad | Mapping[str, Pad] | None = None,
         measured: Mapping[str, Pad] | None = None,
+        scale_errors: Mapping[str, float] | None = None,
         options: RuntimeOptions = DEFAULTS,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
@@ -263,6 +268,7 @@ class Runtime:
             counts_per_newton=counts_per_newton,
             pad=pad,
             measured=measured,
+            scale_errors=scale_errors or {},
         )
         self._sensors: dict[str, Sensor] = {}
         self._events: list[Untimed] = []

@@ -3,7 +3,8 @@
 Three things are asked of each pattern: do its readings look like those of any contact (a magnet, a wrong id map or axis
 do not), does it explain them, and is the model itself sure of it? Of each earlier tap: does it belong to the contact
 that goes on? What repeats over contacts speaks against the sensor, not the contact. The limits are one for all models,
-so that the same reading gets the same verdict as far as their patterns agree.
+so that the same reading gets the same verdict as far as their patterns agree; those of strange readings and of earlier
+taps travel in the model, from `train.trust`, UNFAMILIAR and FOREIGN.
 """
 
 import math
@@ -240,11 +241,19 @@ class SensorPad:
         counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
         gains_certainty: of these gains; None without.
         wrench_origin: whether the model gets the sensor's counts per newton.
+        scale_error: half of the 90 % interval of its counts per newton, as a share of them: as it was given, else of
+            the sensors that the model was trained for; None where counts per newton were given without.
     """
 
     def __init__(
-        self, contract: Contract, pad: Pad | None, counts_per_newton: float | None, check: PatternCheck | None
+        self,
+        contract: Contract,
+        pad: Pad | None,
+        counts_per_newton: float | None,
+        check: PatternCheck | None,
+        scale_error: float | None = None,
     ) -> None:
+        self._given_error = scale_error
         self.check, self.counts_per_newton, self._contract = check, counts_per_newton, contract
         self.use(pad)
 
@@ -262,5 +271,10 @@ class SensorPad:
             self.check.use_pad(self.row, outside=contract.is_outside(pad))
         self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
         calibrated = pad is not None and pad.counts_per_newton is not None
-        takes = any(name == "counts_per_newton" for name, _, _ in contract.pad_inputs)
-        self.wrench_origin: WrenchOrigin = "calibrated" if calibrated and takes else "nominal"
+        ranges = {name: 0.9 * spread / centre for name, centre, spread in contract.pad_inputs}  # they are even ones
+        of_model = ranges.get("counts_per_newton")
+        self.wrench_origin: WrenchOrigin = "calibrated" if calibrated and of_model is not None else "nominal"
+        self.scale_error = of_model
+        if pad is not None and pad.counts_per_newton is not None:
+            ends = pad.intervals.get("counts_per_newton")
+            self.scale_error = self._given_error if ends is None else (ends[1] - ends[0]) / 2 / pad.counts_per_newton

@@ -70,11 +70,12 @@ def open_recording(
     entries = {
         name: SensorEntry(
             mountings.get(name, Mounting(taxel_count=file.geometry.taxel_count)),
-            known.counts_per_newton.get(name),
+            entry.counts_per_newton,
             baselines.get(name),
             entry.pad,
             entry.learned,
             frame=entry.frame,
+            counts_per_newton_interval=entry.counts_per_newton_interval,
         )
         for name in sorted(sensors)
         for entry in [known.sensors.get(name, SensorEntry())]

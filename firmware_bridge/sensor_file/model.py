@@ -79,6 +79,7 @@ class SensorEntry:
     assumed: frozenset[str] = frozenset()  # those of PARTS that were never measured
     emulated: frozenset[str] = frozenset()  # those of PARTS that were measured on an emulated sensor
     frame: PadFrame | None = None  # place of the pad on the robot, entered by hand
+    counts_per_newton_interval: tuple[float, float] | None = None  # 90 % interval of the counts per newton
 
     @property
     def used_pad(self) -> Pad | None:
@@ -130,6 +131,16 @@ class SensorFile:
     def counts_per_newton(self) -> dict[str, float]:
         """Summed z per [N] by sensor name, where it is available."""
         return self._known("counts_per_newton")
+
+    @property
+    def scale_errors(self) -> dict[str, float]:
+        """Half of the 90 % interval of each sensor's counts per newton, as a share of them, where it is available."""
+        known = {name: one for name, one in self.sensors.items() if one.counts_per_newton is not None}
+        return {
+            name: (ends[1] - ends[0]) / 2 / one.counts_per_newton
+            for name, one in known.items()
+            if (ends := one.counts_per_newton_interval) is not None and one.counts_per_newton is not None
+        }
 
     @property
     def frames(self) -> dict[str, PadFrame]:
@@ -199,6 +210,7 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
         "signs": cells((len(AXES),), _are_signs, "1 or -1 for each of x, y, z"),
         "gains": partial(_gains, geometry),
         "counts_per_newton": between(*PAD_RANGES["counts_per_newton"]),
+        "counts_per_newton_interval": partial(_interval, *PAD_RANGES["counts_per_newton"]),
         **dict.fromkeys(("assumed", "emulated"), _marks),
         **dict.fromkeys(parts, a_table),
     }

@@ -118,6 +118,7 @@ def _tables(entry: SensorEntry, shape: tuple[int, int, int]) -> dict[str, list[s
         *_line("signs", mounting.signs, "of x (to the right), y (down) and z (into the pad), after the swap"),
         *_line("gains", gains[:, 0, 0].tolist() if alike else gains.tolist(), "of x, y and z"),
         *_line("counts_per_newton", entry.counts_per_newton, "of the summed z"),
+        *_line("counts_per_newton_interval", entry.counts_per_newton_interval, "90 %"),
         *_line("assumed", sorted(entry.assumed, key=PARTS.index) or None, "as wired; not measured"),
         *_line("emulated", sorted(entry.emulated, key=PARTS.index) or None, _EMULATED),
     ]

@@ -68,6 +68,7 @@ def sensor_files(draw):
             draw(st.none() | st.integers(0, 9).map(lambda seed, n=name, at=created: baseline(n, seed, at))),
             draw(st.none() | pads()),
             frame=draw(st.none() | frames),
+            counts_per_newton_interval=draw(st.none() | st.just((900.0, 1100.0))),
         )
     return SensorFile(draw(st.sampled_from(OF_16)), draw(st.none() | names), entries)
 
@@ -78,7 +79,7 @@ def test_what_is_written_is_read(tmp_path, written):
     save_sensor_file(tmp_path / "s.toml", written)
     read = load_sensor_file(tmp_path / "s.toml")
     assert (read.model, read.adapter, read.mountings) == (written.model, written.adapter, written.mountings)
-    assert read.counts_per_newton == written.counts_per_newton
+    assert (read.counts_per_newton, read.scale_errors) == (written.counts_per_newton, written.scale_errors)
     assert read.pads == written.pads
     assert {name: one.id for name, one in read.baselines.items()} == {
         name: one.id for name, one in written.baselines.items()

@@ -87,6 +87,7 @@ def test_keys_of_baseline_and_sensor_files(tmp_path):
     constants = {name: low or high for name, (low, high) in PAD_RANGES.items()}
     pad = Pad(**constants, intervals={"thickness_mm": (4, 5)}, gains=(1.0,) * GAINS, gain_half_widths=(0.1,) * GAINS)
     marks = {"assumed": frozenset({"mounting"}), "emulated": frozenset({"force"})}
+    marks |= {"counts_per_newton_interval": (1100.0, 1260.0)}
     sensors = {"4": SensorEntry(Mounting(swap_xy=True), 1180.0, baseline, pad, pad, **marks)}
     save_sensor_file(tmp_path / "sensor.toml", SensorFile(adapter="D30BL366", sensors=sensors))
     document = tomllib.loads((tmp_path / "sensor.toml").read_text())

@@ -40,7 +40,9 @@ class TestLoss:
     @pytest.mark.parametrize(
         "held",
         [
-            SensorEntry(baseline=BASELINE, counts_per_newton=1180.0, **ASSUMED),
+            SensorEntry(
+                baseline=BASELINE, counts_per_newton=1180.0, counts_per_newton_interval=(1100.0, 1260.0), **ASSUMED
+            ),
             SensorEntry(Mounting(swap_xy=True, gains=GAINS), pad=Pad(thickness_mm=4.2), frame=PadFrame("tool0")),
         ],
     )
@@ -52,6 +54,7 @@ class TestLoss:
         assert load_sensor_file(path).sensors.keys() == {"4", "6"}
         now = load_sensor_file(path).sensors["4"]
         assert (now.mounting, now.pad, now.frame) == (held.mounting, held.pad, held.frame)
+        assert now.counts_per_newton_interval == held.counts_per_newton_interval
         assert (now.counts_per_newton, now.baseline is None) == (held.counts_per_newton, held.baseline is None)
         assert load_sensor_file(path.with_name("s.toml.bak")).sensors.keys() == {"4"}
 

@@ -8,7 +8,16 @@ from doctor_samples import finger, visit
 
 from edge.doctor import guided_press
 from edge.doctor.grip import Grip
-from edge.doctor.guided_press import GuidedPress, Press, find_axes, find_order, judge_force, judge_press, orders
+from edge.doctor.guided_press import (
+    GuidedPress,
+    Press,
+    Weighed,
+    find_axes,
+    find_order,
+    judge_force,
+    judge_press,
+    orders,
+)
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
@@ -141,22 +150,29 @@ class TestPerson:
         findings, mounting = judged(guide)
         assert mounting is None and {one.verdict for one in findings.values()} == {"not known"}
 
-    @pytest.mark.parametrize(("z_counts", "verdict"), [(2353.6, "ok"), (200.0, "look")])
-    def test_a_weight_gives_counts_per_newton(self, z_counts, verdict):
-        laid = np.zeros((120, 3, 4, 4))
-        laid[:, 2] = z_counts / 16 + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
+    @pytest.mark.parametrize(
+        ("z_counts", "covers", "error", "verdict"),
+        [(2353.6, True, 0.06, "ok"), (2353.6, False, 0.2, "look"), (200.0, True, 0.06, "look")],
+    )
+    def test_a_weight_gives_counts_per_newton(self, z_counts, covers, error, verdict):
+        """Beside a weight that is smaller than the pad the layer bulges: the taxels there read the other way."""
+        laid, share = np.zeros((120, 3, 4, 4)), np.full((4, 4), 1 / 16)
+        if not covers:
+            share[...] = -0.03
+            share[1:3, 1:3] = (1 + 12 * 0.03) / 4
+        laid[:, 2] = z_counts * share + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
         laid[:20, 2] *= np.linspace(0, 1, 20)[:, None, None]
         script = [*visit(UPRIGHT, False, (1, 1, 1)), *laid, *np.zeros((30, 3, 4, 4))]
         asked, guide = answer_to(script, GuidedPress(weight_g=200.0))
-        assert asked[-2:] == ["Lay 200 g on the middle of the pad, hands off.", "Good. Take it off."]
-        assert guide.counts_per_newton == pytest.approx(z_counts / 1.96133, rel=0.02)
-        assert judge_force(guide.counts_per_newton, kept=False).verdict == verdict
+        assert asked[-2:] == ["Lay 200 g on the pad, flat and covering all of it, hands off.", "Good. Take it off."]
+        assert guide.weighed == pytest.approx((z_counts / 1.96133, error), rel=0.02)
+        assert judge_force(guide.weighed, kept=False).verdict == verdict
 
     def test_an_unsteady_weight_gives_none(self):
         laid = np.zeros((7000, 3, 4, 4))
         laid[:, 2] = (200 + 40 * (np.arange(7000) % 2))[:, None, None]
         _, guide = answer_to([*visit(UPRIGHT, False, (1, 1, 1)), *laid], GuidedPress(weight_g=200.0))
-        assert guide.done and judge_force(guide.counts_per_newton, kept=False).verdict == "not known"
+        assert guide.done and judge_force(guide.weighed, kept=False).verdict == "not known"
 
     def test_a_torn_scan_is_not_taken_for_letting_go(self):
         script = visit(UPRIGHT, False, (1, 1, 1), rest=25)
@@ -166,7 +182,12 @@ class TestPerson:
 
 @pytest.mark.parametrize(
     ("weighed", "found"),
-    [({}, {}), ({"a": 1000.0}, {"b": 1250.0}), ({"b": 1000.0}, {"a": 800.0}), ({"a": 1000.0, "b": 1250.0}, {})],
+    [
+        ({}, {}),
+        ({"a": Weighed(1000.0, 0.06)}, {"b": (1250.0, 0.075)}),
+        ({"b": Weighed(1000.0, 0.0)}, {"a": (800.0, 0.045)}),
+        ({"a": Weighed(1000.0, 0.06), "b": Weighed(1250.0, 0.06)}, {}),
+    ],
 )
 def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, found):
     grip = Grip(("a", "b"))
@@ -175,7 +196,8 @@ def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, found):
         grip.push("a", scan / 100, z)
         grip.push("b", scan / 100 + 0.003, -1.25 * z)
     assert grip.over and {one.verdict for one in grip.judge(weighed)} == {"ok"}
-    assert grip.counts_per_newton == pytest.approx(found, rel=0.01)
+    assert grip.weighed.keys() == found.keys()
+    assert all(one == pytest.approx(found[name], rel=0.01) for name, one in grip.weighed.items())
 
 
 def test_a_grip_of_one_pad_alone_settles_nothing():
