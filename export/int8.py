@@ -6,7 +6,8 @@ the trunk's, and what reads it before the outputs. Those on smaller grids, which
 take a tenth of the time, and no later layer recovers their losses. A network that takes poses also quantises what
 encodes its earlier taps, a third of its time with four taps. Its layers that read logarithms stay in float, for a step
 of their range is a factor; so do those that compare taps: in int8 they made a pattern 2.9 times its largest value too
-large on windows beyond any touch.
+large on windows beyond any touch. The training taps are those that `export.to_onnx --int8` is given: in the Makefile,
+PRESSES.
 """
 
 import contextlib

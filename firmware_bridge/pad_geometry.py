@@ -1,4 +1,7 @@
-"""Geometry of a sensor's taxels. Row-major from the top left; x to the right, y down."""
+"""Geometry of a sensor's taxels. Row-major from the top left; x to the right, y down.
+
+The CAN ids of each are in `firmware_bridge.scans.can_id_maps`.
+"""
 
 from dataclasses import dataclass
 from typing import Final

@@ -200,10 +200,12 @@ def open_sink(
                 from edge.sinks.ros2.sink import Ros2Sink
             topic, accepts = _ros2_topic(target)
             return Ros2Sink(topic, contract, source, commands if accepts else None)
-        case _:
+        case "status":
             from edge.sinks.status_line import StatusSink
 
             return StatusSink()
+        case _:
+            raise AssertionError(f"FORMS has {name}, which nothing opens")
 
 
 def _check_mcap(target: str) -> None:

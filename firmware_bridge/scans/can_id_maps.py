@@ -7,7 +7,8 @@ unused. The unused bytes are not zero. The id of a taxel depends on the controll
     layout A (2018-2019)   id = 0x700 | board << 4 | taxel         speaks only after a trigger
     layout B (early 2020)  id = board << 8 | n, n = 0..31          two sensors a board; trigger
 
-A sensor's label does not show its map; with the wrong one, half of the taxels stay silent.
+A sensor's label does not show its map; with the wrong one, half of the taxels stay silent. The grids of pads are in
+`firmware_bridge.pad_geometry`.
 """
 
 from collections.abc import Mapping

@@ -1,1 +1,1 @@
-"""The networks, one file each: windows of taps in, patterns in [mm] out; `registry` says which ones ship."""
+"""The networks, one file each: windows of taps in, patterns in [mm] out; `named_networks` has those that ship."""
