@@ -11,14 +11,7 @@ from edge.inference.bundled import DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
-from train.data.real_grips import (
-    has_hole,
-    play,
-    recorded_grips,
-    recorded_sets,
-    share_touched,
-    unevenness,
-)
+from train.data.real_grips import has_hole, play, recorded_grips, recorded_sets, share_touched, unevenness
 from train.errors import DatasetError
 from train.experiments.__main__ import run
 from train.experiments.workbench import infer_presses

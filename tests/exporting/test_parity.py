@@ -14,14 +14,7 @@ from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession
 from export.graph import ParityError
-from export.parity import (
-    LEVELS,
-    GraphRun,
-    accepted,
-    differences,
-    extreme_windows,
-    read_windows,
-)
+from export.parity import LEVELS, GraphRun, accepted, differences, extreme_windows, read_windows
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import judged, main, verify
 from train.errors import CheckpointError

@@ -12,13 +12,7 @@ from edge_samples import ROOT
 
 from train.data.press_batches import Batch
 from train.errors import CheckpointError
-from train.learning.training_loop import (
-    DivergedError,
-    Recipe,
-    drawn_ahead,
-    learning_rate_share,
-    train,
-)
+from train.learning.training_loop import DivergedError, Recipe, drawn_ahead, learning_rate_share, train
 from train.networks.blocks import PatternNet, RelativeError
 
 RECIPE = Recipe(steps=12, batch=4, learning_rate=1e-2)

@@ -5,12 +5,7 @@ import pytest
 
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.sensor_noise import (
-    NAMES,
-    Nuisances,
-    apply_nuisances,
-    frame_weights,
-)
+from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances, frame_weights
 
 NONE = Nuisances().without(*NAMES)
 STRONG = Nuisances(

@@ -4,15 +4,7 @@ import pytest
 import torch
 
 from train.networks.compact import CompactNet
-from train.networks.symmetric import (
-    Channels,
-    SymmetricConv2d,
-    fields,
-    scalars,
-    symmetries,
-    vectors,
-    write_out,
-)
+from train.networks.symmetric import Channels, SymmetricConv2d, fields, scalars, symmetries, vectors, write_out
 
 GROUPS = {"p2": 2, "p4": 4, "p4m": 8}
 TOLERANCE = 1e-5
