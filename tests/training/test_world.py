@@ -50,17 +50,6 @@ def test_what_is_made_is_what_was_asked_for(small):
     assert not small.with_name("small.npz.parts").exists()
 
 
-@pytest.mark.parametrize("begun", [0.0, 1.0])
-def test_newest_taps_that_have_only_begun_are_lighter(begun):
-    """Level faces, so that force goes with depth wherever the pad taps."""
-    world = World(
-        count=24, taps=2, per_pad=24, families={"flat": 1.0}, spread=0.0, schedule="turns", begun=begun, seed=2
-    )
-    z_counts = solve_pad(world, 0).counts[:, :, 2].sum(axis=(2, 3))
-    share = z_counts[:, 0] / z_counts[:, 1]
-    assert np.median(share) == pytest.approx(1.0 if begun == 0 else 0.65, abs=0.15)
-
-
 def part_of(path, number, presses, world=SMALL):
     """Write what a run leaves that was cut short."""
     replace(presses, config=world.facts()).save(path.with_name(f"{path.name}.parts") / f"{number:06d}.npz")
