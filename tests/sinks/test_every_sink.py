@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ListSink, fake_source
+from edge_samples import ROOT, ListSink, fake_source
 from mcap_samples import messages_of
 from sink_samples import (
     CONTRACT,
@@ -201,6 +201,24 @@ def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, 
     if error is UsageError:  # known before anything is opened
         with pytest.raises(UsageError):
             check_sink(text)
+
+
+@pytest.mark.parametrize(
+    ("package", "text", "code", "words"),
+    [
+        ("cyclonedds", "ros2:skin", 2, "ros2:skin needs Cyclone DDS: pip install"),
+        ("zenoh", "zenoh:a", 5, "zenoh: needs eclipse-zenoh: pip install"),
+        ("rerun", "rerun:press.rrd", 5, "rerun: needs rerun-sdk: pip install"),
+    ],
+)
+def test_without_its_package_one_line_says_how_to_get_it(package, text, code, words):
+    program = (
+        f"import sys; sys.modules[{package!r}] = None; from edge.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", program, "--source", "demo", "--sink", text]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    extra = text.partition(":")[0]
+    assert (done.returncode, done.stderr.splitlines()[1:]) == (code, [f"edge-sr: {words} '{ROOT}[{extra}]'"])
 
 
 @pytest.mark.parametrize("form", ["mcap:out.mcap", "ros2:skin"])

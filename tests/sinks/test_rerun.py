@@ -3,7 +3,6 @@
 import sys
 from contextlib import closing
 from dataclasses import replace
-from importlib.util import find_spec
 
 import pytest
 from edge_samples import fake_source
@@ -57,12 +56,6 @@ def opened(target):
 def test_another_target_is_refused(target, words):
     with pytest.raises(UsageError, match=words):
         check_sink(f"rerun:{target}")
-
-
-@pytest.mark.skipif(find_spec("rerun") is not None, reason="Rerun is installed")
-def test_without_the_package_it_says_how_to_install_it(tmp_path):
-    with pytest.raises(SinkError, match=r"rerun: needs rerun-sdk: pip install .*\[rerun\]"):
-        opened(tmp_path / "press.rrd")
 
 
 @pytest.mark.parametrize("stand_in", ["0.23.4"], indirect=True)
