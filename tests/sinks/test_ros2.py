@@ -201,28 +201,21 @@ def test_a_force_of_which_a_part_is_not_known_is_no_wrench(sink):
     assert ros_messages.force_and_torque(replace(result, scan=scan, force_n=2.0), pad_of(3, 3)) is None, "no places"
 
 
-def test_subscribers_get_force_and_torque_of_a_model_with_traction(sink):
-    result, free = make_wrench_result(), make_wrench_result(press_counts=0)
+def test_force_torque_traction_and_numbers_of_a_model_with_traction(sink):
+    published = []
+    keep_published(sink, published, WRENCH, CLOUD, FLOAT)
+    result = make_wrench_result()
     result = replace(result, deviation=result.pattern / 10)
-    torque_n_m = [torque / 1000 for torque in result.wrench.torque_n_mm]
-    numbers = {
-        "skin/s4/force_z_n": result.wrench.force_n[2],
-        "skin/s4/shear_ratio": result.wrench.shear_ratio,
-        "skin/s4/force_counts": result.force_counts,
-        "skin/s4/uncertainty_m": None if result.interval_mm is None else result.interval_mm / 1e3,
-    }
-    topics = {"skin/s4/wrench": WRENCH, "skin/s4/points": CLOUD} | dict.fromkeys(numbers, FLOAT)
-    with Listener(topics) as listener:
-        listener.until(lambda: all(map(listener.of, topics)), lambda: sink.write(result, {}))
-        for topic, number in numbers.items():
-            np.testing.assert_equal(listener.of(topic)[0]["data"], math.nan if number is None else number)
-        for message in listener.of("skin/s4/wrench"):
-            assert list(message["wrench"]["force"].values()) == list(result.wrench.force_n)
-            assert list(message["wrench"]["torque"].values()) == torque_n_m
-        check_points(listener.of("skin/s4/points")[0], result)
-        sink.write(free, {})
-        listener.until(lambda: not any(listener.of("skin/s4/wrench")[-1]["wrench"]["force"].values()))
-        assert not any(listener.of("skin/s4/wrench")[-1]["wrench"]["torque"].values())
+    sink.write(result, {})
+    (wrench,) = [one["wrench"] for one in published if "wrench" in one]
+    assert list(wrench["force"].values()) == list(result.wrench.force_n)
+    assert list(wrench["torque"].values()) == [torque / 1000 for torque in result.wrench.torque_n_mm]
+    (cloud,) = [one for one in published if "fields" in one]
+    check_points(cloud | {"data": bytes(cloud["data"]).hex()}, result)
+    numbers = dict(zip(NUMBERS, [one["data"] for one in published if type(one.get("data")) is float], strict=True))
+    known = {"force_counts": result.force_counts, "force_z_n": result.wrench.force_n[2]}
+    known |= {"uncertainty_m": result.interval_mm / 1e3, "shear_ratio": result.wrench.shear_ratio}
+    assert numbers == known | {"area_m2": result.area_mm2 / 1e6}
 
 
 def test_frames_of_the_sensor_file_reach_who_comes_late_and_commands_come_back():
