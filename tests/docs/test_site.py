@@ -90,13 +90,3 @@ def test_what_links_of_the_repository_lead_to_is_there():
             address, _ = urldefrag(address)
             if address and not re.match(r"\w+:", address):
                 assert (page.parent / address).exists(), f"{page.name} leads to {address}"
-
-
-def test_each_example_is_named_on_a_page_and_its_folder_in_the_layout():
-    pages = "\n".join(page.read_text() for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")))
-    examples = sorted((ROOT / "examples").glob("*.py"))
-    assert len(examples) > 3
-    assert [path.name for path in examples if f"examples/{path.name}" not in pages] == []
-    layout = (ROOT / "README.md").read_text().split("## Layout", 1)[1]
-    packages = {path.parent.name for path in ROOT.glob("*/*.py")} - {"site"}
-    assert [name for name in sorted(packages) if f"\n{name}/ " not in layout] == []

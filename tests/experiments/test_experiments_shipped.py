@@ -15,6 +15,7 @@ from train.data.real_grips import has_hole, play, recorded_grips, recorded_sets,
 from train.errors import DatasetError
 from train.experiments.__main__ import run
 from train.experiments.workbench import infer_presses
+from train.report import Report, bootstrap_interval
 
 
 @pytest.fixture
@@ -86,3 +87,23 @@ def test_the_report_compares_the_shipped_way_with_a_linear_one(recordings, tmp_p
         (f"trial-{trial}", f"xela_sensor{sensor}") for sensor in (1, 2) for trial in "ab"
     ]
     assert str(recordings) not in page.read_text()
+
+
+def test_frames_of_one_tap_are_not_independent():
+    """Sixteen copies of each value tell no more than one: the interval is that of the taps, not of the frames."""
+    values = np.random.default_rng(1).normal(30, 2, 72)
+    alone = bootstrap_interval(values, np.arange(72))
+    assert bootstrap_interval(np.repeat(values, 16), np.repeat(np.arange(72), 16)) == pytest.approx(alone)
+    assert alone[1] - alone[0] == pytest.approx(2 * 1.96 * values.std() / np.sqrt(72), rel=0.1)
+    assert alone[0] < values.mean() < alone[1]
+
+
+def test_a_report_is_a_page_with_tables(tmp_path):
+    report = Report("mine", tmp_path / "reports", __file__)
+    report.say("What was done.")
+    report.table([{"method": "a", "dB": 31.234567}, {"method": "b", "extra": 2}], "All methods.")
+    page = report.write().read_text()
+    assert page.startswith("# mine\n") and 'command = "python' in page and "quick run" not in page
+    assert page.index("What was done.") < page.index("All methods.\n\n| method | dB | extra |")
+    assert "| a | 31.23 | - |\n| b | - | 2 |" in page
+    assert "quick run" in Report("mine", tmp_path, __file__, quick=True).write().read_text()

@@ -1,4 +1,4 @@
-"""Export of networks that take no poses: contract, parity, intervals, files, and the command."""
+"""Export of networks, with and without poses: contract, parity, intervals, files, and the command."""
 
 import json
 
@@ -9,9 +9,12 @@ import torch
 from export_samples import (
     BEFORE,
     INTERVALS,
+    POSED_PRESSES,
     PRESSES,
     SURE,
+    TAPS,
     made_once,
+    posed_models,
     published_model,
     save_checkpoint,
     small_models,
@@ -20,19 +23,22 @@ from export_samples import (
 from onnx import numpy_helper
 
 from edge.evaluation.test_set import judge, mean_error
-from edge.inference.bundled import find_model
-from edge.inference.contract import CONTRACT_VERSION
+from edge.inference.bundled import INT8_SUFFIX, find_model
+from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
 from export import to_onnx
 from export.graph import ParityError
 from export.parity import GraphRun, check_parity, differences, read_windows
 from export.to_onnx import export, main
+from export.verify import verify
 from train.errors import CheckpointError
 from train.learning.checkpoint import infer, load_network, network_of, origin_of
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
 from train.networks.named_networks import build
+from train.physics.pad_draws import KNOWN
+from train.surfaces.poses import REACH_MM
 from train.trust import load_trust
 
 
@@ -212,3 +218,79 @@ def test_what_integers_cost_too_much_is_said(psnr_db, coverage, exceeded):
     in_float = {"psnr_db": 35.0, "coverage_90": 0.9}
     found = to_onnx.cost(in_float, {"psnr_db": psnr_db, "coverage_90": coverage})
     assert found == ([f"{35 - psnr_db:.3f} dB lost to quantisation"], exceeded)
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    return made_once(tmp_path_factory, posed_models)
+
+
+def windows_and_poses(count=3):
+    rng = np.random.default_rng(3)
+    windows = [rng.normal(0, 0.5, (taps, 3, 4, 4)).astype(np.float32) for taps in range(1, count + 1)]
+    poses = [rng.normal(0, (2, 2, 20, 0, 0), (len(window), 5)).astype(np.float32) for window in windows]
+    for one in poses:
+        one[:, 3:], one[0] = (0.2, 1.0), 0
+    return windows, poses
+
+
+def test_the_contract_states_poses_and_reach(posed):
+    contract = ModelSession(posed / "fused.onnx").contract
+    assert (contract.taps, contract.takes_poses, contract.reach_mm) == (TAPS, True, REACH_MM)
+    assert contract.window_shape == (ANY_BATCH, "taps", 3, 4, 4)
+    assert set(contract.test_error) == {"1", "2", "3", "4"}, "with one to four taps of the paper's schedule"
+    assert set(contract.interval_levels) == {"50", "80", "90", "95"} and contract.read_trust() is not None
+
+
+def test_every_number_of_taps_gives_what_the_network_gives(posed):
+    session, net = ModelSession(posed / "fused.onnx"), network_of(onnx.load(posed / "fused.onnx"))
+    pad = np.zeros(KNOWN, dtype=np.float32)
+    for window, poses in zip(*windows_and_poses(), strict=True):
+        with torch.inference_mode():
+            expected = net(*(torch.from_numpy(one[None]) for one in (window, pad, poses)))
+        assert np.allclose(session.run(window, pad, poses), expected[0][0].numpy(), atol=1e-5)
+        assert session.deviation is not None
+        assert np.allclose(session.deviation, expected[1][0].numpy(), rtol=2e-3, atol=1e-5)
+
+
+def test_windows_of_different_numbers_of_taps_run_together(posed):
+    session = ModelSession(posed / "fused.onnx")
+    windows, poses = (list(reversed(given)) for given in windows_and_poses())
+    windows, poses = ([given[0], given[2], *given[1:]] for given in (windows, poses))  # a single tap amid others
+    alone = [
+        [np.array(made) for made in (session.run(window, poses=pose), session.deviation, session.traction)]
+        for window, pose in zip(windows, poses, strict=True)
+    ]
+    together = session.run_together(windows, poses=poses).copy()
+    assert np.allclose(together, [pattern for pattern, *_ in alone], atol=1e-5)
+    assert session.deviation is not None and session.traction is not None
+    assert np.allclose(session.traction, [traction for *_, traction in alone], atol=1e-3)
+    assert np.allclose(session.deviation, [deviation for _, deviation, _ in alone], rtol=2e-3, atol=1e-5)
+    assert not np.allclose(alone[0][0], session.run(windows[0][:1]), atol=1e-4), "the earlier tap matters"
+
+
+@pytest.mark.night
+def test_in_integers_it_is_near_the_float(posed, tmp_path):
+    export(posed / "fused.pt", tmp_path, some_frames(), calibration=POSED_PRESSES)
+    integers, session = ModelSession(tmp_path / f"fused{INT8_SUFFIX}.onnx"), ModelSession(posed / "fused.onnx")
+    for window, pose in zip(*windows_and_poses(), strict=True):
+        pattern = session.run(window, poses=pose)
+        assert np.abs(integers.run(window, poses=pose) - pattern).max() < 0.2 * np.abs(pattern).max()
+
+
+def test_single_taps_are_verified_too(posed):
+    rows = list(verify(posed / "fused.onnx", some_frames()))
+    assert {"test set", "one tap"} <= {row.windows for row in rows} and not [row for row in rows if row.broken]
+
+
+def test_a_single_tap_reads_no_memory_that_nobody_wrote(posed):
+    """Without earlier taps products go over nothing, which onnxruntime may leave as the memory was."""
+    session = ModelSession(posed / "fused.onnx")
+    window = windows_and_poses()[0][0]
+    expected = session.run(window).copy()
+    assert np.array_equal(session.run(np.concatenate([window, np.zeros_like(window)])), expected), "an absent tap"
+    for count in (1, 2, 4, 8):
+        for size in range(4, 20):
+            for _ in range(50):
+                np.full(2**size, np.nan, dtype=np.float32)  # memory that is free again
+            assert np.allclose(session.run_together([window] * count), expected, atol=1e-6)

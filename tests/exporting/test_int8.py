@@ -6,7 +6,6 @@ import pytest
 import torch
 from export_samples import PRESSES, made_once, small_models
 
-from edge.inference.bundled import find_model
 from edge.inference.onnx_session import ModelSession
 from export.graph import ExportError
 from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
@@ -73,13 +72,3 @@ def test_ranges_are_of_light_contacts_and_all_numbers_of_taps(path):
     assert 0.2 < given < 0.8
     with pytest.raises(ExportError, match="31 sequences to take ranges of, expected 32 or more"):
         calibration_batch(PRESSES.pick(np.arange(31)), contract)
-
-
-def test_what_encodes_earlier_taps_is_in_integers():
-    graph = onnx.load(find_model("mtsr-int8")).graph
-    in_integers = {weight.name.partition(".weight_quantized")[0] for weight in graph.initializer}
-    earlier = {"encode.1", "send", "ask", "hear"}
-    assert earlier | {"trunk.0.body.0", "leave.0", "uncertainty.0"} <= in_integers
-    comparing, at_the_ends = {"compare", "answer"}, {"enter", "enter_earlier", "merge.1", "leave.2", "uncertainty.2"}
-    in_float = comparing | at_the_ends | {"receive", "revise", "share"}
-    assert not in_float & in_integers

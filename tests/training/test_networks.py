@@ -134,7 +134,6 @@ def test_the_whole_network_keeps_every_symmetry(taps, group, count):
 
 
 KNOWN = 5
-REACHES = (torch.tensor(0.1), torch.tensor(0.1))
 
 
 @pytest.fixture(scope="module")
