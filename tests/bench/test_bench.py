@@ -159,15 +159,12 @@ def made():
     return provenance('python x.py --out "a b"', [ROOT / SOURCE, "edge/bench"], [find_model(DEFAULT_MODEL)], seed=3)
 
 
-def test_a_head_is_read_as_it_was_written(made):
+def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs_and_is_read_as_it_was_written(made):
     page = with_head("# mine\n\nText.\n", made)
     assert page.startswith("# mine\n\n```toml\ncommand = ") and page.endswith("```\n\nText.\n")
     assert read_provenance(page) == made
     bare = replace(made, seed=None, models={})
     assert read_provenance(with_head("# b\n", bare)) == bare
-
-
-def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs(made):
     assert made.sources == {name: file_hash(ROOT / name) for name in (SOURCE, "edge/bench")} and made.seed == 3
     assert made.models == {f"edge/models/{DEFAULT_MODEL}.onnx": file_hash(find_model(DEFAULT_MODEL))}
     assert made.tree in {"clean", "changed", UNKNOWN} and len(set(made.sources.values())) == 2

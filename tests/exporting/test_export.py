@@ -9,7 +9,6 @@ import torch
 from export_samples import (
     BEFORE,
     INTERVALS,
-    POSED_PRESSES,
     PRESSES,
     SURE,
     TAPS,
@@ -23,7 +22,7 @@ from export_samples import (
 from onnx import numpy_helper
 
 from edge.evaluation.test_set import judge, mean_error
-from edge.inference.bundled import INT8_SUFFIX, find_model
+from edge.inference.bundled import find_model
 from edge.inference.contract import ANY_BATCH, CONTRACT_VERSION
 from edge.inference.intervals import regions
 from edge.inference.onnx_session import ModelSession
@@ -37,7 +36,6 @@ from train.learning.checkpoint import infer, load_network, network_of, origin_of
 from train.learning.interval_fit import half_width_mm, interval_coverage, readings_of_presses
 from train.networks.compact import CompactNet
 from train.networks.named_networks import build
-from train.physics.pad_draws import KNOWN
 from train.surfaces.poses import REACH_MM
 from train.trust import load_trust
 
@@ -126,13 +124,6 @@ def test_a_file_has_no_traces_of_the_machine(folder):
     assert b".py" not in content and b"/tmp" not in content
     assert not any(init.external_data for init in onnx.load_from_string(content).graph.initializer)
     assert (folder / "sure.onnx.bak").read_bytes() == BEFORE
-
-
-@pytest.mark.night
-def test_exporting_again_gives_the_same_bytes(folder, frozen, tmp_path):
-    line, _ = export(folder / "sure.pt", tmp_path, frozen, validation=[some_frames(2)], intervals=INTERVALS)
-    assert line.startswith("sure.onnx: 0.") and "dB" in line and "interval covers" in line
-    assert (tmp_path / "sure.onnx").read_bytes() == (folder / "sure.onnx").read_bytes()
 
 
 @pytest.mark.parametrize("head", ["leave", "uncertainty", "traction"])
@@ -242,17 +233,6 @@ def test_the_contract_states_poses_and_reach(posed):
     assert set(contract.interval_levels) == {"50", "80", "90", "95"} and contract.read_trust() is not None
 
 
-def test_every_number_of_taps_gives_what_the_network_gives(posed):
-    session, net = ModelSession(posed / "fused.onnx"), network_of(onnx.load(posed / "fused.onnx"))
-    pad = np.zeros(KNOWN, dtype=np.float32)
-    for window, poses in zip(*windows_and_poses(), strict=True):
-        with torch.inference_mode():
-            expected = net(*(torch.from_numpy(one[None]) for one in (window, pad, poses)))
-        assert np.allclose(session.run(window, pad, poses), expected[0][0].numpy(), atol=1e-5)
-        assert session.deviation is not None
-        assert np.allclose(session.deviation, expected[1][0].numpy(), rtol=2e-3, atol=1e-5)
-
-
 def test_windows_of_different_numbers_of_taps_run_together(posed):
     session = ModelSession(posed / "fused.onnx")
     windows, poses = (list(reversed(given)) for given in windows_and_poses())
@@ -267,15 +247,6 @@ def test_windows_of_different_numbers_of_taps_run_together(posed):
     assert np.allclose(session.traction, [traction for *_, traction in alone], atol=1e-3)
     assert np.allclose(session.deviation, [deviation for _, deviation, _ in alone], rtol=2e-3, atol=1e-5)
     assert not np.allclose(alone[0][0], session.run(windows[0][:1]), atol=1e-4), "the earlier tap matters"
-
-
-@pytest.mark.night
-def test_in_integers_it_is_near_the_float(posed, tmp_path):
-    export(posed / "fused.pt", tmp_path, some_frames(), calibration=POSED_PRESSES)
-    integers, session = ModelSession(tmp_path / f"fused{INT8_SUFFIX}.onnx"), ModelSession(posed / "fused.onnx")
-    for window, pose in zip(*windows_and_poses(), strict=True):
-        pattern = session.run(window, poses=pose)
-        assert np.abs(integers.run(window, poses=pose) - pattern).max() < 0.2 * np.abs(pattern).max()
 
 
 def test_single_taps_are_verified_too(posed):

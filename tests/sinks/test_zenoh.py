@@ -12,7 +12,6 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-import orjson
 import pytest
 import zenoh_samples
 from bridge_samples import write_recording
@@ -24,7 +23,6 @@ from zenoh_samples import CONTRACT, consume, endpoint, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
-from edge.sinks.json_records import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.stop_signals import EXIT_FORCED
@@ -34,44 +32,30 @@ __all__ = ["consume", "endpoint"]
 zenoh = pytest.importorskip("zenoh")
 
 
-def plain(said):
-    """Return a record as it is after JSON."""
-    return orjson.loads(orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
-
-
 class TestMessages:
-    def test_all_that_was_written_comes_in_its_order(self, endpoint, consume):
+    def test_a_new_pattern_comes_with_all_its_maps_and_who_writes_comes_and_goes(self, endpoint, consume):
+        """What else there is of each result: tests/sinks/test_every_sink.py."""
         consumer, results = consume(endpoint), make_results(40)
-        assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
-        event = Event(5, "lost", None, "the cable is out")
         sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
-        expected = []
-        for number, result in enumerate(results):
-            counters = {"scans": number}
-            sink.write(result, counters)
-            said = plain(record(result, None if number else counters))  # all within a second
-            expected.append(("grip/4/scan", "application/json", said, {}))
-            if result.pattern is not None and result.reused_from is None:
-                maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
-                assert said["wrench"]["force_n"][2] > 0 and said["wrench_origin"] == "nominal"
-                expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
-            if number == 20:
-                sink.tell(event, counters)
-                said = plain(event_record(event, counters, "replay"))
-                expected.append(("grip/event", "application/json", said, {}))
+        for result in results:
+            sink.write(result, {})
         sink.close()
         messages, lives = consumer.until_gone()
         alive = f"grip/alive/{sink.zid}"
-        assert lives == [["came", alive], ["went", alive]]
-        assert [message[:2] for message in messages] == [wanted[:2] for wanted in expected]
-        for (key, _, writer, payload), (*_, said, maps) in zip(messages, expected, strict=True):
-            assert writer == sink.zid
-            header, got = unpack(payload) if key.endswith("pattern") else (json.loads(payload), {})
-            header.pop("maps", None)
-            assert header == said
-            assert got.keys() == maps.keys()
+        assert lives == [["came", alive], ["went", alive]] and {writer for *_, writer, _ in messages} == {sink.zid}
+        scan, pattern = ("grip/4/scan", "application/json"), ("grip/4/pattern", "application/octet-stream")
+        expected = []
+        for result in results:
+            new = result.pattern is not None and result.reused_from is None
+            expected += [(*scan, result), (*pattern, result)] if new else [(*scan, result)]
+        assert 45 < len(expected) < 70
+        for (*kind, _, payload), (*wanted, result) in zip(messages, expected, strict=True):
+            assert kind == wanted
+            header, maps = (json.loads(payload), {}) if kind == [*scan] else unpack(payload)
+            assert header["scan"] == result.scan.number
+            assert maps.keys() == ({"pattern", "deviation", "traction"} if kind == [*pattern] else set())
             for name, values in maps.items():
-                np.testing.assert_array_equal(got[name], values)
+                np.testing.assert_array_equal(values, getattr(result, name))
 
     def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path, capsys):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)

@@ -131,16 +131,6 @@ def test_a_punch_on_a_thick_layer_is_boussinesqs_and_mindlins():
     assert pushed.force_n == pytest.approx((expected_n, 0), rel=0.03, abs=1e-4 * expected_n)
 
 
-def test_a_cell_carries_as_much_as_it_is_covered():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    one, cover = np.full((3, SIZE, SIZE), NOTHING_MM, dtype=np.float32), np.zeros((3, SIZE, SIZE), dtype=np.float32)
-    one[:, 20, 20] = 0
-    cover[:, 20, 20] = 1, 0.5, 1 / 16
-    whole, half, corner = solver.solve(one, covered=cover, tolerance=1e-9)[0][:, 20, 20]
-    assert whole == pytest.approx(1 / solver.cell_compliance_mm_per_mpa)
-    assert (half / whole, corner / whole) == pytest.approx((0.5, 1 / 16))
-
-
 def test_presses_that_cannot_be_are_refused():
     solver = ContactSolver(Layer(), SIZE, CELL_MM)
     for depth_mm in (0.0, np.array([0.1, np.nan])):
