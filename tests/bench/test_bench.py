@@ -26,7 +26,6 @@ from edge.bench.contenders import Subject
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
 from edge.bench.timing import back_to_back, paced
 from edge.cli.main import main
-from edge.errors import ModelError
 from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
@@ -95,12 +94,6 @@ def test_force_is_what_patterns_sum_up_to_by_the_true_patterns_own_factor():
     nothing = 100 * np.sqrt(np.mean(FROZEN.force_n.astype(float) ** 2)) / FORCE_RANGE_N
     assert force_error_percent(0 * FROZEN.patterns(), FROZEN) == pytest.approx(nothing, rel=1e-4)
     assert FROZEN.force_n.max() == pytest.approx(FORCE_RANGE_N)
-
-
-def test_a_model_of_another_scale_is_refused():
-    coarse = replace(FROZEN, unit_patterns=FROZEN.unit_patterns[:, :16, :16])
-    with pytest.raises(ModelError, match="'scale' is 10, the test set's is 4"):
-        list(error_rows(MTSR, coarse))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from edge import api
 from export.to_onnx import export
@@ -15,8 +14,6 @@ from train.errors import DatasetError
 from train.families.family_shares import tap
 from train.learning.checkpoint import Training, fit_network
 from train.learning.training_loop import Recipe
-from train.networks.compact import CompactNet
-from train.networks.symmetric import symmetries
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import KNOWN, NOMINAL
 from train.physics.taxel_response import on_pad
@@ -28,7 +25,7 @@ TRAINING = Training("pad46", "compact-stsr", Recipe(steps=30, batch=12, learning
 WORLD = World(count=24, per_pad=24, families={"large square": 1.0, "C": 1.0}, spread=0.0, scale=SCALE, pad="uSPa46")
 
 
-def test_a_network_of_another_pad_learns_and_is_refused_here(tmp_path):
+def test_a_network_of_another_pad_learns_and_says_of_which(tmp_path):
     presses = solve_pad(WORLD, 0)
     seen = freeze_presses(presses, 1).as_frozen_set()
     begun = replace(TRAINING, name="begun", recipe=replace(TRAINING.recipe, steps=6))
@@ -39,9 +36,6 @@ def test_a_network_of_another_pad_learns_and_is_refused_here(tmp_path):
     assert (
         (contract.sensor, contract.pattern_shape) == ("uSPa46", (16, 24)) == (USPA46.name, USPA46.pattern_shape(SCALE))
     )
-    with api.open_source("demo") as source, pytest.raises(api.ModelError) as refused:
-        api.open_runtime(tmp_path / "pad46.onnx", source)
-    assert "uSPa46 of 4 x 6 taxels, the sensor is a uSPa44 of 4 x 4" in str(refused.value)
 
 
 def test_nothing_touches_beyond_a_rectangular_pad():
@@ -55,16 +49,6 @@ def test_nothing_touches_beyond_a_rectangular_pad():
     cells = on_pad(USPA46, pad.size, pad.cell_mm)
     assert cells.shape == (60, 60) and cells.sum() == 40 * 60
     assert on_pad(USPA44, 42, 0.47).all()
-
-
-def test_a_network_keeps_half_turns_on_a_rectangular_pad():
-    torch.manual_seed(0)
-    net = CompactNet(1, SCALE, channels=16, blocks=1, group="p2").eval()
-    window = torch.randn(3, 3, 4, 6)
-    signs = torch.tensor([-1.0, -1.0, 1.0])[:, None, None]
-    for before, after, sign in zip(net(window), net(window.flip(2, 3) * signs), (1, 1, signs), strict=True):
-        torch.testing.assert_close(after, before.flip(-2, -1) * sign, atol=1e-5, rtol=1e-4)
-    assert len(symmetries("p2")) == 2
 
 
 def test_a_set_of_the_default_pad_keeps_its_name():
