@@ -58,15 +58,14 @@ VENDOR = VendorReading(newtons=NEWTONS)
 class Talker:
     """Writes contacts of two sensors, and keeps what it wrote by its stamp."""
 
-    def __init__(self, sink, **changes):
+    def __init__(self, sink):
         self.sink, self.number, self.wrote = sink, 0, {}
-        self._changes = changes
 
     def __call__(self):
         self.number += 1
         for sensor, vendor in (("4", VENDOR), ("left/4", None)):
             force_n = None if vendor is None else 2.0
-            result = contact(self.number, sensor=sensor, force_n=force_n, **self._changes)
+            result = contact(self.number, sensor=sensor, force_n=force_n)
             # Stamped by the device a little before it arrived.
             scan = replace(result.scan, vendor=vendor, device_ns=result.scan.time_ns - 3_000_000)
             result = replace(result, scan=scan, area_mm2=40.0, centroid_mm=(1.5, -2.0), trusted=True)

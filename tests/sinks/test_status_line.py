@@ -128,6 +128,14 @@ class TestStatus:
         sink.write(replace(runtime.push(make_scan(0, press_counts=3000)), **changes), {})
         assert (sink.line() + " ").startswith(line) and sink.line().isascii()
 
+    def test_it_is_rewritten_at_most_ten_times_a_second(self):
+        sink = self.make()
+        result = make_results(1)[0]
+        for _ in range(101):
+            sink.write(result, {})
+            self.now_s += 1 / 64
+        assert len(self.shown()) == 1 + 100 // 7  # every 7/64 s
+
     def test_the_rate_follows_the_sensor(self):
         sink = self.make()
         runtime = Runtime(FakeModel(), source="device", baselines={"4": BASELINE})
