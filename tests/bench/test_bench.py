@@ -230,10 +230,6 @@ class Clock:
         return run, numbers
 
 
-def pace(clock, run, ticks, rate_hz=100.0):
-    return paced(run, rate_hz, ticks, clock, clock.sleep, cpu_clock=lambda: clock.now_ns // 4)
-
-
 @pytest.mark.parametrize(
     ("took_ms", "ticks", "done", "missed"),
     [
@@ -246,7 +242,7 @@ def pace(clock, run, ticks, rate_hz=100.0):
 def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, missed):
     clock = Clock()
     run, numbers = clock.work(*took_ms)
-    found = pace(clock, run, ticks)
+    found = paced(run, 100.0, ticks, clock, clock.sleep, cpu_clock=lambda: clock.now_ns // 4)
     assert (numbers, found.missed, found.ticks, found.times.runs) == ([*done], missed, ticks, len(numbers))
     assert found.cpu_percent == pytest.approx(25)
     assert found.times.max_us == 1e3 * max(took_ms)

@@ -50,9 +50,9 @@ def test_what_is_made_is_what_was_asked_for(small):
     assert not small.with_name("small.npz.parts").exists()
 
 
-def part_of(path, number, presses, world=SMALL):
+def part_of(path, number, presses):
     """Write what a run leaves that was cut short."""
-    replace(presses, config=world.facts()).save(path.with_name(f"{path.name}.parts") / f"{number:06d}.npz")
+    replace(presses, config=SMALL.facts()).save(path.with_name(f"{path.name}.parts") / f"{number:06d}.npz")
 
 
 def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(small, tmp_path):
