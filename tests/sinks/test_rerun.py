@@ -31,12 +31,10 @@ class DepthImage(Entity): pass
 @pytest.fixture
 def stand_in(monkeypatch, tmp_path, request):
     """Interface of the package as far as the sink uses it, of a version."""
-    folder = tmp_path / "site"
+    folder, version = tmp_path / "site", getattr(request, "param", "0.26.2")
     (folder / "rerun_sdk-1.dist-info").mkdir(parents=True)
     (folder / "rerun.py").write_text(STAND_IN)
-    (folder / "rerun_sdk-1.dist-info" / "METADATA").write_text(
-        f"Name: rerun-sdk\nVersion: {getattr(request, 'param', '0.26.2')}\n"
-    )
+    (folder / "rerun_sdk-1.dist-info" / "METADATA").write_text(f"Name: rerun-sdk\nVersion: {version}\n")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.delitem(sys.modules, "rerun", raising=False)
     yield
