@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from train.errors import SurfaceError
-from train.families.family_shares import draw_shape
+from train.errors import MeshError, SurfaceError
+from train.families.family_shares import SHARES, draw_shape
 from train.families.shapes import NOWHERE_MM
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import NOMINAL
@@ -29,6 +29,7 @@ from train.surfaces.poses import (
     SCHEDULES,
     SURFACE_REACH_MM,
     random_poses,
+    turns,
 )
 
 SIZE, CELL_MM = 42, 0.47
@@ -94,6 +95,15 @@ def test_a_letter_stands_upright_as_seen_through_the_pad():
 @pytest.fixture(scope="module")
 def pad():
     return GrippedPad(NOMINAL)
+
+
+@pytest.mark.parametrize("family", SHARES)
+def test_every_family_gives_finite_heights_that_reach_the_pad(pad, family):
+    for seed in range(6):
+        heights_mm = draw_shape(np.random.default_rng(seed), family, pad, turns(np.random.default_rng(), 2)).heights_mm
+        assert np.isfinite(heights_mm).all() and (heights_mm.max(axis=(1, 2)) > -50).all()
+    with pytest.raises(MeshError, match="No such file"):
+        draw_shape(np.random.default_rng(0), "mesh:absent.stl", pad, turns(np.random.default_rng(), 1))
 
 
 @pytest.mark.parametrize("family", ["glyph", "polygon", "relief", "block"])
