@@ -1,26 +1,31 @@
-"""`edge-sr bench` as a whole, the cost of the whole program, and reports that know their age."""
+"""`edge-sr bench`, run times on a clock of its own, reports that know their age, and the cost of the program."""
 
 import csv
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
+import hot_path
 import numpy as np
+import program_cost
 import pytest
 from cli_samples import run
 from edge_samples import ROOT, make_contract, wait_for, write_model
+from program_cost import Ratio, ratio_of
 
 from edge.bench import command
 from edge.bench import provenance as reports
 from edge.bench.accuracy import FORCE_RANGE_N, error_rows, force_error_percent, force_floor_percent
+from edge.bench.command import front
 from edge.bench.contenders import Subject
 from edge.bench.provenance import UNKNOWN, file_hash, provenance, read_provenance, with_head
+from edge.bench.timing import back_to_back, paced
 from edge.cli.main import main
-from edge.errors import ModelError
 from edge.evaluation.test_set import judge_model, load_frozen_set, mean_error
 from edge.inference.bundled import BUNDLE_DIR, DEFAULT_MODEL, find_model
 from edge.inference.onnx_session import ModelSession
@@ -91,12 +96,6 @@ def test_force_is_what_patterns_sum_up_to_by_the_true_patterns_own_factor():
     assert FROZEN.force_n.max() == pytest.approx(FORCE_RANGE_N)
 
 
-def test_a_model_of_another_scale_is_refused():
-    coarse = replace(FROZEN, unit_patterns=FROZEN.unit_patterns[:, :16, :16])
-    with pytest.raises(ModelError, match="'scale' is 10, the test set's is 4"):
-        list(error_rows(MTSR, coarse))
-
-
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -153,22 +152,12 @@ def made():
     return provenance('python x.py --out "a b"', [ROOT / SOURCE, "edge/bench"], [find_model(DEFAULT_MODEL)], seed=3)
 
 
-def listed(folder: Path, made, capsys, name="mine.md"):
-    (folder / name).parent.mkdir(exist_ok=True)
-    (folder / name).write_text(with_head("# mine\n\nWhat was measured.\n", made))
-    reports.main([str(folder)])
-    return capsys.readouterr().out
-
-
-def test_a_head_is_read_as_it_was_written(made):
+def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs_and_is_read_as_it_was_written(made):
     page = with_head("# mine\n\nText.\n", made)
     assert page.startswith("# mine\n\n```toml\ncommand = ") and page.endswith("```\n\nText.\n")
     assert read_provenance(page) == made
     bare = replace(made, seed=None, models={})
     assert read_provenance(with_head("# b\n", bare)) == bare
-
-
-def test_a_head_names_commit_seed_and_the_hashes_of_its_inputs(made):
     assert made.sources == {name: file_hash(ROOT / name) for name in (SOURCE, "edge/bench")} and made.seed == 3
     assert made.models == {f"edge/models/{DEFAULT_MODEL}.onnx": file_hash(find_model(DEFAULT_MODEL))}
     assert made.tree in {"clean", "changed", UNKNOWN} and len(set(made.sources.values())) == 2
@@ -206,11 +195,125 @@ def test_a_head_that_lacks_or_is_damaged_is_none(page):
     ],
 )
 def test_a_report_is_stale_and_the_line_says_why(made, tmp_path, capsys, change, why):
-    line = listed(tmp_path, replace(made, **change), capsys, "load/mine.md")
-    assert line == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
+    (tmp_path / "load").mkdir()
+    (tmp_path / "load/mine.md").write_text(with_head("# mine\n", replace(made, **change)))
+    reports.main([str(tmp_path)])
+    assert capsys.readouterr().out == f"load/mine.md: stale, of {made.date[:10]} ({made.commit}): {why}\n"
 
 
 def test_every_report_has_a_head():
     pages = sorted((ROOT / "reports").rglob("*.md"))
     assert [page.name for page in pages if read_provenance(page.read_text()) is None] == []
     assert len(pages) > 5
+
+
+class Clock:
+    """Goes on when someone sleeps or works."""
+
+    def __init__(self):
+        self.now_ns = 1_000_000
+
+    def __call__(self):
+        return self.now_ns
+
+    def sleep(self, time_s):
+        self.now_ns += round(time_s * 1e9)
+
+    def work(self, *took_ms):
+        """Return a run that takes these times in turn, then always the last one, and the list of its numbers."""
+        numbers = []
+
+        def run(number):
+            numbers.append(number)
+            self.now_ns += round(1e6 * took_ms[min(len(numbers), len(took_ms)) - 1])
+
+        return run, numbers
+
+
+@pytest.mark.parametrize(
+    ("took_ms", "ticks", "done", "missed"),
+    [
+        ((2,), 20, range(1, 21), 0),
+        ((2, 12, 2), 10, range(1, 11), 1),  # not done when the next is due
+        ((2, 35, 2), 10, [1, 2, 5, 6, 7, 8, 9, 10], 3),  # due at 20 ms, done at 55: 3 and 4 have passed, 5 begins late
+        ((60,), 30, [1, 7, 13, 19, 25], 30),
+    ],
+)
+def test_ticks_whose_run_is_not_done_in_time_are_missed(took_ms, ticks, done, missed):
+    clock = Clock()
+    run, numbers = clock.work(*took_ms)
+    found = paced(run, 100.0, ticks, clock, clock.sleep, cpu_clock=lambda: clock.now_ns // 4)
+    assert (numbers, found.missed, found.ticks, found.times.runs) == ([*done], missed, ticks, len(numbers))
+    assert found.cpu_percent == pytest.approx(25)
+    assert found.times.max_us == 1e3 * max(took_ms)
+
+
+def test_a_machine_that_stands_still_from_the_first_still_gives_a_figure():
+    clock = Clock()
+    run, numbers = clock.work(1)
+    asked = []
+
+    def stalls():
+        asked.append(clock.now_ns)
+        clock.now_ns += 1_000_000_000 * (len(asked) == 3)  # before the first tick is waited for
+        return clock.now_ns
+
+    found = paced(run, 100.0, 10, stalls, clock.sleep, cpu_clock=lambda: 0)
+    assert (found.times.runs, numbers) == (1, [10])
+    assert found.missed == 10
+
+
+@pytest.mark.parametrize(
+    ("took_ms", "most", "runs"), [(1, 3000, 2000), (0.1, 3000, 3000), (200, 3000, 90), (200, 10, 10)]
+)
+def test_back_to_back_is_as_many_runs_as_fit(took_ms, most, runs):
+    clock = Clock()
+    run, _ = clock.work(took_ms)
+    found = back_to_back(run, most, clock)
+    assert found.runs == runs
+    assert found.p50_us == took_ms * 1000
+
+
+def test_the_front_is_who_is_not_beaten():
+    points = [(9.0, 100.0), (5.0, 60.0), (2.0, 700.0), (2.0, 800.0), (1.9, 900.0), (5.0, 60.0)]
+    assert front(points) == [False, True, True, False, True, True]
+
+
+def test_a_way_that_takes_longer_than_the_one_before_is_red(tmp_path, limits, capsys):
+    """The tree before is this one, without the work that the change adds to each scan."""
+    for package in ("edge", "firmware_bridge"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    changed = tmp_path / "firmware_bridge/scans/slcan_scans.py"
+    text = changed.read_text()
+    begin = "        scans: list[Scan] = []\n"
+    assert text.count(begin) == 1
+    changed.write_text(text.replace(begin, f"{begin}        sum(range(40_000))\n"))
+    limits(hot_path, BLOCKS=3)
+    ratio, took_us = hot_path.compare(tmp_path, ROOT, pairs=1)["at rest"]
+    assert hot_path.slower(ratio) and took_us > 0
+    assert (
+        hot_path.report({"at rest": (ratio, took_us)}, "HEAD~1") == 1
+        and ": more than a tenth slower" in capsys.readouterr().out
+    )
+    assert not hot_path.slower(Ratio(1.05, 1.04, 1.06)) and not hot_path.slower(Ratio(1.2, 0.9, 1.4))
+
+
+def test_a_commit_that_cannot_be_run_is_named_and_is_not_red(capsys):
+    assert hot_path.main(["no-such-commit"]) == 0
+    assert "no-such-commit: fatal" in capsys.readouterr().out
+
+
+def test_pairs_are_drawn_together_so_that_what_meets_both_cancels():
+    weather = np.random.default_rng(3).uniform(1, 3, 30)
+    paired = ratio_of(2 * weather, weather)
+    assert (paired.ratio, paired.low, paired.high) == pytest.approx((2, 2, 2)) and str(paired) == "2 (2..2)"
+
+
+def test_the_cost_of_the_program_is_a_line_for_rest_and_contact_of_each_tree(limits, capsys):
+    limits(program_cost, SETTLE_S=0.5, ROUNDS=1)
+    assert program_cost.main(["--round-s", "0.5"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["at rest, 1 sensors, now", "in contact, 1 sensors, now"]
+    assert all(float(re.search(r"cpu_percent ([\d.]+)", line)[1]) > 0 for line in lines)
+    p50_us = re.search(r"p50_us ([\d.e+]+)", lines[1])  # none where a busy machine lost frames
+    assert p50_us is None or float(p50_us[1]) > 50

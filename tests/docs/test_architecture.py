@@ -1,8 +1,12 @@
-"""The drawing on the page of the architecture is that of the imports; files, names and values on the page are there."""
+"""The page of the architecture is true of imports, files, names and values; files are short, texts plain English."""
 
 import ast
 import re
+import runpy
+import subprocess
+from collections import Counter
 from functools import cache
+from pathlib import Path
 
 import grimp
 import pytest
@@ -82,3 +86,30 @@ def test_each_file_is_there_with_what_is_named_after_it(text):
 
 def test_a_scan_takes_twenty_steps_and_every_row_of_the_index_is_read():
     assert (len(STEPS), len(QUESTIONS)) == (20, PAGE.partition("| question")[2].count("\n|") - 1)
+
+
+MOST_LINES = 400
+SOURCES = {".py", ".js", ".css", ".html"}
+
+
+def test_no_file_is_of_four_hundred_lines_or_more():
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    files = [ROOT / name for name in names if Path(name).suffix in SOURCES and (ROOT / name).is_file()]
+    assert [path.name for path in files if len(path.read_bytes().splitlines()) >= MOST_LINES] == []
+
+
+@pytest.mark.parametrize(
+    "planted", ["no scan was heard yet", "no sensor is told apart", "If none is dead, measured anew."]
+)
+def test_a_planted_word_of_the_dialect_is_seen_in_shown_text(planted):
+    plain_english = runpy.run_path(str(ROOT / ".ci" / "plain_english.py"))
+    shown = [text for _, text in plain_english["strings"](ast.parse(f"raise UsageError({planted!r})"))]
+    assert shown == [planted] and plain_english["shown_dialect"](planted)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_class_has_a_name_of_its_own(package):
+    found = (node for path in (ROOT / package).rglob("*.py") for node in ast.parse(path.read_text()).body)
+    names = Counter(one.name for one in found if isinstance(one, ast.ClassDef) and not one.name.startswith("_"))
+    assert [name for name, count in names.items() if count > 1] == []

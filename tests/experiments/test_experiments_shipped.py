@@ -1,27 +1,26 @@
-"""Reports of the shipped models: parts of those on other pads, and the page on real grips in miniature."""
+"""Reports of the shipped models: on other pads, on real grips and of the checks, each in miniature, and their parts."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import make_pad_contract, write_model
+from edge_samples import FakeModel, make_pad_contract, write_model
 from experiment_samples import grip, quick_bench, save_recordings, tables_of
+from trust_samples import FOREIGN_TAXEL, make_trusted_contract
 
 from edge.inference.bundled import DEFAULT_MODEL, find_model
+from edge.inference.contract import ANY_BATCH
 from edge.inference.onnx_session import ModelSession
 from edge.perception.taxel_health import HOLD_SCANS
 from train.data.frozen_presses import load_frozen_presses
-from train.data.real_grips import (
-    has_hole,
-    play,
-    recorded_grips,
-    recorded_sets,
-    share_touched,
-    unevenness,
-)
-from train.errors import DatasetError
+from train.data.real_grips import has_hole, play, recorded_grips, recorded_sets, share_touched, unevenness
+from train.errors import CheckpointError, DatasetError
+from train.experiments import trust_checks
 from train.experiments.__main__ import run
+from train.experiments.sensor_faults import FAULTS
 from train.experiments.workbench import infer_presses
+from train.families.family_shares import SHARES
+from train.report import Report, bootstrap_interval
 
 
 @pytest.fixture
@@ -93,3 +92,98 @@ def test_the_report_compares_the_shipped_way_with_a_linear_one(recordings, tmp_p
         (f"trial-{trial}", f"xela_sensor{sensor}") for sensor in (1, 2) for trial in "ab"
     ]
     assert str(recordings) not in page.read_text()
+
+
+def test_frames_of_one_tap_are_not_independent():
+    """Sixteen copies of each value tell no more than one: the interval is that of the taps, not of the frames."""
+    values = np.random.default_rng(1).normal(30, 2, 72)
+    alone = bootstrap_interval(values, np.arange(72))
+    assert bootstrap_interval(np.repeat(values, 16), np.repeat(np.arange(72), 16)) == pytest.approx(alone)
+    assert alone[1] - alone[0] == pytest.approx(2 * 1.96 * values.std() / np.sqrt(72), rel=0.1)
+    assert alone[0] < values.mean() < alone[1]
+
+
+def test_a_report_is_a_page_with_tables(tmp_path):
+    report = Report("mine", tmp_path / "reports", __file__)
+    report.say("What was done.")
+    report.table([{"method": "a", "dB": 31.234567}, {"method": "b", "extra": 2}], "All methods.")
+    page = report.write().read_text()
+    assert page.startswith("# mine\n") and 'command = "python' in page and "quick run" not in page
+    assert page.index("What was done.") < page.index("All methods.\n\n| method | dB | extra |")
+    assert "| a | 31.23 | - |\n| b | - | 2 |" in page
+    assert "quick run" in Report("mine", tmp_path, __file__, quick=True).write().read_text()
+
+
+def press(z=3000.0, x=0.0):
+    counts = np.zeros((3, 4, 4), dtype=np.float32)
+    counts[2].flat[FOREIGN_TAXEL] = z
+    counts[0, 0, 0] = x
+    return counts
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return load_frozen_presses().pick(np.arange(60))
+
+
+class TestVerdicts:
+    def test_suspicion_is_counted_after_contacts_that_have_ended(self):
+        model = FakeModel(make_trusted_contract())
+        odd = np.stack([press(x=9000)] * trust_checks.CONTACTS)
+        good = np.stack([press()] * trust_checks.CONTACTS)
+        found = trust_checks.verdicts_on(model, [odd, good], [None, None])
+        assert (found["contacts"], found["too light"]) == (2 * trust_checks.CONTACTS, 0)
+        assert str(found["flagged %"]).startswith("50.0")
+        assert (found["unfamiliar %"], found["unexplained %"]) == (50, 0)
+        after = [float(str(found[f"sensor, after {number} %"]).split()[0]) for number in trust_checks.AFTER]
+        assert after == [0, 50, 50, 50]
+
+    def test_what_begins_no_contact_counts_nowhere(self):
+        found = trust_checks.verdicts_on(FakeModel(make_trusted_contract()), [np.stack([press(z=500)] * 4)], [None])
+        assert found == {"contacts": 0}
+
+    def test_a_share_of_none_has_an_interval_too(self):
+        assert trust_checks.share(np.zeros(100, dtype=bool)) == "0.0 (0.0..3.6)"
+        assert trust_checks.share(np.ones(100, dtype=bool)) == "100.0 (96.4..100.0)"
+        assert trust_checks.share(np.zeros(100, dtype=bool), np.zeros(100, dtype=int)) == "0.0 (0.0..97.5)"
+
+
+def test_patterns_that_are_off_are_counted_by_how_far(wide):
+    """The fake model's patterns are in no relation to the truth: what counts is who is counted where."""
+    found = trust_checks.judged(FakeModel(make_trusted_contract()), wide, [None] * len(wide))
+    assert len(found.off) and np.isfinite(found.off).all() and (found.off > 1).all()
+    cells = found.cells(np.ones(len(found.off), dtype=bool))
+    assert cells["contacts"] == cells["> 50% off"] == cells["> 100% off"] == len(found.off)
+    assert cells["of those < 30% off, not believed %"] is None
+
+
+def test_right_windows_are_kept_and_foreign_ones_dropped():
+    posed = {"batch": ANY_BATCH, "takes_poses": True, "reach_mm": 10.0, "unposed_taps": 4}
+    model = FakeModel(make_trusted_contract(output_full_scale=0.5, **posed))
+    elsewhere = np.roll(press(), 2, axis=-1)
+    right, wrong = (np.stack([press(), *[one] * 3])[None] for one in (press(), elsewhere))
+    truth = np.zeros((1, 40, 40), dtype=np.float32)
+    right_db, used, foreign = trust_checks.guarded(model, right, truth, 4)
+    assert (used.tolist(), foreign.tolist()) == ([4], [[False] * 3])
+    wrong_db, used, foreign = trust_checks.guarded(model, wrong, truth, 4)
+    assert (used.tolist(), foreign.tolist()) == ([1], [[True] * 3])
+    alone_db, _, _ = trust_checks.guarded(model, wrong, truth, 1)
+    assert alone_db == pytest.approx(wrong_db, abs=0.05) and right_db != wrong_db
+
+
+def test_the_report_of_the_checks_is_made_in_miniature(recordings, tmp_path_factory):
+    page = run("trust-checks", quick_bench(tmp_path_factory), tmp_path_factory.mktemp("reports"))
+    families, _, grips, faults, taps = tables_of(page)
+    assert page.read_text().startswith("# trust-checks\n") and "quick run" in page.read_text()
+    assert [row["contacts of"] for row in families] == [*SHARES, "all", "light"]
+    assert any(float(row["stsr-int8 %"]) > 0 for row in grips), "noise is no grip"
+    assert {"no fault", "another pad's file", *FAULTS} <= {row["fault"] for row in faults}
+    cases = ["right", "another surface", "order reversed", "turned the other way", "not turned"]
+    assert [row["earlier taps"] for row in taps] == cases
+
+
+def test_a_model_without_checks_is_refused_in_a_line(tmp_path, tmp_path_factory):
+    for name in ("stsr", "stsr-small", "mtsr"):
+        write_model(tmp_path / f"{name}-int8.onnx", make_pad_contract(taps=1))
+    with pytest.raises(CheckpointError, match="stsr-int8 has no checks"):
+        run("trust-checks", replace(quick_bench(tmp_path_factory), models=tmp_path), tmp_path)

@@ -1,11 +1,12 @@
-"""Every bundled model computes what its network computes, at every level, and in a second runtime."""
+"""Every model computes what its network computes, at every level, in a second runtime, and nearly so in integers."""
 
 from functools import cache
 
 import numpy as np
 import onnx
 import pytest
-from export_samples import made_once, small_models
+import torch
+from export_samples import PRESSES, made_once, small_models
 from onnx import numpy_helper
 
 from edge.errors import ModelError
@@ -13,17 +14,12 @@ from edge.evaluation.test_set import load_frozen_set
 from edge.inference.bundled import BUNDLE_DIR, bundled_models, find_model
 from edge.inference.contract import Contract, scheduled_rows
 from edge.inference.onnx_session import ModelSession
-from export.graph import ParityError
-from export.parity import (
-    LEVELS,
-    GraphRun,
-    accepted,
-    differences,
-    extreme_windows,
-    read_windows,
-)
+from export.graph import ExportError, ParityError
+from export.int8 import calibration_batch, convolutions, integer_nodes, quantised
+from export.parity import LEVELS, GraphRun, accepted, differences, extreme_windows, read_windows
 from export.to_onnx import MOST_LOSS_DB
 from export.verify import judged, main, verify
+from train.data.press_batches import Batch
 from train.errors import CheckpointError
 from train.learning.checkpoint import network_of
 
@@ -215,3 +211,61 @@ def test_what_is_no_model_ends_in_one_line(tmp_path, content, complaint):
         main([str(path)])
     with pytest.raises(ModelError):
         list(verify(path, frozen()))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return made_once(tmp_path_factory, small_models) / "sure.onnx"
+
+
+@pytest.fixture(scope="module")
+def model(path):
+    return onnx.load(path)
+
+
+@pytest.fixture(scope="module")
+def seen(model):
+    """Batch that ranges are taken from; its truth is not used."""
+    known = model.graph.input[1].type.tensor_type.shape.dim[1].dim_value
+    window = torch.from_numpy(np.random.default_rng(0).normal(size=(64, 6, 4, 4)).astype(np.float32))
+    return Batch(window, torch.zeros(64, 40, 40), pad=torch.zeros(64, known))
+
+
+@pytest.fixture(scope="module")
+def integers(model, seen):
+    return quantised(model, seen)
+
+
+def test_the_largest_grid_is_in_integers_but_for_outputs(model, integers):
+    weights = {node.name: node.input[1] for node in model.graph.node if node.op_type == "Conv"}
+    chosen = {weights[name] for name in integer_nodes(model) if name in weights}
+    trunk = {f"trunk.0.body.{layer}.weight" for layer in (0, 2)}
+    assert chosen == trunk | {"leave.0.weight", "uncertainty.0.weight"}
+    assert (convolutions(model), convolutions(integers)) == ((0, 16), (4, 16)), "once optimised"
+
+
+def test_the_same_windows_give_the_same_bytes(model, seen, integers):
+    before = model.SerializeToString(deterministic=True)
+    again = quantised(model, seen)
+    assert again.SerializeToString(deterministic=True) == integers.SerializeToString(deterministic=True)
+    assert model.SerializeToString(deterministic=True) == before
+
+
+def test_a_graph_without_convolutions_is_refused(seen):
+    ends = [[onnx.helper.make_tensor_value_info(name, 1, [1, 6, 4, 4])] for name in ("window", "pattern")]
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["window"], ["pattern"])], "none", *ends)
+    with pytest.raises(ExportError, match=r"no convolution .* without --int8"):
+        quantised(onnx.helper.make_model(graph), seen)
+
+
+def test_ranges_are_of_light_contacts_and_all_numbers_of_taps(path):
+    contract = ModelSession(path).contract
+    windows = calibration_batch(PRESSES, contract).window.numpy()
+    assert windows.shape == (64, 6, 4, 4)
+    assert np.array_equal(windows, calibration_batch(PRESSES, contract).window.numpy())
+    size = np.abs(windows[:, :3]).max(axis=(1, 2, 3))
+    assert size.min() < 0.3 * size.max()
+    given = (np.abs(windows[:, 3:]).max(axis=(1, 2, 3)) > 0).mean()
+    assert 0.2 < given < 0.8
+    with pytest.raises(ExportError, match="31 sequences to take ranges of, expected 32 or more"):
+        calibration_batch(PRESSES.pick(np.arange(31)), contract)

@@ -3,13 +3,14 @@
 import contextlib
 import json
 import os
+import resource
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from edge_samples import ListSink, fake_source
+from edge_samples import ROOT, ListSink, fake_source
 from mcap_samples import messages_of
 from sink_samples import (
     CONTRACT,
@@ -85,45 +86,17 @@ def test_counters_come_once_a_second_and_with_the_record_in_which_one_changes(ki
     assert counted == {0: 0, 2: 2, 5: 2, 6: 2}
 
 
-FULL = """
-import resource, signal, sys
-from pathlib import Path
-from edge.errors import SinkError
-from dataclasses import replace
-from sink_samples import CONTRACT, RUN, every_kind
-from edge_samples import fake_source
-from edge.sinks.registry import open_sink
-sink, contact = open_sink(sys.argv[1], CONTRACT, fake_source()), every_kind()[3]
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-try:
-    for number in range(2400):
-        sink.write(replace(contact, scan=replace(contact.scan, number=number)), RUN)
-    sink.close()
-except SinkError as error:
-    print(error)
-"""
-
-
-@pytest.mark.parametrize(
-    ("form", "words"),
-    [("jsonl:out.jsonl", "cannot write records to out.jsonl: File too large"),
-     ("mcap:out.mcap", "recording into out.mcap stopped: File too large; its ")],
-)  # fmt: skip
-def test_a_disk_that_fills_up_is_told_and_what_was_written_is_whole(form, words, tmp_path):
-    command = [sys.executable, "-c", FULL, form]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.stdout.startswith(words) and done.stdout.count("\n") == 1, done.stderr
-    if form.startswith("jsonl"):
-        lines = (tmp_path / "out.jsonl").read_text().splitlines()
-        assert [json.loads(line)["scan"] for line in lines] == list(range(len(lines))) != []
-        return
-    from firmware_bridge.recording.formats import load_recording
-
-    recording = load_recording(tmp_path / "out.mcap")
-    scans = sum(len(track.counts) for track in recording.tracks)
-    assert f"its {scans} scans can be played" in done.stdout
-    assert "breaks off (without an end" in recording.notes[0], "a chunk is there as a whole, or not at all"
+def test_a_file_that_finds_no_more_room_holds_whole_records(tmp_path):
+    """A recording for replay does, too: tests/bridge/test_mcap_commands.py."""
+    opened, contact, before = Jsonl(tmp_path), every_kind()[3], resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, before[1]))
+    try:
+        with pytest.raises(SinkError, match=r"cannot write records to .*out\.jsonl: File too large"):
+            for number in range(2400):
+                opened.sink.write(replace(contact, scan=replace(contact.scan, number=number)), RUN)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [line["scan"] for line in opened.lines()] == list(range(len(opened.lines()))) != []
 
 
 def gone(tmp_path: Path) -> Sink:
@@ -201,6 +174,24 @@ def test_what_cannot_be_opened_is_refused_in_one_line_and_nothing_is_lost(text, 
     if error is UsageError:  # known before anything is opened
         with pytest.raises(UsageError):
             check_sink(text)
+
+
+@pytest.mark.parametrize(
+    ("package", "text", "code", "words"),
+    [
+        ("cyclonedds", "ros2:skin", 2, "ros2:skin needs Cyclone DDS: pip install"),
+        ("zenoh", "zenoh:a", 5, "zenoh: needs eclipse-zenoh: pip install"),
+        ("rerun", "rerun:press.rrd", 5, "rerun: needs rerun-sdk: pip install"),
+    ],
+)
+def test_without_its_package_one_line_says_how_to_get_it(package, text, code, words):
+    program = (
+        f"import sys; sys.modules[{package!r}] = None; from edge.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", program, "--source", "demo", "--sink", text]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    extra = text.partition(":")[0]
+    assert (done.returncode, done.stderr.splitlines()[1:]) == (code, [f"edge-sr: {words} '{ROOT}[{extra}]'"])
 
 
 @pytest.mark.parametrize("form", ["mcap:out.mcap", "ros2:skin"])

@@ -13,7 +13,6 @@ import pytest
 from edge_samples import BASELINE, FakeModel, fake_source, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packed_messages import unpack
 from sink_samples import CONTRACT, RUN, make_results, make_sure_results
 
 from edge.api import Event, Runtime
@@ -99,15 +98,9 @@ class TestJsonLines:
         sink = open_sink(f"jsonl:{tmp_path}/out.jsonl", CONTRACT, fake_source())
         sink.tell(Event(5, "lost", None, "the cable is out"), {"scans": 3})
         sink.close()
-        assert json.loads((tmp_path / "out.jsonl").read_text()) == {
-            "time_ns": 5,
-            "sensor": None,
-            "source": "replay",
-            "state": "event",
-            "event": "lost",
-            "note": "the cable is out",
-            "counters": {"scans": 3, "unwritten": 0},
-        }
+        told = {"time_ns": 5, "sensor": None, "source": "replay", "state": "event", "event": "lost"}
+        told |= {"note": "the cable is out", "counters": {"scans": 3, "unwritten": 0}}
+        assert json.loads((tmp_path / "out.jsonl").read_text()) == told
 
     def test_a_slow_reader_holds_up_nothing_and_what_it_missed_is_counted(self, tmp_path):
         """Every record is written or counted, and each that is written is whole."""
@@ -153,23 +146,6 @@ def _read(descriptor):
         return os.read(descriptor, 1 << 20)
     except BlockingIOError:
         return b""
-
-
-NAMES = st.text(max_size=8)
-SHAPES = st.lists(st.integers(0, 4), max_size=3).map(tuple)
-HEADERS = st.dictionaries(NAMES.filter(lambda name: name != "maps"), st.none() | st.integers(-(2**53), 2**53) | NAMES)
-
-
-@given(HEADERS, st.dictionaries(NAMES, SHAPES, max_size=4))
-def test_what_was_packed_is_unpacked(header, shapes):
-    rng = np.random.default_rng(1)
-    maps = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    message = pack(header, maps)
-    got_header, got_maps = unpack(message)
-    assert got_header == {**header, "maps": [[name, list(shape)] for name, shape in shapes.items()]}
-    assert got_maps.keys() == maps.keys()
-    for name, values in maps.items():
-        assert np.array_equal(got_maps[name], values) and got_maps[name].shape == values.shape
 
 
 def test_the_layout_is_as_documented():

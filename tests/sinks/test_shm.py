@@ -17,18 +17,7 @@ from struct import unpack_from
 import numpy as np
 import pytest
 from edge_samples import ROOT, ended, make_pad_contract, make_wrench_result
-from shm_samples import (
-    CONTRACT,
-    fields,
-    heartbeat_ns,
-    latest,
-    make_result,
-    name,
-    sink,
-    start_writer,
-    values,
-    writing,
-)
+from shm_samples import CONTRACT, fields, heartbeat_ns, latest, make_result, name, sink, start_writer, values, writing
 
 from edge.api import Event, SinkError
 from edge.sinks import shm

@@ -12,10 +12,10 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-import orjson
 import pytest
 import zenoh_samples
 from bridge_samples import write_recording
+from cli_samples import start
 from edge_samples import ROOT, ended, fake_source, make_scan, wait_for, write_model
 from packed_messages import unpack
 from test_listening import reachable
@@ -23,7 +23,6 @@ from zenoh_samples import CONTRACT, consume, endpoint, listening, make_results
 
 from edge.api import Event, SinkError
 from edge.cli.main import main
-from edge.sinks.json_records import event_record, record
 from edge.sinks.registry import open_sink
 from edge.sinks.zenoh import ZenohSink, chunks
 from edge.terminal.stop_signals import EXIT_FORCED
@@ -33,44 +32,30 @@ __all__ = ["consume", "endpoint"]
 zenoh = pytest.importorskip("zenoh")
 
 
-def plain(said):
-    """Return a record as it is after JSON."""
-    return orjson.loads(orjson.dumps(said, option=orjson.OPT_SERIALIZE_NUMPY))
-
-
 class TestMessages:
-    def test_all_that_was_written_comes_in_its_order(self, endpoint, consume):
+    def test_a_new_pattern_comes_with_all_its_maps_and_who_writes_comes_and_goes(self, endpoint, consume):
+        """What else there is of each result: tests/sinks/test_every_sink.py."""
         consumer, results = consume(endpoint), make_results(40)
-        assert 5 < sum(result.pattern is not None and result.reused_from is None for result in results) < 30
-        event = Event(5, "lost", None, "the cable is out")
         sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
-        expected = []
-        for number, result in enumerate(results):
-            counters = {"scans": number}
-            sink.write(result, counters)
-            said = plain(record(result, None if number else counters))  # all within a second
-            expected.append(("grip/4/scan", "application/json", said, {}))
-            if result.pattern is not None and result.reused_from is None:
-                maps = {"pattern": result.pattern, "deviation": result.deviation, "traction": result.traction}
-                assert said["wrench"]["force_n"][2] > 0 and said["wrench_origin"] == "nominal"
-                expected.append(("grip/4/pattern", "application/octet-stream", said, maps))
-            if number == 20:
-                sink.tell(event, counters)
-                said = plain(event_record(event, counters, "replay"))
-                expected.append(("grip/event", "application/json", said, {}))
+        for result in results:
+            sink.write(result, {})
         sink.close()
         messages, lives = consumer.until_gone()
         alive = f"grip/alive/{sink.zid}"
-        assert lives == [["came", alive], ["went", alive]]
-        assert [message[:2] for message in messages] == [wanted[:2] for wanted in expected]
-        for (key, _, writer, payload), (*_, said, maps) in zip(messages, expected, strict=True):
-            assert writer == sink.zid
-            header, got = unpack(payload) if key.endswith("pattern") else (json.loads(payload), {})
-            header.pop("maps", None)
-            assert header == said
-            assert got.keys() == maps.keys()
+        assert lives == [["came", alive], ["went", alive]] and {writer for *_, writer, _ in messages} == {sink.zid}
+        scan, pattern = ("grip/4/scan", "application/json"), ("grip/4/pattern", "application/octet-stream")
+        expected = []
+        for result in results:
+            new = result.pattern is not None and result.reused_from is None
+            expected += [(*scan, result), (*pattern, result)] if new else [(*scan, result)]
+        assert 45 < len(expected) < 70
+        for (*kind, _, payload), (*wanted, result) in zip(messages, expected, strict=True):
+            assert kind == wanted
+            header, maps = (json.loads(payload), {}) if kind == [*scan] else unpack(payload)
+            assert header["scan"] == result.scan.number
+            assert maps.keys() == ({"pattern", "deviation", "traction"} if kind == [*pattern] else set())
             for name, values in maps.items():
-                np.testing.assert_array_equal(got[name], values)
+                np.testing.assert_array_equal(values, getattr(result, name))
 
     def test_a_run_that_nobody_reads_says_so_as_it_goes_and_at_its_end(self, endpoint, tmp_path, capsys):
         model = write_model(tmp_path / "tiny.onnx", CONTRACT)
@@ -168,42 +153,38 @@ class TestWhoComesAndGoes:
         assert lines | {f"{alive} went\n"} == {f"{alive} came\n", pattern, "the cable is out\n", f"{alive} went\n"}
 
 
-class TestOpening:
-    def test_a_configuration_that_cannot_be_read_is_told(self, tmp_path):
-        with pytest.raises(SinkError, match=r"none.json5 is not a zenoh configuration: No such file"):
-            open_sink(f"zenoh:a?config={tmp_path}/none.json5", CONTRACT, fake_source())
-        (tmp_path / "bad.json5").write_text("{mode: ")
-        with pytest.raises(SinkError, match=r"bad.json5 is not a zenoh configuration: expected"):
-            open_sink(f"zenoh:a?config={tmp_path}/bad.json5", CONTRACT, fake_source())
-
-    def test_an_endpoint_that_zenoh_does_not_know_is_told(self):
-        with pytest.raises(SinkError, match=r"zenoh cannot be opened: Unicast not supported for smoke protocol$"):
-            open_sink("zenoh:a?connect=smoke/1:2", CONTRACT, fake_source())
-
-    def test_without_the_package_it_says_what_to_install(self, monkeypatch):
-        monkeypatch.setitem(sys.modules, "zenoh", None)
-        with pytest.raises(SinkError, match=rf"needs eclipse-zenoh: pip install '{ROOT}\[zenoh\]'"):
-            open_sink("zenoh:a", CONTRACT, fake_source())
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [
+        ("config=none.json5", r"none.json5 is not a zenoh configuration: No such file"),
+        ("config=bad.json5", r"bad.json5 is not a zenoh configuration: expected"),
+        ("connect=smoke/1:2", r"zenoh cannot be opened: Unicast not supported for smoke protocol$"),
+    ],
+)
+def test_what_cannot_be_opened_is_told(option, why, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.json5").write_text("{mode: ")
+    with pytest.raises(SinkError, match=why):
+        open_sink(f"zenoh:a?{option}", CONTRACT, fake_source())
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").is_file(), reason="sockets are told by Linux's /proc")
-class TestListening:
-    @pytest.mark.parametrize(
-        ("configuration", "protocol"),
-        [
-            (None, None),
-            ("{connect: {endpoints: ['tcp/127.0.0.1:1']}}", None),
-            ("{listen: {endpoints: ['tcp/0.0.0.0:0']}}", "tcp"),
-            ("{scouting: {multicast: {enabled: true}}}", "udp"),
-        ],
-    )
-    def test_nobody_can_reach_it_unless_a_configuration_says_so(self, tmp_path, configuration, protocol):
-        (tmp_path / "zenoh.json5").write_text(configuration or "")
-        before = reachable(os.getpid())
-        sink = ZenohSink("grip" if configuration is None else f"grip?config={tmp_path}/zenoh.json5", fake_source())
-        opened = {one.split()[0] for one in reachable(os.getpid()) if one not in before}
-        sink.close()
-        assert protocol in opened if protocol else not opened
+@pytest.mark.parametrize(
+    ("configuration", "protocol"),
+    [
+        (None, None),
+        ("{connect: {endpoints: ['tcp/127.0.0.1:1']}}", None),
+        ("{listen: {endpoints: ['tcp/0.0.0.0:0']}}", "tcp"),
+        ("{scouting: {multicast: {enabled: true}}}", "udp"),
+    ],
+)
+def test_nobody_can_reach_it_unless_a_configuration_says_so(tmp_path, configuration, protocol):
+    (tmp_path / "zenoh.json5").write_text(configuration or "")
+    before = reachable(os.getpid())
+    sink = ZenohSink("grip" if configuration is None else f"grip?config={tmp_path}/zenoh.json5", fake_source())
+    opened = {one.split()[0] for one in reachable(os.getpid()) if one not in before}
+    sink.close()
+    assert protocol in opened if protocol else not opened
 
 
 @pytest.mark.parametrize("by_file", [False, True])
@@ -221,36 +202,20 @@ def test_nobody_is_dialled_but_whom_it_was_told_to(by_file, tmp_path):
         sink.close()
 
 
-def sending(*words, **settings):
-    """A program that puts every scan, and hears signals as from a terminal."""
-    command = [sys.executable, "-m", "edge.cli.main", *words, "--every-scan"]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE} | settings
-    return ended(subprocess.Popen(command, **pipes))
-
-
-def until_quiet(pipe, quiet_s=1.0):
-    while select.select([pipe], [], [], quiet_s)[0] and os.read(pipe.fileno(), 1 << 20):
-        pass
-
-
-class TestEndOfTheProgram:
+def test_a_replay_that_waits_for_a_peer_that_is_gone_ends_all_the_same(endpoint, consume, tmp_path):
     """Five seconds are promised; a busy machine may take longer."""
-
-    def test_a_replay_that_waits_for_a_peer_that_is_gone_ends_all_the_same(self, endpoint, consume, tmp_path):
-        model = write_model(tmp_path / "tiny.onnx", CONTRACT)
-        press = np.where(np.arange(8000) < 110, 0, 2000 + 7 * np.arange(8000) % 997)
-        noise = np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
-        counts = make_scan(0).counts + noise
-        counts[:, 2] += press[:, None, None] // 16
-        recording = write_recording(tmp_path / "long.csv", counts)
-        consumer = consume(endpoint)
-        words = ["replay", str(recording), "--zero", "--rate-hz", "2000", "--model", str(model)]
-        sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
-        with sending(*words, *sinks, stdout=subprocess.PIPE) as program:
-            while consumer.next()[0] != "got":
-                pass
-            consumer.process.send_signal(signal.SIGSTOP)
-            until_quiet(program.stdout)  # what zenoh has no room for holds up everything, for five seconds at most
-            program.send_signal(signal.SIGTERM)
-            words = program.communicate()[1].decode()
-        assert program.returncode == 0 or (program.returncode == EXIT_FORCED and "ended by force" in words)
+    model, consumer = write_model(tmp_path / "tiny.onnx", CONTRACT), consume(endpoint)
+    counts = make_scan(0).counts + np.random.default_rng(1).integers(-2, 3, (8000, 3, 4, 4))
+    counts[110:, 2] += ((2000 + 7 * np.arange(7890) % 997) // 16)[:, None, None]
+    replay = ["replay", write_recording(tmp_path / "long.csv", counts), "--zero", "--rate-hz", 2000, "--model", model]
+    sinks = ["--sink", "jsonl:-", "--sink", f"zenoh:grip?connect={endpoint}"]
+    with ended(start(*replay, *sinks, "--every-scan")) as program:
+        while consumer.next()[0] != "got":
+            pass
+        consumer.process.send_signal(signal.SIGSTOP)
+        # What zenoh has no room for holds up everything, for five seconds at most.
+        while select.select([program.stdout], [], [], 1.0)[0] and os.read(program.stdout.fileno(), 1 << 20):
+            pass
+        program.send_signal(signal.SIGTERM)
+        words = program.communicate()[1]
+    assert program.returncode == 0 or (program.returncode == EXIT_FORCED and "ended by force" in words)

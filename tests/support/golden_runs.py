@@ -91,26 +91,17 @@ def differences(frozen: Any, now: Any, place: str = "") -> list[str]:
     """Return where two outcomes differ by more than the tolerances, a line each."""
     key = place.rpartition(".")[2]
     if isinstance(frozen, dict) and isinstance(now, dict):
-        changed = [
-            f"{place}.{name}: only {'before' if name in frozen else 'now'}" for name in frozen.keys() ^ now.keys()
-        ]
-        return changed + [
-            line
-            for name in frozen.keys() & now.keys()
-            for line in differences(frozen[name], now[name], f"{place}.{name}")
-        ]
+        missing, common = frozen.keys() ^ now.keys(), frozen.keys() & now.keys()
+        changed = [f"{place}.{name}: only {'before' if name in frozen else 'now'}" for name in missing]
+        return changed + [line for name in common for line in differences(frozen[name], now[name], f"{place}.{name}")]
     if isinstance(frozen, list) and isinstance(now, list):
         if key == "at" and all(isinstance(one, int) for one in frozen):
-            return (
-                []
-                if max(abs(a - b) for a, b in zip(frozen, now, strict=True)) <= 2
-                else [f"{place}: {now}, was {frozen}"]
-            )
+            near = max(abs(a - b) for a, b in zip(frozen, now, strict=True)) <= 2
+            return [] if near else [f"{place}: {now}, was {frozen}"]
         if len(frozen) != len(now):
             return [f"{place}: {len(now)} entries, were {len(frozen)}: {now}, was {frozen}"[:600]]
-        return [
-            line for n, (a, b) in enumerate(zip(frozen, now, strict=True)) for line in differences(a, b, f"{place}.{n}")
-        ]
+        pairs = enumerate(zip(frozen, now, strict=True))
+        return [line for n, (a, b) in pairs for line in differences(a, b, f"{place}.{n}")]
     if frozen == now or (is_number(frozen) and is_number(now) and close(frozen, now, key)):
         return []
     return [f"{place}: {now!r}, was {frozen!r}"]

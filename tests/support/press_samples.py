@@ -6,7 +6,7 @@ from train.data.presses import PressSet
 from train.physics.pad_draws import INPUTS
 
 
-def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:
+def make_press_set(count=12, taps=2, seed=0) -> PressSet:
     """Return readings and truths in proportion to the indentation, of as many pads as there are fours."""
     rng = np.random.default_rng(seed)
     depth_mm = rng.uniform(0.1, 0.5, count).astype(np.float32)
@@ -15,7 +15,7 @@ def make_press_set(count=12, taps=2, seed=0, per_pad=4) -> PressSet:
     traction = rng.standard_normal((count, 3, 8, 8))
     return PressSet(
         family=np.array(["flat", "dome", "glyph"])[np.arange(count) % 3],
-        pad=np.arange(count) // per_pad,
+        pad=np.arange(count) // 4,
         constants=rng.uniform(-1, 1, (count, len(INPUTS))).astype(np.float32),
         counts=(2000 * rng.uniform(-1, 1, (count, taps, 3, 4, 4)) * depth_mm[:, None, None, None, None]).astype(
             np.float32

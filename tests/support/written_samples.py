@@ -15,6 +15,7 @@ LANGUAGES = {"sh", "python", "text", "json", "toml", "html", "ini", "xml", "c", 
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 _INLINE = re.compile(r"(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)")
 _INDENTED = re.compile(r"(?<=\n\n)( {4,7})(?![-*] |\d+\. )\S.*\n(?:(?:\1.*|\n(?=\1))(?:\n|\Z))*")
+_COMMENT = re.compile(r"(?:^|\s)#.*")
 _RUNNABLE = re.compile(r"(?:edge-sr|make|pip install|python3?|sudo|torchrun|tensorboard|git|echo|ros2|ulimit) \S")
 NAMED = re.compile(r"edge-sr ([a-z]+)")
 """A command that is spoken of, not one to be typed."""
@@ -60,7 +61,7 @@ def commands() -> dict[str, list[str]]:
     for block in blocks():
         if block.language == "sh":
             for line in block.text.replace("\\\n", " ").splitlines():
-                command = " ".join(_without_comment(line).split())
+                command = " ".join(_COMMENT.sub("", line).split())
                 if command:
                     found.setdefault(command, []).append(block.page)
     for page in PAGES:
@@ -70,16 +71,3 @@ def commands() -> dict[str, list[str]]:
     for command in _MAKEFILE.findall((ROOT / "Makefile").read_text()):
         found.setdefault(command.replace("$(NETWORKS)", "mine/stsr.pt").replace("$@", "out.npz"), []).append("Makefile")
     return found
-
-
-def _without_comment(line: str) -> str:
-    """Return a line of shell up to a # that begins a word, outside quotes."""
-    quoted = ""
-    for at, letter in enumerate(line):
-        if quoted:
-            quoted = "" if letter == quoted else quoted
-        elif letter in "'\"":
-            quoted = letter
-        elif letter == "#" and (at == 0 or line[at - 1].isspace()):
-            return line[:at]
-    return line

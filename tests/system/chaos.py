@@ -32,6 +32,7 @@ import orjson
 from chaos_judge import RATE_HZ, REST_COUNTS, Judge, telling
 from chaos_wire import FaultyBus, Sent, stretches
 from numpy.typing import NDArray
+from program_cost import CONTROLLERS, ROOT, resident_mb, started
 
 from edge.pipeline.result_stream import uncollected
 from edge.sinks.json_records import PIPE_BYTES
@@ -43,8 +44,6 @@ from firmware_bridge.emulation.slcan_emulator import FRAME_S
 from firmware_bridge.scans.can_id_maps import USPA44_MAP
 from firmware_bridge.zeroing.baseline import Baseline, save_baselines
 
-ROOT: Final = Path(__file__).parents[2]
-CONTROLLERS: Final = ("4", "6", "8", "10")
 FIELDS: Final = "counts,fresh,dead,state,note,device_time_ns,latency_us"
 QUIET_S: Final = 0.5
 END_TIMEOUT_S: Final = 30.0
@@ -179,19 +178,13 @@ class Chaos:
     def _program(self, folder: Path, buses: Sequence[FaultyBus]) -> Iterator[subprocess.Popen[bytes]]:
         baselines = [Baseline.of(name, rest_counts(), time.time(), 100, "file") for name in self.names]
         save_baselines(folder / "zero.json", baselines)
-        command = [sys.executable, "-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
+        command = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
+        command += ["--sink", "jsonl:-", "--fields", FIELDS]
         for prefix, bus in zip(self._prefixes, buses, strict=True):
             command += ["--source", f"{prefix.replace('/', '=')}slcan:{bus.line.path}"]
         with (
             (folder / "said").open("wb") as said,
-            subprocess.Popen(
-                [*command, "--sink", "jsonl:-", "--fields", FIELDS],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=said,
-                env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": ""},
-                start_new_session=True,
-            ) as process,
+            started(command, ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said) as process,
         ):
             try:
                 yield process
@@ -213,10 +206,10 @@ class Chaos:
             self._judge(lines, (seconds - warm_up_s) / windows)
             latencies_us = sorted(self.run.judge.latencies_us)
             folder = Path(f"/proc/{process.pid}")
-            mb = int((folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
             held = sum(len(list((folder / name).iterdir())) for name in ("task", "fd"))
             quiet_us = latencies_us[len(latencies_us) // 4] if latencies_us else math.nan
-            self.run.windows.append(((number + 1) * (seconds - warm_up_s) / windows / 60, mb, held, quiet_us))
+            minute = (number + 1) * (seconds - warm_up_s) / windows / 60
+            self.run.windows.append((minute, resident_mb(folder), held, quiet_us))
 
     def _judge(self, lines: SimpleQueue[bytes], seconds: float) -> None:
         """Judge the records that come within this time, and all that wait."""

@@ -22,7 +22,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class Program:
 
     def __init__(self, process: subprocess.Popen[bytes], *, silent: bool) -> None:
         self._process, self._silent = process, silent
-        self._folder = Path(f"/proc/{process.pid}")
+        self.folder = Path(f"/proc/{process.pid}")
 
     def records(self, seconds: float) -> list[tuple[int, dict[str, Any]]]:
         """Return the records of so long without their maps, each with its time of arrival in [ns]."""
@@ -76,14 +76,15 @@ class Program:
     def cpu_s(self) -> float:
         """Return the processor time of all its threads, as the scheduler counts it, in [s]."""
         try:
-            tasks = list((self._folder / "task").iterdir())
+            tasks = list((self.folder / "task").iterdir())
             return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
         except OSError as error:
             raise CostError("edge-sr ended while it was measured") from error
 
-    def resident_mb(self) -> float:
-        """Return its resident memory, in [MB]."""
-        return int((self._folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+def resident_mb(folder: Path) -> float:
+    """Return the resident memory of the process of a folder of /proc, in [MB]."""
+    return int((folder / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def tree_of(commit: str, folder: Path) -> Path:
@@ -104,7 +105,7 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
         before_s, start_s = program.cpu_s(), time.monotonic()
         records = program.records(seconds)
         cpu_percent = 100 * (program.cpu_s() - before_s) / (time.monotonic() - start_s)
-        resident_mb, stamps = program.resident_mb(), (Path(name) / "stamps.txt").read_text()
+        resident, stamps = resident_mb(program.folder), (Path(name) / "stamps.txt").read_text()
     times_ns: dict[str, list[int]] = defaultdict(list)
     for stamp in stamps.splitlines():
         sensor, _, time_ns = stamp.partition(" ")
@@ -117,10 +118,10 @@ def measured(part: str, sensors: int, seconds: float, tree: Path = ROOT) -> Cost
     # What makes the numbers of scans differ from those of the emulator.
     differ = any(last.get(name, 0) for name in ("missing_taxels", "missed", "resynchronised", "abandoned"))
     if not records or beyond or differ:
-        return Cost(cpu_percent, None, None, lost, resident_mb)
+        return Cost(cpu_percent, None, None, lost, resident)
     took_us = [(at_ns - times_ns[record["sensor"]][record["scan"]]) / 1e3 for at_ns, record in records]
     p50_us, p99_us = np.percentile(took_us, (50, 99)).tolist()
-    return Cost(cpu_percent, p50_us, p99_us, lost, resident_mb)
+    return Cost(cpu_percent, p50_us, p99_us, lost, resident)
 
 
 def _newest_counters(records: Sequence[tuple[int, dict[str, Any]]]) -> dict[str, int]:
@@ -142,7 +143,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
     program = ["-m", "edge.cli.main", "--baseline", str(folder / "zero.json")]
     program += ["--sink", "status"] if part == "at rest" else ["--sink", "jsonl:-", "--every-scan"]
     pipe, null = subprocess.PIPE, subprocess.DEVNULL
-    with _started([*command, *map(str, played)], ROOT, stdin=pipe, stdout=pipe) as emulators:
+    with started([*command, *map(str, played)], ROOT, stdin=pipe, stdout=pipe) as emulators:
         try:
             ports = [emulators.stdout.readline().decode().strip() if emulators.stdout else "" for _ in range(buses)]
             if not all(ports):
@@ -151,7 +152,7 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 program += ["--source", f"{prefix.replace('/', '=')}slcan:{port}"]
             with (
                 uncollected(),  # or a pause of our own collector would count as the program's
-                _started(program, tree, stdin=null, stderr=null, stdout=pipe) as process,
+                started(program, tree, stdin=null, stderr=null, stdout=pipe) as process,
             ):
                 try:
                     yield Program(process, silent=part == "at rest")
@@ -162,8 +163,8 @@ def edge_sr(folder: Path, part: str, sensors: int, tree: Path = ROOT) -> Iterato
                 emulators.stdin.close()
 
 
-def _started(
-    arguments: Sequence[str], tree: Path, *, stdin: int, stdout: int, stderr: int | None = None
+def started(
+    arguments: Sequence[str], tree: Path, *, stdin: int, stdout: int, stderr: int | IO[bytes] | None = None
 ) -> subprocess.Popen[bytes]:
     """Start Python in the tree; its bytecode is kept, as that of an installed program is."""
     paths = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])

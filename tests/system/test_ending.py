@@ -36,31 +36,17 @@ def listen(host, port, listen=server.listen):
 server.listen, server.GONE_S = listen, 60.0
 sys.exit(cli.main(sys.argv[1:]))
 """
-# A graph that goes round for ever, which onnxruntime runs without coming back to Python.
+# A lock that is never given back, which keeps the program in C as a graph does that goes round for ever.
 ENDLESS = """
-import onnxruntime, numpy as np, sys
-from onnx import TensorProto as Type, helper
+import ctypes
 from edge.terminal.stop_signals import stop_on_signals
 from edge.cli.user_commands import terminal_keys
 from edge.pipeline.commands import Commands
 
-def value(name, kind, shape):
-    return helper.make_tensor_value_info(name, kind, shape)
-
-body = helper.make_graph(
-    [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Identity", ["x"], ["z"])],
-    "body",
-    [value("i", Type.INT64, []), value("on", Type.BOOL, []), value("x", Type.FLOAT, [1])],
-    [value("still", Type.BOOL, []), value("z", Type.FLOAT, [1])],
-)
-loop = helper.make_node("Loop", ["", "always", "x"], ["y"], body=body)
-always = helper.make_tensor("always", Type.BOOL, [], [True])
-graph = helper.make_graph([loop], "endless", [value("x", Type.FLOAT, [1])], [value("y", Type.FLOAT, [1])], [always])
-model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+lock, library = ctypes.create_string_buffer(64), ctypes.CDLL(None)
 with stop_on_signals(), terminal_keys(Commands()):
-    print("runs", flush=True)
-    session.run(None, {"x": np.ones(1, dtype=np.float32)})
+    while True:
+        library.pthread_mutex_lock(lock)
 """
 
 

@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[2]
 OURS = {"edge", "firmware_bridge", "train", "export"}
 ANY_LICENCE = "Apache License\n                           Version 2.0, January 2004"
 IN_THE_WHEEL = {"edge", "firmware_bridge"}
+INSTALL = ("install", "--quiet", "--no-compile")
 NOT_IN_THE_RUNTIME = {"torch", "onnx", "onnxscript", "trimesh", "scipy", "shapely"}
 
 
@@ -35,10 +36,7 @@ def fresh(tmp_path_factory, wheels):
     """Folder bin of a new environment with the runtime's wheel and its dependencies."""
     folder = tmp_path_factory.mktemp("wheel") / "env"
     venv.create(folder)
-    run(
-        [*pip_for(folder), "install", "--quiet", "--no-compile", wheels[0]],
-        PIP_CONSTRAINT=str(ROOT / "constraints.txt"),
-    )
+    pip(folder, *INSTALL, wheels[0], PIP_CONSTRAINT=str(ROOT / "constraints.txt"))
     return folder / "bin"
 
 
@@ -56,13 +54,14 @@ def demo(fresh, tmp_path_factory):
 @pytest.fixture(scope="module")
 def both(fresh, wheels):
     """The same environment with the second wheel as well, without torch and the like: used by the last tests alone."""
-    run([*pip_for(fresh.parent), "install", "--quiet", "--no-compile", "--no-deps", wheels[1]])
+    pip(fresh.parent, *INSTALL, "--no-deps", wheels[1])
     return fresh
 
 
-def pip_for(environment):
-    # The pip of this environment works in the other: to install one there takes longer than all that follows.
-    return [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", str(environment)]
+def pip(environment, *words, **variables):
+    """Run the pip of this environment on another one: to install one there takes longer than all that follows."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", str(environment)]
+    return run([*command, *words], **variables)
 
 
 def without_checkout():
@@ -71,9 +70,8 @@ def without_checkout():
 
 
 def run(command, **environment):
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=240, env={**without_checkout(), **environment}
-    )
+    variables = without_checkout() | environment
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=variables)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -85,7 +83,7 @@ def ended(folder, *command):
 
 
 def test_the_runtime_installs_without_the_training_libraries(fresh, demo):
-    installed = json.loads(run([*pip_for(fresh.parent), "list", "--format", "json"]))
+    installed = json.loads(pip(fresh.parent, "list", "--format", "json"))
     assert "tactile-edge-sr" in {package["name"] for package in installed}
     assert not NOT_IN_THE_RUNTIME & {package["name"].lower() for package in installed}
 

@@ -1,5 +1,6 @@
-"""The elastic pad against closed forms and finite elements: layer, contact, friction, magnets, and the tactile PSF."""
+"""The elastic pad against closed forms, finite elements and itself: layer, contact, friction, magnets, and presses."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import magpylib
@@ -9,7 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.contact import ContactSolver, FrictionSolver
+from train.errors import SurfaceError
+from train.families.family_shares import heights_of
+from train.families.shapes import NOWHERE_MM
+from train.physics.contact import BARE, ContactSolver, FrictionSolver
 from train.physics.elastic_layer import (
     Layer,
     inner_displacement,
@@ -17,10 +21,20 @@ from train.physics.elastic_layer import (
     surface_compliance,
     surface_tangential_compliance,
 )
+from train.physics.gripped import (
+    FINE_SCALE,
+    FRAMES,
+    MAX_INDENTATION_MM,
+    MOST_FORCE_N,
+    SCALE,
+    TRACTION_SCALE,
+    GrippedPad,
+)
 from train.physics.magnets import Magnet, MagnetArray
-from train.physics.pad_draws import Pad
+from train.physics.pad_draws import NOMINAL, Pad
 from train.physics.taxel_response import Skin
-from train.surfaces.depth_image import NOTHING_MM
+from train.physics.tpsf import resample, resample_touching
+from train.surfaces.depth_image import NOTHING_MM, Pose
 
 SIZE, CELL_MM = 42, 0.47
 WAVES = np.concatenate([[0.0], np.logspace(-9, 4, 60), [1e6]])
@@ -131,16 +145,6 @@ def test_a_punch_on_a_thick_layer_is_boussinesqs_and_mindlins():
     assert pushed.force_n == pytest.approx((expected_n, 0), rel=0.03, abs=1e-4 * expected_n)
 
 
-def test_a_cell_carries_as_much_as_it_is_covered():
-    solver = ContactSolver(Layer(), SIZE, CELL_MM, torch.float64)
-    one, cover = np.full((3, SIZE, SIZE), NOTHING_MM, dtype=np.float32), np.zeros((3, SIZE, SIZE), dtype=np.float32)
-    one[:, 20, 20] = 0
-    cover[:, 20, 20] = 1, 0.5, 1 / 16
-    whole, half, corner = solver.solve(one, covered=cover, tolerance=1e-9)[0][:, 20, 20]
-    assert whole == pytest.approx(1 / solver.cell_compliance_mm_per_mpa)
-    assert (half / whole, corner / whole) == pytest.approx((0.5, 1 / 16))
-
-
 def test_presses_that_cannot_be_are_refused():
     solver = ContactSolver(Layer(), SIZE, CELL_MM)
     for depth_mm in (0.0, np.array([0.1, np.nan])):
@@ -213,3 +217,87 @@ def test_a_magnet_near_its_chip_or_through_it_is_refused():
         movement[3, 2] = down_mm
         with pytest.raises(ValueError, match=told):
             array.change_mt(movement)
+
+
+PIXEL_MM = USPA44.pitch_mm / TRACTION_SCALE
+
+
+@pytest.fixture(scope="module")
+def pad():
+    return GrippedPad(NOMINAL)
+
+
+PLACED = Pose(0.5, -0.5, 20.0)
+
+
+def figure(pad, name="C", pose=PLACED):
+    """Heights of a figure under the pad, (1, m, m) in [mm]."""
+    return heights_of(name, pose, pad)[None]
+
+
+def face(pad):
+    return np.zeros((1, *np.broadcast_shapes(*(places.shape for places in pad.places_mm))), np.float32)
+
+
+def press(pad, heights_mm, depth_mm=0.2, slide_mm=(0.0, 0.0), twist_rad=0.0, friction=0.5, cover=BARE, **options):
+    """One press."""
+    return pad.press(
+        heights_mm,
+        np.array([depth_mm]),
+        np.array([slide_mm]),
+        np.array([twist_rad]),
+        np.array([friction]),
+        [cover],
+        **options,
+    )
+
+
+@pytest.mark.parametrize(("slide_mm", "twist_rad"), [((0.1, 0.0), 0.0), ((0.0, -0.3), 0.0), ((0.05, 0.1), 0.03)])
+def test_traction_adds_up_to_force_and_twist(pad, slide_mm, twist_rad):
+    done = press(pad, figure(pad), 0.3, slide_mm, twist_rad, friction=0.6)
+    added_n = done.traction_kpa[0].sum(axis=(1, 2)) * 1e-3 * PIXEL_MM**2
+    assert added_n == pytest.approx(done.force_n[0], rel=1e-4, abs=1e-5)
+    across_mm = (np.arange(8) - 3.5) * PIXEL_MM
+    x_kpa, y_kpa, _ = done.traction_kpa[0]
+    twist = float((y_kpa * across_mm - x_kpa * across_mm[:, None]).sum() * 1e-3 * PIXEL_MM**2)
+    # Coarse pixels know no arm within themselves: off by 5 % of force times the pixel, measured.
+    most = 0.08 * float(np.abs(done.force_n[0, :2]).max()) * PIXEL_MM
+    assert twist == pytest.approx(float(done.twist_nmm[0]), abs=most + 1e-3)
+    assert np.abs(done.force_n[0, :2]).max() > 0.1 or abs(done.twist_nmm[0]) > 1, "it is dragged"
+
+
+@pytest.mark.parametrize("name", ["C", "O"])
+def test_every_frame_of_a_whole_tap_is_a_press_of_its_depth(pad, name):
+    pose = Pose(1.0, -0.5, 30.0)
+    heights = figure(pad, name, pose)
+    tap = pad.tap(heights, 5.0)
+    assert tap.indentation_mm[0] == pytest.approx(tap.indentation_mm[0, -1] * np.arange(1, FRAMES + 1) / FRAMES)
+    reached = tap.force_n[0, -1] == pytest.approx(5.0, rel=1e-3)
+    assert reached or tap.indentation_mm[0, -1] == pytest.approx(MAX_INDENTATION_MM)
+    for frame in (4, -1):
+        depth_mm = float(tap.indentation_mm[0, frame])
+        done = press(pad, heights, depth_mm)
+        assert np.abs(done.counts[0] - tap.counts[0, frame]).max() < 1e-3 * np.abs(tap.counts[0, -1]).max()
+        assert done.force_n[0, 2] == pytest.approx(tap.force_n[0, frame], rel=1e-4)
+        true = resample(tap.unit_patterns, FINE_SCALE, SCALE) * depth_mm
+        assert np.abs(done.patterns - true).max() < 1e-3 * depth_mm
+        assert np.array_equal(done.touching, resample_touching(tap.touching, FINE_SCALE, SCALE))
+    fine = press(pad, heights, 0.2, scale=FINE_SCALE)
+    assert fine.patterns.shape == tap.unit_patterns.shape and np.array_equal(fine.touching, tap.touching)
+
+
+def test_a_press_that_takes_too_much_force_goes_less_deep():
+    stiff = GrippedPad(replace(NOMINAL, thickness_mm=3.6, shear_modulus_mpa=0.15))
+    free = stiff.tap(face(stiff), 1e3)
+    held = press(stiff, face(stiff), 0.5)
+    assert free.force_n[0, -1] > 1.3 * MOST_FORCE_N
+    assert 0.7 * MOST_FORCE_N < held.force_n[0, 2] <= MOST_FORCE_N
+    assert held.indentation_mm[0] < free.indentation_mm[0, -1] == 0.5
+    assert held.patterns.max() == pytest.approx(held.indentation_mm[0], rel=1e-4)
+    light = press(stiff, face(stiff), 0.1)
+    assert light.indentation_mm[0] == pytest.approx(0.1) and light.force_n[0, 2] < MOST_FORCE_N
+
+
+def test_nothing_under_the_pad_is_refused(pad):
+    with pytest.raises(SurfaceError, match="nothing lies under the pad"):
+        press(pad, np.full_like(face(pad), NOWHERE_MM))

@@ -35,30 +35,15 @@ def contacts(mixture, count, gains, constants, seed):
     return (drawn * gains * rng.uniform(400, 700, (count, 1))).reshape(count, 3, 4, 4).astype(np.float32)
 
 
-def sensor(mixture, seed, count=100):
-    """True log-gains (48,) and constants (p,), and what contacts tell of them."""
-    rng = np.random.default_rng([1, seed])
-    log_gains = rng.normal(0, 0.075, (3, 16)).clip(-0.15, 0.15)
+def test_what_contacts_tell_is_found_and_the_rest_keeps_its_prior(mixture):
+    log_gains = np.random.default_rng(1).normal(0, 0.075, (3, 16)).clip(-0.15, 0.15)
     log_gains = (log_gains - log_gains.mean(axis=1, keepdims=True)).ravel()
     constants = np.zeros(len(CONSTANTS))
-    constants[2] = rng.uniform(-0.8, 0.8)
-    read = contacts(mixture, count, np.exp(log_gains), constants, seed)
-    return log_gains, constants, learned(read, mixture.model(widening=1.3))
-
-
-def test_gains_are_recovered_within_their_intervals(mixture):
-    cases = [sensor(mixture, seed) for seed in range(8)]
-    true = np.array([case[0] for case in cases])
-    found = np.log([case[2].gains for case in cases])
-    half = np.array([case[2].pad().gain_half_widths for case in cases])
-    assert np.sqrt(((found - true) ** 2).mean()) < np.sqrt((true**2).mean()) / 2
-    assert (np.abs(found - true) <= half).mean() > 0.85
-    for _, constants, one in cases:
-        assert one.constants[2] == pytest.approx(constants[2], abs=0.15)
-
-
-def test_what_contacts_do_not_tell_keeps_its_prior(mixture):
-    _, _, found = sensor(mixture, 3)
+    constants[2] = 0.5
+    found = learned(contacts(mixture, 100, np.exp(log_gains), constants, 3), mixture.model(widening=1.3))
+    off, half = np.abs(np.log(found.gains) - log_gains), found.pad().gain_half_widths
+    assert np.sqrt((off**2).mean()) < np.sqrt((log_gains**2).mean()) / 2 and (off <= half).mean() > 0.85
+    assert found.constants[2] == pytest.approx(0.5, abs=0.15)
     silent = [0, 1, 3, 4, 5, 6]
     np.testing.assert_allclose(found.constants[silent], 0, atol=1e-9)
     np.testing.assert_allclose(found.constant_deviations[silent], 1 / np.sqrt(3))

@@ -1,16 +1,18 @@
+"""What differs from sensor to sensor: faults of readings, and pads, told to a network as by the runtime."""
+
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 import pytest
+from edge_samples import make_pad_contract
 
 from edge.perception.contact_options import ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44
-from train.physics.sensor_noise import (
-    NAMES,
-    Nuisances,
-    apply_nuisances,
-    frame_weights,
-)
+from firmware_bridge.scans.pad_constants import PAD_RANGES
+from firmware_bridge.scans.pad_constants import Pad as KnownPad
+from train.physics.pad_draws import INPUTS, KNOWN, RANGES, Pad, constants, draw_pad, input_scale, known_numbers
+from train.physics.sensor_noise import NAMES, Nuisances, apply_nuisances, frame_weights
 
 NONE = Nuisances().without(*NAMES)
 STRONG = Nuisances(
@@ -37,10 +39,6 @@ def presses(n=5, taps=3, frames=8, counts=1e5):
     return (peak * np.linspace(1 / frames, 1, frames)[:, None, None, None] ** 1.5).astype(np.float32)
 
 
-def zeros(n=5, taps=3, frames=8):
-    return np.zeros((n, taps, frames, 3, 4, 4), dtype=np.float32)
-
-
 @pytest.mark.parametrize("off", [None, *ACTING])
 def test_each_acts_by_itself_and_in_its_turn(off):
     """All at once is one after the other, each run alone: so no draw depends on what else is on."""
@@ -52,14 +50,6 @@ def test_each_acts_by_itself_and_in_its_turn(off):
     assert np.abs(together - in_turn).max() <= 4
     changed = np.abs(together - apply_nuisances(presses(), STRONG, 7, angle_deg=ANGLES_DEG)).max()
     assert (changed > 100) == (off is not None)
-
-
-def test_the_seed_alone_decides():
-    def read(seed):
-        return apply_nuisances(presses(), STRONG, seed)
-
-    assert np.array_equal(read(4), read(4))
-    assert (read(4) != read(5)).any() and (read(4) != read([4, 1])).any()
 
 
 def test_all_off_only_rounds_and_leaves_its_input_alone():
@@ -96,3 +86,30 @@ def test_closed_form_and_steps_are_the_same_hysteresis(relaxation):
     course = np.concatenate([np.zeros((1, 5)), press])
     stepped = maxwell(course, np.arange(frames + 1) * step_s, share, relaxation)
     assert np.allclose(weights[0, 0] @ press, stepped[1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("gains", [None, (1.0,) * 48])
+def test_training_and_runtime_tell_a_network_the_same_of_a_pad(gains):
+    """Pads drawn for training equal those that the runtime makes of a sensor's file."""
+    takes = make_pad_contract(pad_inputs=tuple(input_scale()))
+    assert takes.pad_width == KNOWN
+    for number in range(20):
+        pad = draw_pad(np.random.default_rng([7, number]))
+        scaled = constants(pad)[None]
+        told = known_numbers(scaled, np.ones(scaled.shape, dtype=bool), np.array([0.9 if gains else 0.0]))[0]
+        known = KnownPad(**{name: getattr(pad, name) for name in INPUTS}, gains=gains)
+        assert np.allclose(takes.pad_row(known), told, atol=1e-6)
+        assert abs(scaled).max() <= 2
+    some = KnownPad(thickness_mm=5.0)
+    flags = np.array([[name == "thickness_mm" for name in INPUTS]])
+    told = known_numbers(constants(Pad(thickness_mm=5.0))[None], flags, np.array([False]))[0]
+    assert np.allclose(takes.pad_row(some), told, atol=1e-6)
+    assert not takes.pad_row(None).any()
+
+
+def test_a_sensor_file_can_hold_every_constant_that_is_drawn():
+    assert set(INPUTS) <= set(PAD_RANGES) and set(INPUTS) <= set(RANGES)
+    for name, centre, spread in input_scale():
+        low, high = PAD_RANGES[name]
+        assert low <= RANGES[name][0] < RANGES[name][1] <= high, name
+        assert low <= centre <= high and 0 < spread < inf

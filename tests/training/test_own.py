@@ -77,13 +77,8 @@ def test_what_is_worse_is_not_handed_over(tmp_path):
     found = knowledge_of(FILE, "4")
     tiny = ModelSession(write_model(tmp_path / "tiny.onnx", make_contract(scale=10, taps=1, output_full_scale=0.5)))
     table, objection = compared(tiny, found, sets, [])
-    assert [line.split(" | ")[0] for line in table.splitlines()] == [
-        "method",
-        OWN,
-        "stsr-int8",
-        "bilinear",
-        "over stsr-int8",
-    ]
+    rows = [line.split(" | ")[0] for line in table.splitlines()]
+    assert rows == ["method", OWN, "stsr-int8", "bilinear", "over stsr-int8"]
     assert objection is not None and "on figures it is -" in objection and "to stsr-int8" in objection
     rest = Baseline.from_counts("xela_4", np.full((2, 3, 4, 4), 30_000), created_unix_s=0.0)
     free = Grip("untouched", np.full((30, 3, 4, 4), 30_000), rest)

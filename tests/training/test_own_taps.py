@@ -83,39 +83,25 @@ def test_other_truths_are_there_to_compare(tapped, capsys, truth):
     assert (truth == "depth") == (not made.patterns[~inside].any()), "alone it has no reach"
 
 
-def without_poses(folder):
-    lines = (folder / "plate.csv").read_text().splitlines()
-    return "\n".join(",".join(line.split(",")[:-3]) for line in lines)
-
-
-def of_another_frame(folder):
-    lines = [line.split(",") for line in (folder / "plate.csv").read_text().splitlines()]
-    mirrored = [lines[0], *([*one[:-3], f"{-float(one[-3])}", *one[-2:]] for one in lines[1:])]
-    return "\n".join(map(",".join, mirrored))
-
-
-def elsewhere(folder):
-    lines = [line.split(",") for line in (folder / "plate.csv").read_text().splitlines()]
-    far = [lines[0], *([*one[:-3], "500", *one[-2:]] for one in lines[1:])]
-    return "\n".join(map(",".join, far))
-
-
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "lines", "complaint"),
     [
-        (without_poses, "has no poses: record with --poses, or add columns pose_x_mm"),
-        (of_another_frame, "the readings do not fit what lies under the poses: likeness 0."),
-        (elsewhere, "the pad never touches the surface at a pose"),
+        (lambda row: row[:-3], None, "has no poses: record with --poses, or add columns pose_x_mm"),
         (
-            lambda folder: "\n".join((folder / "plate.csv").read_text().splitlines()[:900]),
-            "places, expected at least 27",
+            lambda row: [*row[:-3], f"{-float(row[-3])}", *row[-2:]],
+            None,
+            "the readings do not fit what lies under the poses: likeness 0.",
         ),
-        (lambda folder: "\n".join((folder / "plate.csv").read_text().splitlines()[:99]), "has no tap with a pose"),
+        (lambda row: [*row[:-3], "500", *row[-2:]], None, "the pad never touches the surface at a pose"),
+        (list, 900, "places, expected at least 27"),
+        (list, 99, "has no tap with a pose"),
     ],
 )
-def test_a_bad_recording_is_one_line(tapped, tmp_path, change, complaint):
+def test_a_bad_recording_is_one_line(tapped, tmp_path, change, lines, complaint):
     folder, _ = tapped
-    (tmp_path / "bad.csv").write_text(change(folder) + "\n")
+    header, *rows = [line.split(",") for line in (folder / "plate.csv").read_text().splitlines()[:lines]]
+    changed = [change(row) for row in rows]
+    (tmp_path / "bad.csv").write_text("".join(f"{','.join(row)}\n" for row in [header[: len(changed[0])], *changed]))
     with pytest.raises(SystemExit, match=rf"^train\.taps: .*{complaint}[^\n]*$"):
         taps.main(arguments(folder, recording=tmp_path / "bad.csv"))
 
@@ -189,8 +175,6 @@ class Evil:
         [{"depth": np.eye(2)}],
         [3],
         [Evil(bytearray, 1 << 40)],
-        [Evil(np.ndarray.tofile)],
-        [Evil(np.load)],
     ],
 )
 def test_a_hostile_or_wrong_file_is_one_line_and_runs_nothing(tapped, tmp_path, capsys, held):

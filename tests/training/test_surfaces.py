@@ -1,10 +1,14 @@
-"""Surfaces by name, and their depth under the pad."""
+"""Surfaces by name, their depth under the pad, and taps on them, which see a shape from their poses."""
 
 import numpy as np
 import pytest
 import trimesh
 
-from train.errors import SurfaceError
+from train.errors import MeshError, SurfaceError
+from train.families.family_shares import SHARES, draw_shape
+from train.families.shapes import NOWHERE_MM
+from train.physics.gripped import GrippedPad
+from train.physics.pad_draws import NOMINAL
 from train.surfaces.depth_image import NOTHING_MM, Pose, Relief, depth_image
 from train.surfaces.named_surfaces import (
     AREA_MM2,
@@ -16,6 +20,16 @@ from train.surfaces.named_surfaces import (
     figure,
     relief,
     surface_mesh,
+)
+from train.surfaces.poses import (
+    HELD_OUT_RADIUS_MM,
+    MAX_TAPS,
+    PLACES_MM,
+    REACH_MM,
+    SCHEDULES,
+    SURFACE_REACH_MM,
+    random_poses,
+    turns,
 )
 
 SIZE, CELL_MM = 42, 0.47
@@ -68,25 +82,68 @@ def test_a_slope_is_exact_at_every_pixel(angle_deg):
     assert 0 <= depth.min() <= 0.13 * np.sqrt(2) * CELL_MM / 2
 
 
-def test_a_dome_is_as_deep_as_a_sphere_wherever_it_stands():
-    ball = trimesh.creation.icosphere(subdivisions=6, radius=8.0).apply_translation([0, 0, -8.0])
-    for x_mm, y_mm in np.random.default_rng(3).uniform(-1, 1, (4, 2)):
-        depth = depth_image(Relief("ball", ball), Pose(x_mm, y_mm, 0.0), SIZE, CELL_MM)
-        square = (x_mm + ALONG_MM) ** 2 + (y_mm - ALONG_MM[:, None]) ** 2
-        expected = 8 - np.sqrt(np.maximum(64 - square, 0))
-        assert np.abs(depth - expected)[expected < 1].max() < 2e-3  # facets
-
-
 def test_what_is_finer_than_a_cell_is_not_felt():
     slab, needle = trimesh.creation.box([20, 20, 1]), trimesh.creation.box([0.2, 0.2, 3])
     assert np.allclose(depth_image(Relief("needle", slab + needle), CENTRE, SIZE, CELL_MM), 0, atol=1e-6)
 
 
-def test_a_pose_beside_the_surface_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"surface 'I' lies under the pad at Pose\(x_mm=50"):
-        depth_image(relief("I"), Pose(50, 0, 0), SIZE, CELL_MM)
-
-
 def test_a_letter_stands_upright_as_seen_through_the_pad():
     letter = depth_image(relief("F"), CENTRE, 41, 0.5) < FIGURE_HEIGHT_MM / 2
     assert letter[:20].sum() > letter[21:].sum() and letter[:, :20].sum() > letter[:, 21:].sum()
+
+
+@pytest.fixture(scope="module")
+def pad():
+    return GrippedPad(NOMINAL)
+
+
+@pytest.mark.parametrize("family", SHARES)
+def test_every_family_gives_finite_heights_that_reach_the_pad(pad, family):
+    for seed in range(6):
+        heights_mm = draw_shape(np.random.default_rng(seed), family, pad, turns(np.random.default_rng(), 2)).heights_mm
+        assert np.isfinite(heights_mm).all() and (heights_mm.max(axis=(1, 2)) > -50).all()
+    with pytest.raises(MeshError, match="No such file"):
+        draw_shape(np.random.default_rng(0), "mesh:absent.stl", pad, turns(np.random.default_rng(), 1))
+
+
+@pytest.mark.parametrize("family", ["glyph", "polygon", "relief", "block"])
+def test_a_tap_sees_the_shape_from_its_pose(pad, family):
+    """Heights from another pose are those of the newest tap at the places that the pose says."""
+    poses = np.array([[0, 0, 0], [2.0, -1.0, 30.0], [-1.5, 2.5, -20.0]])
+    tapped = draw_shape(np.random.default_rng(4), family, pad, poses)
+    assert np.array_equal(tapped.poses, poses) and np.allclose(np.diff(tapped.angle_deg), np.diff(-poses[:, 2]))
+    x_mm, y_mm = np.broadcast_arrays(*pad.places_mm)
+    step_mm = x_mm[0, 1] - x_mm[0, 0]
+    for (right, down, turn_deg), heights in zip(poses[1:], tapped.heights_mm[1:], strict=True):
+        cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+        col = np.rint((cosine * x_mm - sine * y_mm + right - x_mm[0, 0]) / step_mm).astype(int)
+        row = np.rint((sine * x_mm + cosine * y_mm + down - y_mm[0, 0]) / step_mm).astype(int)
+        inside = (np.minimum(row, col) >= 0) & (np.maximum(row, col) < len(heights))
+        ours = tapped.heights_mm[0][row.clip(0, len(heights) - 1), col.clip(0, len(heights) - 1)]
+        off = np.abs(np.maximum(ours, -3) - np.maximum(heights, -3))[inside]
+        assert np.median(off) < 0.05 and (off < 0.3).mean() > 0.93
+
+
+def test_a_tap_that_would_miss_the_shape_lands_nearer(pad):
+    poses = np.array([[0, 0, 0], [100.0, 0, 10.0]])
+    tapped = draw_shape(np.random.default_rng(1), "solid", pad, poses)
+    assert 0 < tapped.poses[1, 0] < 100 and tapped.poses[1, 2] == 10
+    assert tapped.heights_mm[1].max() > NOWHERE_MM / 2
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+def test_every_schedule_stays_within_reach(name):
+    for seed in range(30):
+        poses = SCHEDULES[name](np.random.default_rng(seed), MAX_TAPS)
+        assert poses.shape == (MAX_TAPS, 3) and not poses[0].any()
+        assert np.hypot(*poses[:, :2].T).max() <= REACH_MM + 1e-9
+        assert SCHEDULES[name](np.random.default_rng(seed), 1).shape == (1, 3)
+
+
+def test_random_poses_keep_away_from_held_out_positions():
+    drawn = np.array(random_poses(np.random.default_rng(1), 3000))
+    for place_mm in PLACES_MM.values():
+        distance_mm = np.hypot(*(drawn[:, :2] - place_mm).T)
+        assert HELD_OUT_RADIUS_MM < distance_mm.min() < HELD_OUT_RADIUS_MM + 0.1
+    assert (np.abs(drawn[:, :2]).max(axis=0) > 0.97 * SURFACE_REACH_MM).all() and np.ptp(drawn[:, 2]) > 350
+    assert np.abs(drawn[:, :2]).max() <= SURFACE_REACH_MM

@@ -1,4 +1,4 @@
-"""Worlds of pads and shapes: every pad by itself, the same bytes after a kill, and one line where it cannot be made."""
+"""Worlds of pads and shapes: each pad by itself, the same bytes after a kill, and one line for what cannot be made."""
 
 import os
 import re
@@ -14,13 +14,21 @@ import shapely
 import trimesh
 from edge_samples import ROOT
 
+from edge import api
+from export.to_onnx import export
+from firmware_bridge.pad_geometry import USPA44, USPA46
+from train.data.frozen_presses import freeze_presses
 from train.data.make_presses import main, make_presses, quiet_workers
 from train.data.presses import load_presses
 from train.data.world import INDENTATION_MM, LEAST_FORCE_N, World, solve_pad
 from train.errors import DatasetError, ended_by_errors
-from train.families.family_shares import SHARES
-from train.physics.gripped import MOST_FORCE_N
-from train.physics.pad_draws import INPUTS
+from train.families.family_shares import SHARES, tap
+from train.learning.checkpoint import Training, fit_network
+from train.learning.training_loop import Recipe
+from train.physics.gripped import MOST_FORCE_N, GrippedPad
+from train.physics.pad_draws import INPUTS, KNOWN, NOMINAL
+from train.physics.taxel_response import on_pad
+from train.surfaces.depth_image import Pose
 from train.surfaces.poses import REACH_MM
 
 SMALL = World(count=11, taps=2, per_pad=4, seed=5)
@@ -50,20 +58,9 @@ def test_what_is_made_is_what_was_asked_for(small):
     assert not small.with_name("small.npz.parts").exists()
 
 
-@pytest.mark.parametrize("begun", [0.0, 1.0])
-def test_newest_taps_that_have_only_begun_are_lighter(begun):
-    """Level faces, so that force goes with depth wherever the pad taps."""
-    world = World(
-        count=24, taps=2, per_pad=24, families={"flat": 1.0}, spread=0.0, schedule="turns", begun=begun, seed=2
-    )
-    z_counts = solve_pad(world, 0).counts[:, :, 2].sum(axis=(2, 3))
-    share = z_counts[:, 0] / z_counts[:, 1]
-    assert np.median(share) == pytest.approx(1.0 if begun == 0 else 0.65, abs=0.15)
-
-
-def part_of(path, number, presses, world=SMALL):
+def part_of(path, number, presses):
     """Write what a run leaves that was cut short."""
-    replace(presses, config=world.facts()).save(path.with_name(f"{path.name}.parts") / f"{number:06d}.npz")
+    replace(presses, config=SMALL.facts()).save(path.with_name(f"{path.name}.parts") / f"{number:06d}.npz")
 
 
 def test_a_run_that_was_cut_short_goes_on_to_the_same_bytes(small, tmp_path):
@@ -178,3 +175,39 @@ def test_what_cannot_be_made_is_said_in_one_line(tmp_path, monkeypatch, options,
     trimesh.creation.annulus(r_min=28.0, r_max=30.0, height=3.0).export("ring.stl")
     with pytest.raises(SystemExit, match=rf"^train\.data\.make_presses: .*{told}[^\n]*$"):
         main(["out.npz", "--count", "2", *options])
+
+
+SCALE, OPTIONS = 4, {"channels": 16, "blocks": 1, "group": "p2", "known": KNOWN}
+TRAINING = Training("pad46", "compact-stsr", Recipe(steps=30, batch=12, learning_rate=8e-3), SCALE, options=OPTIONS)
+PAD46 = World(count=24, per_pad=24, families={"large square": 1.0, "C": 1.0}, spread=0.0, scale=SCALE, pad="uSPa46")
+
+
+def test_a_network_of_another_pad_learns_and_says_of_which(tmp_path):
+    presses = solve_pad(PAD46, 0)
+    seen = freeze_presses(presses, 1).as_frozen_set()
+    begun = replace(TRAINING, name="begun", recipe=replace(TRAINING.recipe, steps=6))
+    first, last = (fit_network(one, presses, seen, tmp_path)["validation_psnr_db"] for one in (begun, TRAINING))
+    assert last > first + 1
+    export(tmp_path / "pad46.pt", tmp_path, seen)
+    contract = api.load_model(tmp_path / "pad46.onnx").contract
+    assert (contract.sensor, contract.pattern_shape) == ("uSPa46", (16, 24))
+    assert (USPA46.name, USPA46.pattern_shape(SCALE)) == ("uSPa46", (16, 24))
+
+
+def test_nothing_touches_beyond_a_rectangular_pad():
+    pad = GrippedPad(replace(NOMINAL, model="uSPa46"))
+    poses = (Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 180.0))
+    taps = tap(pad, ["large square"] * 2, poses, 2.0)
+    assert taps.unit_patterns.shape == (2, 80, 120) and taps.counts.shape[2:] == (3, 4, 6)
+    once, turned = taps.counts[:, -1]
+    signs = np.array([-1, -1, 1])[:, None, None]
+    np.testing.assert_allclose(turned, signs * once[:, ::-1, ::-1], atol=0.02 * np.abs(once).max())
+    cells = on_pad(USPA46, pad.size, pad.cell_mm)
+    assert cells.shape == (60, 60) and cells.sum() == 40 * 60
+    assert on_pad(USPA44, 42, 0.47).all()
+
+
+def test_a_set_of_the_default_pad_keeps_its_name():
+    assert "pad" not in World(count=1).facts() and PAD46.facts()["pad"] == "uSPa46"
+    with pytest.raises(DatasetError, match="pad is 'uSPa4', expected one of uSPa44, uSPa46"):
+        World(pad="uSPa4")

@@ -1,0 +1,221 @@
+"""Networks: compact ones, symmetric ones, and those that fuse taps of any poses, of which one tap is one tap."""
+
+import pytest
+import torch
+from press_samples import make_press_set
+
+from train.data.press_batches import Batch, PosedBatches
+from train.networks.blocks import relative_rms_error
+from train.networks.compact import CompactNet, HeteroscedasticError, heteroscedastic_loss
+from train.networks.fusion import FusionNet
+from train.networks.named_networks import grown
+from train.networks.symmetric import Channels, scalars, symmetries, vectors, write_out
+
+
+@pytest.fixture(scope="module")
+def net():
+    torch.manual_seed(0)
+    return CompactNet(4, 10, channels=16, blocks=2).eval()
+
+
+def window(count=3, taps=4, cols=4):
+    return torch.randn(count, 3 * taps, 4, cols, generator=torch.Generator().manual_seed(0))
+
+
+def truth_like(pattern):
+    return 0.3 * torch.rand(pattern.shape, generator=torch.Generator().manual_seed(5))
+
+
+@pytest.mark.parametrize(("taps", "channels", "said"), [(0, 16, "at least 1"), (1, 6, "multiple of the 4 symmetries")])
+def test_taps_and_channels_out_of_range_are_refused(taps, channels, said):
+    with pytest.raises(ValueError, match=said):
+        CompactNet(taps, 4, channels, 1)
+
+
+def test_absent_taps_are_the_same_as_fewer_taps(net):
+    given = window()
+    given[:, 6:] = 0
+    fewer = CompactNet(2, 10, channels=16, blocks=2, group=net.group).eval()
+    fewer.take_over(net)
+    for output, expected in zip(net(given), fewer(given[:, :6]), strict=True):
+        assert torch.allclose(output, expected, atol=1e-6 * float(output.detach().abs().max()) + 1e-6)
+
+
+@pytest.mark.parametrize("other", [{"channels": 32}, {"blocks": 2}, {"known": 13}])
+def test_another_width_is_not_taken_over(other):
+    start = CompactNet(1, 4, **{"channels": 16, "blocks": 1, **other})
+    with pytest.raises(ValueError, match="its width and inputs of the pad are"):
+        CompactNet(2, 4, 16, 1).take_over(start)
+
+
+def test_patterns_are_cut_at_zero_in_use_alone(net):
+    assert net(window())[0].min() == 0
+    assert net.train()(window())[0].min() < 0
+    net.eval()
+
+
+def test_the_pattern_learns_as_if_there_were_no_deviation():
+    torch.manual_seed(2)
+    net = CompactNet(2, 4, 16, 1).train()
+    learns = {name: value for name, value in net.named_parameters() if not name.startswith("traction")}
+    pattern, deviation, _ = net(window(taps=2))
+    truth = truth_like(pattern)
+    of_both = torch.autograd.grad(heteroscedastic_loss(pattern, deviation, truth), list(learns.values()))
+    pattern, *_ = net(window(taps=2))
+    alone = torch.autograd.grad(relative_rms_error(pattern, truth), list(learns.values()), allow_unused=True)
+    for name, both, one in zip(learns, of_both, alone, strict=True):
+        if name.startswith("uncertainty"):
+            assert one is None
+            assert both.abs().max() > 0
+        else:
+            assert torch.equal(both, one)
+
+
+def test_what_is_known_of_the_pad_changes_the_outputs():
+    torch.manual_seed(0)
+    net = CompactNet(1, 4, channels=16, blocks=1, known=3).eval()
+    unknown, zeros = net(window(taps=1)), net(window(taps=1), torch.zeros(3, 3))
+    assert all(torch.equal(one, other) for one, other in zip(unknown, zeros, strict=True))
+    assert not torch.allclose(unknown[0], net(window(taps=1), torch.ones(3, 3))[0])
+
+
+def test_light_pulls_count_as_much_as_firm_ones():
+    torch.manual_seed(0)
+    net = CompactNet(1, 4, channels=16, blocks=1)
+    pattern, _, traction = net(window(taps=1))
+    truth, pulled = truth_like(pattern), torch.randn(traction.shape)
+    loss = HeteroscedasticError().loss
+    alone = float(loss(net, Batch(window(taps=1), truth)).detach())
+    share = [
+        float(loss(net, Batch(window(taps=1), truth, traction=(traction.detach() + pulled * size))).detach()) - alone
+        for size in (100.0, 1e4)
+    ]
+    assert 0 < share[0] == pytest.approx(share[1], rel=0.1)
+    right = loss(net, Batch(window(taps=1), truth, traction=traction.detach()))
+    assert float(right.detach()) == pytest.approx(alone, abs=1e-6)
+
+
+TOLERANCE = 1e-5
+
+
+def moved(maps, channels: Channels, number: int):
+    """Maps (n, channels, H, W) after one of the symmetries: places move, and channels among each other."""
+    index, sign = torch.from_numpy(channels.index[number].copy()), torch.from_numpy(channels.sign[number].copy())
+    placed = symmetries(channels.group)[number](maps.detach().numpy())
+    return torch.from_numpy(placed.copy())[:, index] * sign[:, None, None]
+
+
+def test_x_points_up_after_a_quarter_turn_and_left_in_a_mirror():
+    right = torch.zeros(1, 3, 3, 3)
+    right[0, 0, 1, 2] = 1  # x at the right edge
+    right[0, 2] = 0.5  # z does not turn
+    channels = vectors("p4m")
+    turned, mirrored = moved(right, channels, 1), moved(right, channels, 4)
+    assert turned[0, 1, 0, 1] == -1 and turned[0, :2].abs().sum() == 1, "y points down the rows"
+    assert mirrored[0, 0, 1, 0] == -1 and mirrored[0, :2].abs().sum() == 1
+    assert (turned[0, 2] == 0.5).all() and (mirrored[0, 2] == 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("taps", "group", "count", "cols"),
+    [(1, "p4m", 8, 4), (1, "p4", 4, 4), (4, "p4", 4, 4), (2, "p2", 2, 4), (1, "p2", 2, 6)],
+)
+def test_the_whole_network_keeps_every_symmetry(taps, group, count, cols):
+    """Pattern and deviation move as they are, the traction's vectors turn, for any input about the pad."""
+    torch.manual_seed(0)
+    learning = CompactNet(taps, 10, channels=16, blocks=2, known=5, group=group).eval()
+    given, pad = window(taps=taps, cols=cols), torch.randn(3, 5, generator=torch.Generator().manual_seed(1))
+    enter, kinds = vectors(group, taps), (scalars(group, 1), scalars(group, 1), vectors(group))
+    for net in (learning, write_out(learning)):
+        with torch.inference_mode():
+            outputs = net(given, pad)
+            assert all(maps.max() > 0 for maps in outputs)
+            for number in range(count):
+                for got, maps, kind in zip(net(moved(given, enter, number), pad), outputs, kinds, strict=True):
+                    expected = moved(maps.reshape(3, len(kind), *maps.shape[-2:]), kind, number).reshape(got.shape)
+                    assert (got - expected).abs().max() <= TOLERANCE * maps.abs().max()
+
+
+KNOWN = 5
+
+
+@pytest.fixture(scope="module")
+def fused():
+    """Small network whose earlier taps matter."""
+    torch.manual_seed(0)
+    net = FusionNet(7, 10, channels=16, blocks=2, known=KNOWN).eval()
+    for part in (net.receive, net.revise):
+        for free in part.parameters():
+            torch.nn.init.normal_(free, 0, 0.1)
+    net.own_share.data += 0.3
+    return net
+
+
+@pytest.fixture(scope="module")
+def inputs():
+    rng = torch.Generator().manual_seed(1)
+    window, pad = torch.randn(2, 9, 4, 4, generator=rng), torch.randn(2, KNOWN, generator=rng)
+    poses = torch.randn(2, 3, 5, generator=rng) * torch.tensor([2, 2, 30, 0.3, 1.0])
+    poses[:, :, 3:] = poses[:, :, 3:].abs()
+    poses[:, 0] = 0
+    return window, pad, poses
+
+
+def run(net, *inputs):
+    with torch.inference_mode():
+        return net(*inputs)
+
+
+def test_one_tap_is_the_network_of_one_tap_it_started_from(inputs):
+    torch.manual_seed(3)
+    one = CompactNet(1, 10, channels=16, blocks=2, known=KNOWN).eval()
+    grew = grown(one, "fusion-mtsr4", 10, channels=16, blocks=2, known=KNOWN).eval()
+    window, pad, _ = inputs
+    for ours, theirs in zip(run(grew, window[:, :3], pad), run(one, window[:, :3], pad), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_after_training_one_tap_is_still_one_tap(fused, inputs):
+    window, pad, poses = inputs
+    alone = run(fused, window[:, :3], pad, poses[:, :1])[0]
+    empty = torch.cat([window[:, :3], torch.zeros(2, 6, 4, 4)], dim=1)
+    assert torch.equal(run(fused, empty, pad, poses)[0], alone)
+    assert not torch.allclose(run(fused, window, pad, poses)[0], alone, atol=1e-3)
+
+
+def test_a_quarter_turn_of_everything_turns_the_pattern(fused, inputs):
+    window, pad, poses = inputs
+    turned = torch.rot90(window.unflatten(1, (3, 3)), 1, (-2, -1))
+    turned = torch.stack([turned[:, :, 1], -turned[:, :, 0], turned[:, :, 2]], dim=2).flatten(1, 2)
+    round_ = poses.clone()
+    round_[..., 0], round_[..., 1] = poses[..., 1], -poses[..., 0]
+    expected = torch.rot90(run(fused, window, pad, poses)[0], 1, (-2, -1))
+    assert torch.allclose(run(fused, turned, pad, round_)[0], expected, atol=1e-5)
+
+
+def test_order_and_absence_of_earlier_taps_change_nothing(fused, inputs):
+    window, pad, poses = inputs
+    pattern = run(fused, window, pad, poses)[0]
+    order = [0, 2, 1]
+    shuffled = window.unflatten(1, (3, 3))[:, order].flatten(1, 2)
+    assert torch.allclose(run(fused, shuffled, pad, poses[:, order])[0], pattern, atol=1e-6)
+    longer = torch.cat([window, torch.zeros(2, 6, 4, 4)], dim=1)
+    padded = torch.cat([poses, torch.zeros(2, 2, 5)], dim=1)
+    assert torch.allclose(run(fused, longer, pad, padded)[0], pattern, atol=1e-6)
+
+
+def test_without_poses_the_schedule_of_the_paper_is_assumed(fused, inputs):
+    window, pad, _ = inputs
+    poses = torch.zeros(2, 3, 5)
+    poses[:, 1:, 2] = torch.tensor([5.0, 10.0])
+    poses[:, 1:, 3], poses[:, 1:, 4] = 0.2, 1.0
+    assert torch.equal(run(fused, window, pad)[0], run(fused, window, pad, poses)[0])
+
+
+def test_every_parameter_has_a_gradient():
+    presses = make_press_set(48, taps=4)
+    for given in ((1.0, 0, 0, 0), (0, 0, 0, 1.0)):
+        net = FusionNet(4, 10, channels=16, blocks=2, known=presses.constants.shape[1] * 2 + 1).train()
+        batch = PosedBatches(presses, given, 8, seed=1)(0)
+        HeteroscedasticError().loss(net, batch).backward()
+        assert all(part.grad is not None for part in net.parameters())
