@@ -120,20 +120,6 @@ class TestRuntime:
         result = self.runtime(model, **own).push(make_scan(0, press_counts=3000))
         assert (model.pads[0].tolist(), result.wrench_origin) == (pytest.approx(expected), origin)
 
-    @pytest.mark.parametrize(
-        ("settings", "expected"),
-        [
-            ({}, 0.45),  # 90 % of the even range of the sensors that the model was trained for
-            ({"counts_per_newton": 1500.0}, None),
-            ({"counts_per_newton": {"4": 1500.0, "6": 1500.0}, "scale_errors": {"4": 0.06}}, 0.06),
-            ({"pad": OTHER}, None),
-            ({"pad": replace(OTHER, intervals={"counts_per_newton": (1900.0, 2100.0)})}, 0.05),
-        ],
-    )
-    def test_a_record_states_how_far_its_newtons_may_be_off(self, settings, expected):
-        result = self.runtime(FakeModel(make_pad_contract()), **settings).push(make_scan(0))
-        assert result.scale_error == (None if expected is None else pytest.approx(expected))
-
     @pytest.mark.parametrize("takes_gains", [True, False])
     def test_gains_divide_what_the_network_sees_and_nothing_else(self, takes_gains):
         model = FakeModel(make_pad_contract(takes_gains=takes_gains))

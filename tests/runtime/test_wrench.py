@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
 
-from edge.api import USPA44, find_model, load_model
+from edge.api import USPA44, Pad, find_model, load_model
 from edge.inference.trust_model import features
 from edge.perception.pattern_description import Balance, wrench_of
 from edge.perception.result import LEAST_FORCE_N
@@ -132,3 +132,17 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
     assert both.wrench is not None and both.force_n == 20 and both.wrench_origin == "calibrated"
     told = force_and_torque(both, USPA44)
     assert told is not None and told[0] == both.wrench.force_n and not math.isnan(told[1][2])
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, 0.45),  # 90 % of the even range of the sensors that the model was trained for
+        ({"counts_per_newton": 1500.0}, None),
+        ({"counts_per_newton": {"4": 1500.0}, "scale_errors": {"4": 0.06}}, 0.06),
+        ({"pad": Pad(counts_per_newton=2000.0)}, None),
+        ({"pad": Pad(counts_per_newton=2000.0, intervals={"counts_per_newton": (1900.0, 2100.0)})}, 0.05),
+    ],
+)
+def test_a_record_states_how_far_its_newtons_may_be_off(settings, expected):
+    assert make_wrench_result(**settings).scale_error == (None if expected is None else pytest.approx(expected))
