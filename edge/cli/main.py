@@ -20,7 +20,7 @@ from edge.api import (
     UsageError,
     unfinished_load,
 )
-from edge.cli.command_table import COMMANDS, TABLE, runtime_options
+from edge.cli.option_table import COMMANDS, TABLE, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
 from firmware_bridge.errors import harmless

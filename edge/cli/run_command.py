@@ -40,7 +40,7 @@ from edge.api import (
     pump,
     save_baselines,
 )
-from edge.cli.command_table import runtime_options
+from edge.cli.option_table import runtime_options
 from edge.cli.user_commands import user_commands
 from edge.errors import SinkError
 from edge.pipeline.run_statistics import silence_hint
