@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, inferred
+from edge_samples import PERIOD_NS, REST
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
@@ -71,17 +71,6 @@ class TestChoice:
             scan = replace(scan, device_ns=scan.time_ns - before_ns)
         assert pad.runtime.push(scan).pose.x_mm == x_mm
 
-    def test_taps_without_a_pose_are_left_out_with_one_event_each(self):
-        pad = make_pad()
-        pad.tap()
-        pad.tap()
-        assert pad.kinds == [], "a sensor without poses is no fault"
-        pad.tap(PadPose(0, 0))
-        result = pad.tap(PadPose(1, 0))
-        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
-        pad.tap(PadPose(2, 0))
-        assert pad.kinds == ["tap_without_pose"] * 2
-
     def test_a_newest_scan_without_a_pose_is_used_alone(self):
         pad = make_pad()
         pad.tap(PadPose(0, 0))
@@ -127,20 +116,6 @@ class TestChoice:
             assert np.hypot(*result.poses[:, :2].T) == pytest.approx(np.abs(expected_mm), abs=1e-6)
         assert pad.kinds == []
 
-    def test_two_sensors_with_different_numbers_of_taps_in_one_run(self, session):
-        runtime = make_runtime(session, baselines=dict.fromkeys(("4", "6"), BASELINE))
-        pads = [Pushed(runtime, "4"), Pushed(runtime, "6")]
-        runtime.pose(PadPose(7, 7, 7), 0, "6", holds=True)
-        for pose in POSES:
-            pads[0].tap(pose)
-        pads[1].number = pads[0].number
-        pads[0].place(PadPose(1, 2, 3))
-        results = inferred(runtime, [pad.scan(PRESS + 100 * index) for index, pad in enumerate(pads)])
-        assert [result.taps_used for result in results] == [4, 1]
-        assert [result.pose.x_mm for result in results] == [1, 7], "its own poses come before those of all"
-        for result in results:
-            np.testing.assert_allclose(result.pattern, expected(result, session.contract), atol=1e-4)
-
     def test_a_changed_relative_pose_is_inferred_again(self):
         pad = Pushed(make_runtime(model := PosedModel()))
         for x_mm in range(3):  # a single tap has none
@@ -175,14 +150,6 @@ class TestChoice:
         for wrong in (0, 1.5, "2"):
             with pytest.raises(UsageError, match=r"taps is .*, expected a whole number from 1"):
                 RuntimeOptions(taps=wrong)
-
-    def test_a_model_without_poses_ignores_them(self):
-        plain, moved = Pushed(make_runtime(FakeModel())), Pushed(make_runtime(FakeModel()))
-        for x_mm in (0, 50):
-            without, result = plain.tap(), moved.tap(PadPose(x_mm, 0))
-            np.testing.assert_array_equal(result.pattern, without.pattern)
-            assert result.pose.x_mm == x_mm and result.poses is None and without.pose is None
-        assert result.taps_used == 2 and moved.kinds == []
 
 
 class TestChecks:
@@ -228,20 +195,6 @@ def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
     assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
     assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
-
-
-def test_a_robot_that_follows_touches_no_place_twice():
-    pad, places = make_pad(SURE, idle_reset_s=0.2), set()
-    pose = begun = PadPose(5, -3, 30)
-    for _ in range(4):
-        assert pad.tap(pose).next_tap is None
-        proposed = pad.results[-1].next_tap
-        seen = pose.seen_from(begun)
-        places.add((round(seen.x_mm / HALF_MM, 6), round(seen.y_mm / HALF_MM, 6)))
-        seen = proposed.target.seen_from(pose)
-        assert (seen.x_mm, seen.y_mm, seen.turn_deg) == pytest.approx((proposed.dx_mm, proposed.dy_mm, 0), abs=1e-9)
-        pose = proposed.target
-    assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
 
 
 def test_it_stays_until_the_next_tap_or_an_idle_time():

@@ -7,8 +7,7 @@ import pytest
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan
 from runtime_samples import make_runtime, presses, pumped
 
-from edge.api import LinkLostError, SinkClosedError, Statistics
-from edge.pipeline.scan_reader import CAPACITY_SCANS
+from edge.api import LinkLostError, Statistics
 from firmware_bridge.links.base import Notice
 
 MS = 1_000_000
@@ -53,35 +52,6 @@ class TestOvertaking:
         assert statistics.dropped == 4
         assert all(numbers(sink, name) == [0, 1, 2] for name in names)
 
-    @pytest.mark.parametrize(
-        ("meanwhile", "states", "overruns"),
-        [
-            ([presses([n]) for n in range(1, 8)], {("4", 0): "contact", ("4", 7): "contact"}, 0),
-            (
-                [*([*presses([n]), *presses([n], "6")] for n in range(1, 4)), presses([4])],
-                {("4", 0): "contact", ("4", 4): "contact", ("6", 3): "contact"},
-                0,
-            ),
-            (
-                [[make_scan(n, noise=3)] for n in range(1, CAPACITY_SCANS + 7)],
-                {("4", 0): "contact"},
-                6,
-            ),
-        ],
-    )
-    def test_behind_scans_the_newest_of_each_sensor_wins(self, meanwhile, states, overruns):
-        """One scan occupies the model, and all others arrive meanwhile."""
-        busy = threading.Event()
-        link, sink = FakeLink([presses([0]), busy, *meanwhile]), ListSink()
-        model = FakeModel(on_run=lambda: (busy.set(), link.through.wait(10)))
-        statistics = pumped(link, sink, model=model)
-        states_made = [one.state for one in sink.results]
-        made = {(one.scan.sensor, one.scan.number): one.state for one in sink.results if one.pattern is not None}
-        sent = 1 + sum(map(len, meanwhile))
-        assert made == states and len(sink.results) == sent - overruns
-        assert statistics.dropped == states_made.count("dropped") == sink.counters[-1]["dropped"]
-        assert statistics.overruns == sink.counters[-1]["overruns"] == overruns
-
 
 class TestEnds:
     @pytest.mark.parametrize(
@@ -108,13 +78,6 @@ class TestEnds:
         sink = ListSink(on_write=lambda result: (busy.set(), link.through.wait(10), stop.set()))
         pumped(link, sink, stop=stop)
         assert numbers(sink) == [0, 1, 2]
-
-    def test_a_closed_sink_ends_it(self):
-        def refuse(result):
-            raise SinkClosedError("gone")
-
-        with pytest.raises(SinkClosedError):
-            pumped(FakeLink([presses([0])], endless=True), ListSink(on_write=refuse))
 
 
 class TestRecords:

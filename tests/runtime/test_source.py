@@ -108,28 +108,6 @@ class TestOne:
 
 
 class TestScripts:
-    def test_a_link_that_hangs_holds_up_no_other(self):
-        gate = threading.Event()
-        fast = FakeLink([[make_scan(n)] for n in range(5)], prefix="fast/")
-        with Source(FakeLink([gate, [make_scan(0)]], prefix="slow/"), fast) as source:
-            taken = take_all(source, lambda taken: len(taken) >= 5)
-            assert numbers(taken, "fast/4") == list(range(5)) and not numbers(taken, "slow/4")
-            gate.set()
-            assert numbers(take_all(source), "slow/4") == [0]
-
-    def test_one_that_gives_up_ends_all_after_its_scans(self):
-        lost = FakeLink([[make_scan(0)]], error=LinkLostError("gone"))
-        told = [Notice(0, "lost", "told")]
-        lost.notices = lambda: [] if lost.reads < 2 or not told else [told.pop()]
-        taken = []
-        with Source(lost, FakeLink([], endless=True, prefix="other/")) as source:
-            with pytest.raises(LinkLostError, match="gone"):
-                while True:
-                    taken += source.take(0.2) or ()
-            with pytest.raises(LinkLostError, match="gone"):
-                source.take(0)
-        assert sorted(type(one).__name__ for one in taken) == ["Notice", "Scan"]
-
     def test_the_source_closes_while_a_link_is_away(self):
         before = set(threading.enumerate())
         away = FakeLink([], error=LinkLostError("gone"), lasts=True)
