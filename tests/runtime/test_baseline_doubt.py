@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS
 from edge_samples import BASELINE, PERIOD_NS, FakeModel
-from runtime_samples import make_runtime
+from runtime_samples import Pushed, make_runtime
 from trust_samples import make_trusted_contract
 
 from edge.api import USPA44, Baseline
@@ -15,7 +15,6 @@ from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 
-NOISE_COUNTS = 2.5
 TAKEN = replace(BASELINE, origin="start-up")
 ROW, COL = np.mgrid[-1.5:2:1, -1.5:2:1] / 1.5
 GRIP = np.zeros((3, 4, 4))
@@ -39,33 +38,17 @@ def drift_field(seed, hours):
     return field
 
 
-class Pad:
-    """A sensor that reads what it is told to, and its runtime; keeps the results."""
+class Pad(Pushed):
+    """A sensor that reads what it is told to."""
 
     def __init__(self, baseline=BASELINE, **options):
         model = FakeModel(make_trusted_contract())
-        self.runtime = make_runtime(model, baselines={"4": baseline}, options=RuntimeOptions(**options))
-        self.results = []
-        self._rng = np.random.default_rng(0)
-        self._series = ScanSeries("4", USPA44)
-        self.time_ns = PERIOD_NS
-
-    def scan(self, felt):
-        counts = BASELINE.counts + felt + self._rng.normal(0, NOISE_COUNTS, (3, 4, 4))
-        self.time_ns += PERIOD_NS
-        return self._series.close(np.rint(counts).astype(np.int32), self.time_ns - PERIOD_NS)
+        super().__init__(make_runtime(model, baselines={"4": baseline}, options=RuntimeOptions(**options)), noise=4)
 
     def read(self, seconds, felt=0.0):
         """Return the results of readings over the rest level, or of what it gives for each time in [s]."""
-        begun = len(self.results)
-        for number in range(max(1, round(seconds * 1e9 / PERIOD_NS))):
-            now = felt(number * PERIOD_NS / 1e9) if callable(felt) else felt
-            self.results.append(self.runtime.push(self.scan(now)))
-        return self.results[begun:]
-
-    @property
-    def kinds(self):
-        return [event.kind for result in self.results for event in result.events]
+        at = (lambda number: felt(number * PERIOD_NS / 1e9)) if callable(felt) else felt
+        return self.play(max(1, round(seconds * 1e9 / PERIOD_NS)), at)
 
 
 def states(results):
@@ -175,7 +158,7 @@ def test_after_an_outage_rest_levels_are_compared(before, felt, state, lost):
     if lost:
         pad.runtime.lose_touch()
     else:
-        pad.time_ns += 60_000_000_000
+        pad.number += 6000
     assert states(pad.read(0.5, felt)) == state
     assert ("another pad" in str(pad.results[-1].note)) == (state == DOUBT and np.mean(felt) > 0)
     pad.read(0.2)
@@ -206,8 +189,9 @@ def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
 
 def test_a_scan_in_doubt_that_is_overtaken_stays_in_doubt():
     pad = Pad()
-    assert pad.runtime.take(pad.scan(GRIP)) == []
-    (overtaken,) = pad.runtime.take(pad.scan(GRIP))
+    scans = [replace(pad.scan(), counts=(BASELINE.counts + GRIP).astype(np.int32)) for _ in range(2)]
+    assert pad.runtime.take(scans[0]) == []
+    (overtaken,) = pad.runtime.take(scans[1])
     assert (overtaken.state, overtaken.trusted, overtaken.pattern) == ("baseline_in_doubt", False, None)
 
 
