@@ -57,33 +57,12 @@ def test_perfect_patterns_of_a_letter_give_its_outline(turns):
     assert abs(area_mm2 - (here[known] == 0).sum() / 16) < 0.1 * edge_mm
 
 
-def test_the_axes_are_those_of_a_pattern_and_of_the_pose():
-    whole, pose = ObjectMap(), PadPose(10.0, -5.0, 90.0, 0.0, 0.0)
-    pattern = np.zeros((40, 40), dtype=np.float32)
-    pattern[18:22, 34:38] = 0.3  # to the right on the pad, so down in the object's plane
-    whole.add(replace(result_of(dome, pose), pattern=pattern), pose)
-    x_mm, y_mm = pixels_mm(whole.grid)
-    touched = whole.layers().contact > 0.5
-    assert x_mm[touched].mean() == pytest.approx(10.0, abs=0.1)
-    assert y_mm[touched].mean() == pytest.approx(-5.0 + 16 * 0.47, abs=0.1)
-
-
 def test_a_deeper_press_does_not_raise_the_map():
     layers = fused(letter, over(letter, raster(step_mm=8.0)), (0.2, 0.45)).layers()
     x_mm, y_mm = pixels_mm(ObjectMap().grid)
     inside = np.all([letter(x_mm + dx, y_mm + dy) == 0 for dx in (-1, 1) for dy in (-1, 1)], axis=0)
     assert np.abs(layers.height_mm[inside & (layers.coverage > 0)]).max() < 0.01
     assert np.nanmax(fused(dome, [HERE, HERE], (0.2, 0.45)).layers().height_mm) < 0.01
-
-
-def test_heights_of_a_curved_part_agree_between_presses():
-    poses = [PadPose(float(x), 0.0, 0.0, 0.0, 0.0) for x in range(-12, 13, 3)]
-    whole = fused(dome, poses, (0.4, 0.25))
-    layers = whole.layers()
-    x_mm, y_mm = pixels_mm(whole.grid)
-    there = np.isfinite(layers.height_mm) & (np.abs(y_mm) < 4) & (np.abs(x_mm) < 15)
-    off_mm = (layers.height_mm - dome(x_mm, y_mm))[there]
-    assert there.sum() > 1000 and off_mm.std() < 0.002 and np.ptp(dome(x_mm, y_mm)[there]) > 0.15
 
 
 DOUBTED, LIGHT = {"trusted": False}, {"trusted": None}

@@ -161,17 +161,6 @@ class TestOnDemand:
         assert events(results) == [f"sensor 4 zeroed on demand: baseline {new.id} instead of {BASELINE.id}"]
         assert results[-1].baseline_age_s == pytest.approx((120 - 100) * PERIOD_NS / 1e9)
 
-    def test_in_contact_it_is_refused_unless_forced(self):
-        bench = make_bench()
-        results = zeroed(bench, 120, LOCAL)
-        (event,) = events(results)
-        assert [(one.kind, one.sensor) for one in results[0].events] == [("in_contact", "4")]
-        assert event.startswith("zeroing refused: sensor 4 is in contact: free the pad, or force it")
-        assert {result.baseline.id for result in results} == {BASELINE.id}
-        results = zeroed(bench, 120, LOCAL, force=True)
-        assert "zeroed on demand" in events(results)[0]
-        assert results[-1].contact is False and abs(results[-1].force_counts) < 100
-
     def test_motion_puts_it_off_and_a_touch_meanwhile_starts_it_over(self):
         bench = make_bench()
         moving = zeroed(bench, 150, sway)
@@ -188,15 +177,6 @@ class TestOnDemand:
         (event,) = [event for event in events(results) if "given up" in event]
         assert event.startswith("sensor 4: zeroing given up, the old baseline stays: taxel (") and why in event
         assert results[-1].baseline.id == BASELINE.id
-
-    def test_one_sensor_alone_or_all(self):
-        bench = make_bench(baselines={"4": BASELINE, "6": BASELINE})
-        for sensor in ("4", "6"):
-            bench.play(2, sensor=sensor)
-        bench.runtime.zero("6")
-        assert events(bench.play(105, sensor="4")) == [] and len(events(bench.play(105, sensor="6"))) == 1
-        bench.runtime.zero("9")
-        assert events(bench.play(1)) == ["zeroing refused: no sensor 9, there are 4, 6"]
 
     def test_without_a_baseline_there_is_nothing_to_zero_again(self):
         results = zeroed(make_bench(baselines={}), 100)
