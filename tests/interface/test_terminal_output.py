@@ -5,14 +5,16 @@ import fcntl
 import io
 import os
 import re
+import signal
 import struct
 import termios
+import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import write_model
+from edge_samples import wait_for, write_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -106,12 +108,24 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
     assert pipe.getvalue() == terminal.said() == ""
 
 
-def test_zeroing_shows_its_bar_and_leaves_no_trace(tmp_path, limits, terminal):
+def test_zeroing_shows_its_bar_and_leaves_no_trace_when_it_is_stopped(tmp_path, limits, terminal):
+    """`edge-sr baseline` for an hour of scans, stopped by Ctrl-C."""
     limits(progress_bar, DELAY_S=0)
+    said = []
+
+    def stop():
+        wait_for(lambda: said.append(terminal.said()) or RATE.search("".join(said)))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
     with contextlib.redirect_stderr(terminal.stream):
-        assert cli.main(["baseline", "--source", "demo", "--out", str(tmp_path / "zero.json")]) == 0
-    said = terminal.said()
-    assert re.search(r"zeroing: +\d+%\|.*(?:scan/s|s/scan)", said) and re.search(r"\r +\r$", said)
+        words = ["baseline", "--source", "demo", "--out", str(tmp_path / "zero.json"), "--scans", "360000"]
+        assert cli.main(words) == 3
+    stopping.join()
+    shown = "".join(said) + terminal.said()
+    assert re.search(r"zeroing:   0%\|", shown)
+    assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", shown)
 
 
 ESCAPE = re.compile(r"\x1b\[[0-9;]*m")

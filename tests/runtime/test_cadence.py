@@ -58,6 +58,14 @@ def test_the_period_is_that_of_the_sensor(intervals_ms, period_ms):
     assert Cadence(100).period_ns == followed(intervals_ms, rate_hz=100).period_ns == 10 * MS
 
 
+def test_scans_that_lay_unread_set_no_pace():
+    cadence = Cadence()
+    for number, time_ms in enumerate([*range(500, 512), *range(520, 640, 10)]):
+        cadence.follow(replace(scan(number, time_ms), unread_ns=400 * MS * (time_ms < 520)))
+        assert cadence.period_ns in (None, 10 * MS)
+    assert cadence.rate_hz == 100
+
+
 def test_a_pattern_is_late_after_one_period_and_not_before():
     for latency_us, late in ((10_000, 0), (10_000.001, 9 - FEWEST_INTERVALS)):
         cadences = Cadences()

@@ -39,6 +39,17 @@ def expected(result, contract):
 
 
 class TestChoice:
+    def test_taps_without_a_pose_are_left_out_with_one_event_each(self):
+        pad = make_pad()
+        pad.tap()
+        pad.tap()
+        assert pad.kinds == [], "a sensor without poses is no fault"
+        pad.tap(PadPose(0, 0))
+        result = pad.tap(PadPose(1, 0))
+        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
+        pad.tap(PadPose(2, 0))
+        assert pad.kinds == ["tap_without_pose"] * 2
+
     def test_a_pattern_is_made_from_all_taps_with_their_poses(self, session):
         pad = Pushed(make_runtime(session))
         for count, pose in enumerate(POSES, 1):
@@ -195,6 +206,20 @@ def test_an_earlier_tap_is_not_touched_again_and_in_reach():
     shift_mm = next_shift_mm(np.array([[0.0, 0.0], [-HALF_MM, 0.0]]), 3.4)
     assert shift_mm is not None and np.hypot(shift_mm[0] + HALF_MM, shift_mm[1]) <= 3.4
     assert next_shift_mm(np.zeros((1, 2)), 2.0) is None
+
+
+def test_a_robot_that_follows_touches_no_place_twice():
+    pad, places = make_pad(SURE, idle_reset_s=0.2), set()
+    pose = begun = PadPose(5, -3, 30)
+    for _ in range(4):
+        assert pad.tap(pose).next_tap is None
+        proposed = pad.results[-1].next_tap
+        seen = pose.seen_from(begun)
+        places.add((round(seen.x_mm / HALF_MM, 6), round(seen.y_mm / HALF_MM, 6)))
+        seen = proposed.target.seen_from(pose)
+        assert (seen.x_mm, seen.y_mm, seen.turn_deg) == pytest.approx((proposed.dx_mm, proposed.dy_mm, 0), abs=1e-9)
+        pose = proposed.target
+    assert len(places) == 4 and all(x == round(x) and y == round(y) for x, y in places)
 
 
 def test_it_stays_until_the_next_tap_or_an_idle_time():

@@ -108,6 +108,15 @@ class TestOne:
 
 
 class TestScripts:
+    def test_a_link_that_hangs_holds_up_no_other(self):
+        gate = threading.Event()
+        fast = FakeLink([[make_scan(n)] for n in range(5)], prefix="fast/")
+        with Source(FakeLink([gate, [make_scan(0)]], prefix="slow/"), fast) as source:
+            taken = take_all(source, lambda taken: len(taken) >= 5)
+            assert numbers_of(taken, "fast/4") == list(range(5)) and not numbers_of(taken, "slow/4")
+            gate.set()
+            assert numbers_of(take_all(source), "slow/4") == [0]
+
     def test_the_source_closes_while_a_link_is_away(self):
         before = set(threading.enumerate())
         away = FakeLink([], error=LinkLostError("gone"), lasts=True)

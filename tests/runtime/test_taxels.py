@@ -276,6 +276,12 @@ class TestRuntime:
         assert back.state == "contact" and len(back.notes) == 1 and back.dead == {}
         assert [saturated(pad, 65534).state for _ in range(HOLD_SCANS + 2)][-1] == "contact", "a count from the end"
 
+    def test_silent_ones_are_named_with_one_at_its_end(self):
+        pad, half = Pushed(), tuple(range(8, 16))
+        note = [saturated(pad, health.RANGE_ENDS[1], press=0, absent=half).note for _ in range(TAXEL_SILENT_SCANS)][-1]
+        assert "taxel 5 at the end of its range" in note
+        assert note.endswith("taxel 8, 9, 10, 11, 12, 13, 14, 15 silent: try another --id-map")
+
 
 GRID = (4, 4)
 

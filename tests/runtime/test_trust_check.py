@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import FakeModel
+from edge_samples import FakeModel, make_contract, make_pad_contract, write_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import FOREIGN_TAXEL, make_trust, make_trusted_contract
 
 from edge.api import Pad
 from edge.inference.contract import ANY_BATCH, scheduled_rows
+from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.trust_check import LEAST_COUNTS, MOST_MISMATCH, REPEATS, PatternCheck, TrustVerdict, foreign_taps
 
@@ -240,3 +241,14 @@ class TestVerdict:
         assert {touch(3000).untrusted_reason for _ in range(8)} == {"unfamiliar"} and pad.kinds == ["suspected"]
         assert touch(0).untrusted_reason == "sensor"
         assert [touch(0).trusted for _ in range(60)][-1] is True and pad.kinds == ["suspected", "cleared"]
+
+
+@pytest.mark.parametrize("contract", [make_contract(), make_pad_contract()])
+def test_a_model_without_checks_says_that_it_does_not_know(tmp_path, contract):
+    pad = make_pad(ModelSession(write_model(tmp_path / "plain.onnx", contract)))
+    for taxel in (FOREIGN_TAXEL, ELSEWHERE):
+        result = pad.tap(taxel=taxel)
+        assert result.pattern is not None
+        assert (result.trusted, result.untrusted_reason, result.mismatch) == (None, None, None)
+        assert result.tap_mismatch is None
+    assert result.taps_used == 2
