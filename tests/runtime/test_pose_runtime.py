@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import PERIOD_NS, REST
+from edge_samples import BASELINE, PERIOD_NS, REST, inferred
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
@@ -126,6 +126,20 @@ class TestChoice:
             result = pad.tap(pose)
             assert np.hypot(*result.poses[:, :2].T) == pytest.approx(np.abs(expected_mm), abs=1e-6)
         assert pad.kinds == []
+
+    def test_two_sensors_with_different_numbers_of_taps_in_one_run(self, session):
+        runtime = make_runtime(session, baselines=dict.fromkeys(("4", "6"), BASELINE))
+        pads = [Pushed(runtime, "4"), Pushed(runtime, "6")]
+        runtime.pose(PadPose(7, 7, 7), 0, "6", holds=True)
+        for pose in POSES:
+            pads[0].tap(pose)
+        pads[1].number = pads[0].number
+        pads[0].place(PadPose(1, 2, 3))
+        results = inferred(runtime, [pad.scan(PRESS + 100 * index) for index, pad in enumerate(pads)])
+        assert [result.taps_used for result in results] == [4, 1]
+        assert [result.pose.x_mm for result in results] == [1, 7], "its own poses come before those of all"
+        for result in results:
+            np.testing.assert_allclose(result.pattern, expected(result, session.contract), atol=1e-4)
 
     def test_a_changed_relative_pose_is_inferred_again(self):
         pad = Pushed(make_runtime(model := PosedModel()))
