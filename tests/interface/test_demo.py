@@ -73,6 +73,12 @@ def test_each_tap_is_scored_at_its_peak_against_that_frames_truth(recording):
         assert got.rmse_percent == pytest.approx(float(rmse_percent(got.result.pattern, truth, 2.0)))
 
 
+def test_a_lost_scan_shifts_nothing(recording):
+    whole, gappy = play(recording).scores(), play(recording, lost=(0, 2, 5)).scores()
+    assert [s.truth.tobytes() for s in gappy] == [s.truth.tobytes() for s in whole]
+    assert gappy[0].result.scan.number != whole[0].result.scan.number
+
+
 def test_a_tap_that_is_played_in_place_of_another_has_its_own_truth_and_pose(recording):
     model = FakeModel()
     score = play(recording, option=True, model=model)

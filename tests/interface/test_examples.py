@@ -233,6 +233,14 @@ def test_a_sensor_that_falls_silent_stops_it_though_the_other_is_heard(at_once, 
     assert gripper.done == ["close", "stop"] and grip.why.startswith("no reading of sensor right for 3")
 
 
+def test_of_several_sensors_one_alone_may_be_gone_by(at_once):
+    grip, gripper = grip_of(at_once, name="left")
+    grip.follow(reading("contact", "right", area_mm2=50.0))
+    grip.follow(reading(sensor="left"))
+    grip.follow(reading("zeroing", "right", force_counts=None))
+    assert gripper.done == ["close"]
+
+
 def test_it_does_not_begin_before_all_that_are_known_were_heard(at_once):
     known = {name: SensorEntry(baseline=replace(BASELINE, sensor=name)) for name in ("4", "6")}
     grip, gripper = grip_of(at_once, oldest_ms=20_000)

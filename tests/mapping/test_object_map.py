@@ -65,6 +65,16 @@ def test_a_deeper_press_does_not_raise_the_map():
     assert np.nanmax(fused(dome, [HERE, HERE], (0.2, 0.45)).layers().height_mm) < 0.01
 
 
+def test_heights_of_a_curved_part_agree_between_presses():
+    poses = [PadPose(float(x), 0.0, 0.0, 0.0, 0.0) for x in range(-12, 13, 3)]
+    whole = fused(dome, poses, (0.4, 0.25))
+    layers = whole.layers()
+    x_mm, y_mm = pixels_mm(whole.grid)
+    there = np.isfinite(layers.height_mm) & (np.abs(y_mm) < 4) & (np.abs(x_mm) < 15)
+    off_mm = (layers.height_mm - dome(x_mm, y_mm))[there]
+    assert there.sum() > 1000 and off_mm.std() < 0.002 and np.ptp(dome(x_mm, y_mm)[there]) > 0.15
+
+
 DOUBTED, LIGHT = {"trusted": False}, {"trusted": None}
 
 

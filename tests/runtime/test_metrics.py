@@ -129,6 +129,16 @@ def test_bicubic_is_exact_on_a_parabola():
     assert not np.allclose(up[5:55, 5:65], expected[5:55, 5:65])
 
 
+def test_bicubic_goes_through_the_taxels_and_no_further():
+    taxels = np.random.default_rng(4).standard_normal((3, 4, 4))
+    assert np.allclose(bicubic(taxels, 5)[:, 2::5, 2::5], taxels)
+    assert np.allclose(bicubic(np.full((4, 4), 3.0), 10), 3.0)
+    spike = np.zeros((8, 8))
+    spike[0, 0] = 1.0
+    up = bicubic(spike, 10)
+    assert up[24, 4] != 0 and (up[25:] == 0).all()
+
+
 def test_fits_find_what_made_the_data():
     rng = np.random.default_rng(1)
     readings, matrix = rng.standard_normal((300, 6)), rng.standard_normal((6, 9))
