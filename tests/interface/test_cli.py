@@ -25,6 +25,7 @@ from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile
 from firmware_bridge.sensor_file.toml_writer import save_sensor_file
+from firmware_bridge.zeroing.baseline import load_baselines
 
 __all__ = ["files"]
 
@@ -161,6 +162,21 @@ def test_a_full_disk_is_5_after_the_summary(files):
     with Path("/dev/full").open("w") as full:
         process = start(*base_options(files), "--source", f"replay:{files}/rest.npz", "--sink", "jsonl:-", stdout=full)
         assert "cannot write records to stdout: No space left" in process.communicate()[1] and process.returncode == 5
+
+
+def test_of_a_recording_a_few_free_scans_are_enough(tmp_path):
+    begins_in_contact = write_recording(tmp_path / "held.npz", [3000] * 50 + [0] * 40)
+    done = run(
+        "baseline", "--source", f"replay:{begins_in_contact}", "--rate-hz", "1000", "--out", tmp_path / "zero.json",
+        "--skip", "50", "--scans", "40",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert load_baselines(tmp_path / "zero.json")["4"].scans == 40
+    done = run("baseline", "--source", f"replay:{begins_in_contact}", "--out", tmp_path / "free.json")
+    assert "sensor 4: zeroed from its scans 5" in done.stderr
+    assert done.stderr.count("where the pad is still and pressed least\n") == 1
+    free, zero = (load_baselines(tmp_path / f"{name}.json")["4"] for name in ("free", "zero"))
+    assert np.abs(free.counts - zero.counts).max() < 5
 
 
 def test_a_baseline_of_a_recording_that_may_be_of_a_held_pad_is_in_doubt(tmp_path):
