@@ -15,7 +15,7 @@ import pytest
 from cli_samples import files, records, run, write_recording
 from edge_samples import BASELINE, ROOT, FakeLink, FakeModel, make_scan
 from mcap_samples import arrays_of
-from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
+from pose_samples import PosedModel, make_posed_contract, posed_pattern
 
 from edge import api
 from edge.api import Pad, Stream, UsageError, load_model, open_recording, open_runtime, open_sink, open_source
@@ -262,15 +262,3 @@ def test_an_npz_holds_the_pose_of_each_scan_and_a_row_for_each_tap(tmp_path):
     np.testing.assert_allclose(arrays["scan_pose"][2], [2 / 3, -1, 30, 0.2, 1], rtol=1e-4)
     np.testing.assert_allclose(arrays["poses"][-1, :2], made[-1].poses, atol=1e-4)
     assert np.isnan(arrays["poses"][-1, 2:]).all()
-
-
-def test_the_command_line_takes_the_most_taps(files, tmp_path):
-    write_posed_model(tmp_path / "posed.onnx")
-    fixed = ("--model", tmp_path / "posed.onnx", "--baseline", files / "zero.json")
-    for options, most in (((), 1), (("--taps", "3"), 3)):
-        done = run("replay", files / "taps.npz", *fixed, "--sink", "jsonl:-", *options)
-        said = [json.loads(line) for line in done.stdout.splitlines()]
-        assert max(one["taps_used"] for one in said) == most, done.stderr
-    assert said[-1]["poses"] == [[0] * 5, [0, 0, 5, 0.2, 1], [0, 0, 10, 0.2, 1]]
-    done = run("replay", files / "taps.npz", *fixed, "--taps", "8")
-    assert done.returncode == 2 and "taps is 8, but model 'posed' takes 7 at most" in done.stderr

@@ -3,12 +3,10 @@
 import json
 import signal
 import subprocess
-import threading
-import time
 
 import numpy as np
 import pytest
-from cli_samples import base_options, files, records, run, start, write_recording
+from cli_samples import base_options, files, run, start, write_recording
 from edge_samples import BASELINE, FakeLink, FakeModel, ListSink, make_scan, wait_for
 from pose_samples import make_posed_contract
 
@@ -158,36 +156,6 @@ def test_poses_come_to_the_sinks_before_the_scans_that_they_serve(of_link, why):
     assert (statistics.poses, statistics.poses_refused, statistics.poses_dropped) == (used, 1 - used, 0)
     assert sink.counters[-1]["poses"] == used
     assert f"poses: 1 received, {used} used, {1 - used} refused, 0 dropped" in statistics.summary(source="fake")
-
-
-def test_a_program_counts_poses_at_1000_hz_and_reports_their_end(files):
-    """A robot at 1000 poses/s that dies: every scan gets its record all the same, and one event reports it."""
-    recording = write_recording(files / "long.npz", ([0] * 5 + [3000] * 5) * 30)
-    options = [*base_options(files), "--source", f"replay:{recording}", "--sink", "jsonl:-"]
-    with start(*options, stdin=subprocess.PIPE) as process:
-        out = []
-        reader = threading.Thread(target=lambda: out.extend(process.stdout))
-        reader.start()
-        wait_for(lambda: out)
-        sent = 0
-        process.stdin.write('{"cmd": "pose", "x_mm": "left"}\n' * 50)
-        while sent < 1000:
-            numbers = range(sent, sent + 10)
-            process.stdin.write("".join(f'{{"cmd": "pose", "x_mm": {number}, "y_mm": 0}}\n' for number in numbers))
-            process.stdin.flush()
-            sent += 10
-            time.sleep(0.008)
-        reader.join()
-        err = process.stderr.read()
-        assert process.wait() == 0
-    lines = records("".join(out))
-    events = [line["event"] for line in lines if line["state"] == "event"]
-    assert events.count("poses_silent") == 1 and events.count("poses_trouble") == 2
-    scans = [line for line in lines if line["state"] != "event"]
-    assert [line["scan"] for line in scans] == list(range(300))
-    assert f"poses: {sent + 50} received, {sent} used, 50 refused, 0 dropped" in err
-    assert err.count("x_mm is 'left'") == err.count("takes none, so that each pattern is of one tap: give --model") == 1
-    assert [one["counters"] for one in scans if "counters" in one][-1]["poses"] <= sent
 
 
 HELD = json.dumps({"cmd": "pose", "x_mm": 5, "y_mm": -3, "turn_deg": 0, "holds": True}) + "\n"

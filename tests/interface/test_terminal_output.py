@@ -7,16 +7,14 @@ import os
 import re
 import signal
 import struct
-import subprocess
-import sys
 import termios
-import time
+import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from bridge_samples import make_counts, write_recording
-from edge_samples import ROOT, write_model
+from edge_samples import wait_for, write_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -110,36 +108,24 @@ def test_nothing_without_a_terminal_or_beyond_torchruns_first(terminal, monkeypa
     assert pipe.getvalue() == terminal.said() == ""
 
 
-AT_ONCE = """
-import sys
-from edge.cli import main as cli
-from edge.terminal import progress_bar
-progress_bar.DELAY_S = 0.0
-sys.exit(cli.main(sys.argv[1:]))
-"""
-
-
-def test_a_command_shows_its_bar_on_a_terminal_and_leaves_no_trace_when_it_is_stopped(tmp_path):
+def test_zeroing_shows_its_bar_and_leaves_no_trace_when_it_is_stopped(tmp_path, limits, terminal):
     """`edge-sr baseline` for an hour of scans, stopped by Ctrl-C."""
-    terminal = Terminal(60)
-    command = [sys.executable, "-c", AT_ONCE, "baseline", "--source", "demo", "--out", str(tmp_path / "zero.json")]
-    process = subprocess.Popen(
-        [*command, "--scans", "360000"],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=terminal.stream,
-    )
-    said = ""
-    while not RATE.search(said):
-        assert process.poll() is None, said
-        said += terminal.said()
-        time.sleep(0.01)
-    assert re.search(r"zeroing:   0%\|.*(?:scan/s|s/scan)", said)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 3
-    assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", terminal.said())
-    terminal.close()
+    limits(progress_bar, DELAY_S=0)
+    said = []
+
+    def stop():
+        wait_for(lambda: said.append(terminal.said()) or RATE.search("".join(said)))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    stopping = threading.Thread(target=stop)
+    stopping.start()
+    with contextlib.redirect_stderr(terminal.stream):
+        words = ["baseline", "--source", "demo", "--out", str(tmp_path / "zero.json"), "--scans", "360000"]
+        assert cli.main(words) == 3
+    stopping.join()
+    shown = "".join(said) + terminal.said()
+    assert re.search(r"zeroing:   0%\|", shown)
+    assert re.search(r"\r +\redge-sr: stopped before every sensor was zeroed", shown)
 
 
 ESCAPE = re.compile(r"\x1b\[[0-9;]*m")

@@ -57,17 +57,6 @@ def test_perfect_patterns_of_a_letter_give_its_outline(turns):
     assert abs(area_mm2 - (here[known] == 0).sum() / 16) < 0.1 * edge_mm
 
 
-def test_the_axes_are_those_of_a_pattern_and_of_the_pose():
-    whole, pose = ObjectMap(), PadPose(10.0, -5.0, 90.0, 0.0, 0.0)
-    pattern = np.zeros((40, 40), dtype=np.float32)
-    pattern[18:22, 34:38] = 0.3  # to the right on the pad, so down in the object's plane
-    whole.add(replace(result_of(dome, pose), pattern=pattern), pose)
-    x_mm, y_mm = pixels_mm(whole.grid)
-    touched = whole.layers().contact > 0.5
-    assert x_mm[touched].mean() == pytest.approx(10.0, abs=0.1)
-    assert y_mm[touched].mean() == pytest.approx(-5.0 + 16 * 0.47, abs=0.1)
-
-
 def test_a_deeper_press_does_not_raise_the_map():
     layers = fused(letter, over(letter, raster(step_mm=8.0)), (0.2, 0.45)).layers()
     x_mm, y_mm = pixels_mm(ObjectMap().grid)

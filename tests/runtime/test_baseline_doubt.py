@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bridge_samples import REAL_RECORDINGS
 from edge_samples import BASELINE, PERIOD_NS, FakeModel
-from runtime_samples import make_runtime
+from runtime_samples import Pushed, make_runtime
 from trust_samples import make_trusted_contract
 
 from edge.api import USPA44, Baseline
@@ -15,7 +15,6 @@ from edge.perception.contact_options import RuntimeOptions
 from firmware_bridge.recording.formats import load_recording
 from firmware_bridge.scans.scan import ScanSeries
 
-NOISE_COUNTS = 2.5
 TAKEN = replace(BASELINE, origin="start-up")
 ROW, COL = np.mgrid[-1.5:2:1, -1.5:2:1] / 1.5
 GRIP = np.zeros((3, 4, 4))
@@ -39,33 +38,17 @@ def drift_field(seed, hours):
     return field
 
 
-class Pad:
-    """A sensor that reads what it is told to, and its runtime; keeps the results."""
+class Pad(Pushed):
+    """A sensor that reads what it is told to."""
 
     def __init__(self, baseline=BASELINE, **options):
         model = FakeModel(make_trusted_contract())
-        self.runtime = make_runtime(model, baselines={"4": baseline}, options=RuntimeOptions(**options))
-        self.results = []
-        self._rng = np.random.default_rng(0)
-        self._series = ScanSeries("4", USPA44)
-        self.time_ns = PERIOD_NS
-
-    def scan(self, felt):
-        counts = BASELINE.counts + felt + self._rng.normal(0, NOISE_COUNTS, (3, 4, 4))
-        self.time_ns += PERIOD_NS
-        return self._series.close(np.rint(counts).astype(np.int32), self.time_ns - PERIOD_NS)
+        super().__init__(make_runtime(model, baselines={"4": baseline}, options=RuntimeOptions(**options)), noise=4)
 
     def read(self, seconds, felt=0.0):
         """Return the results of readings over the rest level, or of what it gives for each time in [s]."""
-        begun = len(self.results)
-        for number in range(max(1, round(seconds * 1e9 / PERIOD_NS))):
-            now = felt(number * PERIOD_NS / 1e9) if callable(felt) else felt
-            self.results.append(self.runtime.push(self.scan(now)))
-        return self.results[begun:]
-
-    @property
-    def kinds(self):
-        return [event.kind for result in self.results for event in result.events]
+        at = (lambda number: felt(number * PERIOD_NS / 1e9)) if callable(felt) else felt
+        return self.play(max(1, round(seconds * 1e9 / PERIOD_NS)), at)
 
 
 def states(results):
@@ -102,44 +85,32 @@ FIELD[2] = 300 * (1 + 0.2 * COL)
 
 
 @pytest.mark.parametrize(
-    ("baseline", "told"),
+    ("baseline", "told", "why"),
     [
         # A grip from a rest that was seen is a contact, which ends as one, and is one again where it is tightened.
-        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.6, HELD), (GRIP * 0.04, FREE), (GRIP, HELD)]),
-        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.15, DOUBT), (GRIP, HELD)]),
+        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.6, HELD), (GRIP * 0.04, FREE), (GRIP, HELD)], None),
+        (BASELINE, [(0.0, FREE), (GRIP, HELD), (GRIP * 0.15, DOUBT), (GRIP, HELD)], ""),
         # A recording that begins gripped is one with its own baseline alone.
-        (TAKEN, [(GRIP, HELD)]),
-        (BASELINE, [(GRIP, DOUBT), (0.0, FREE), (GRIP, HELD)]),
+        (TAKEN, [(GRIP, HELD)], None),
+        (BASELINE, [(GRIP, DOUBT), (0.0, FREE), (GRIP, HELD)], ""),
         # A local press needs no rest before it, but for an old baseline.
-        (BASELINE, [(LOCAL, HELD)]),
-        (BASELINE, [(LOCAL + drift_field(0, 4), DOUBT)]),
+        (BASELINE, [(LOCAL, HELD)], None),
+        (BASELINE, [(LOCAL + drift_field(0, 4), DOUBT)], ""),
         # All taxels alike at once are a field and no touch.
-        (BASELINE, [(0.0, FREE), (FIELD, DOUBT), (0.0, FREE)]),
+        (BASELINE, [(0.0, FREE), (FIELD, DOUBT), (0.0, FREE)], "alike"),
         # A baseline that was taken under load shows at the release, and the pad was not seen at rest since.
-        (TAKEN, [(0.0, FREE), (-GRIP, DOUBT), (GRIP, DOUBT), (0.0, FREE)]),
+        (TAKEN, [(0.0, FREE), (-GRIP, DOUBT)], "it was taken while something pressed"),
+        (TAKEN, [(0.0, FREE), (-GRIP, DOUBT), (GRIP, DOUBT), (0.0, FREE)], ""),
     ],
 )
-def test_what_is_felt_is_a_contact_or_in_doubt(baseline, told):
+def test_what_is_felt_is_a_contact_or_in_doubt(baseline, told, why):
     pad = Pad(baseline)
     for felt, expected in told:
         assert states(pad.read(0.4, felt)[15:]) == expected, pad.kinds
         if expected == DOUBT:
-            doubted(pad.results[-25:])
-    doubts = sum(expected == DOUBT for _, expected in told) > 0
-    assert set(pad.kinds) == {*["baseline_doubted"] * doubts, *["baseline_cleared"] * (doubts and len(told) > 1)}
-
-
-def test_a_note_tells_why_it_is_in_doubt():
-    for baseline, felt, why in (
-        (BASELINE, FIELD, "alike"),
-        (TAKEN, -GRIP, "far below the baseline on all taxels"),
-        (TAKEN, -GRIP, "while something pressed"),
-    ):
-        pad = Pad(baseline)
-        pad.read(0.5)
-        assert why in doubted(pad.read(0.2, felt))
-    doubtful = Pad().read(0.2, GRIP)[-1]
-    assert doubtful.pattern is not None and doubtful.taps_used == 1 and doubtful.traction is None
+            assert why in doubted(pad.results[-25:])
+    doubts = why is not None
+    assert set(pad.kinds) == {*["baseline_doubted"] * doubts, *["baseline_cleared"] * (doubts and told[-1][1] != DOUBT)}
 
 
 def test_what_a_release_leaves_is_no_contact():
@@ -187,7 +158,7 @@ def test_after_an_outage_rest_levels_are_compared(before, felt, state, lost):
     if lost:
         pad.runtime.lose_touch()
     else:
-        pad.time_ns += 60_000_000_000
+        pad.number += 6000
     assert states(pad.read(0.5, felt)) == state
     assert ("another pad" in str(pad.results[-1].note)) == (state == DOUBT and np.mean(felt) > 0)
     pad.read(0.2)
@@ -209,6 +180,8 @@ def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
         pad.read(0.2, GRIP)
         pad.read(0.2, GRIP + drift_field(2, 22))
     assert states(pad.results) == DOUBT
+    held = pad.results[10]
+    assert held.pattern is not None and held.taps_used == 1 and held.traction is None
     pad.read(0.2)
     assert {one.taps_used for one in pad.read(0.2, GRIP)} == {1}
     assert {one.drift.common_counts for one in pad.results[:-1]} == {(0.0, 0.0, 0.0)}
@@ -216,8 +189,9 @@ def test_what_is_in_doubt_is_no_earlier_tap_and_teaches_nothing():
 
 def test_a_scan_in_doubt_that_is_overtaken_stays_in_doubt():
     pad = Pad()
-    assert pad.runtime.take(pad.scan(GRIP)) == []
-    (overtaken,) = pad.runtime.take(pad.scan(GRIP))
+    scans = [replace(pad.scan(), counts=(BASELINE.counts + GRIP).astype(np.int32)) for _ in range(2)]
+    assert pad.runtime.take(scans[0]) == []
+    (overtaken,) = pad.runtime.take(scans[1])
     assert (overtaken.state, overtaken.trusted, overtaken.pattern) == ("baseline_in_doubt", False, None)
 
 

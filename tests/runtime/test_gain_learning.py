@@ -235,11 +235,6 @@ class TestRuntime:
         scans = [one for number, one in enumerate(scans) if number % (HELD_SCANS + 6)]  # never free
         assert any(result.events for result in learning(scans, every_scan=True)[2])
 
-    def test_gains_by_hand_are_not_replaced_by_less_certain_ones(self):
-        sure = Pad(gains=(1.0,) * GAINS, gain_half_widths=(0.01,) * GAINS)
-        results = learning(scans_of(draw_contacts(40), noise=2), pad=sure)[2]
-        assert all(result.gains_certainty >= sure.gains_certainty for result in results)
-
 
 LEARNED = Pad(gains=tuple(draw_gains().round(4).tolist()), gain_half_widths=(0.05,) * GAINS)
 SURER = replace(LEARNED, gain_half_widths=(0.03,) * GAINS)

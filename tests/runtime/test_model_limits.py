@@ -11,8 +11,8 @@ import onnx
 import onnxruntime
 import pytest
 from cli_samples import write_recording
-from edge_samples import BASELINE, ROOT, ended, make_contract, write_model
-from onnx import helper, numpy_helper
+from edge_samples import BASELINE, ROOT, ended, make_contract, save_graph, write_model
+from onnx import helper
 
 from edge.api import ModelError, bundled_models, save_baselines
 from edge.cli import main as cli
@@ -22,27 +22,15 @@ from edge.inference.onnx_guard import OPERATORS, check_plain
 from edge.inference.onnx_session import ModelSession, load_session
 
 
-def of_nodes(*nodes: onnx.NodeProto, numbers: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:
-    """A model of a batch of one from "window" to "pattern", with its contract."""
-    contract = make_contract(interval_factor=None, confidence={})
-    ends = [
-        helper.make_tensor_value_info("window", 1, list(contract.window_shape)),
-        helper.make_tensor_value_info("pattern", 1, [1, *contract.pattern_shape]),
-    ]
-    weights = [numpy_helper.from_array(array, name) for name, array in (numbers or {}).items()]
-    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    helper.set_model_props(model, contract.to_metadata())
-    return model
+def write_nodes(path, *nodes: onnx.NodeProto, **numbers: np.ndarray):
+    """Write a model of a batch of one from "window" to "pattern", with its contract."""
+    contract = make_contract()
+    return save_graph(path, [*nodes], contract, numbers, contract.to_metadata())
 
 
 def one_node(operator: str, domain: str = "") -> bytes:
-    return of_nodes(helper.make_node(operator, ["window"], ["pattern"], domain=domain)).SerializeToString()
-
-
-def written(path, model: onnx.ModelProto):
-    path.write_bytes(model.SerializeToString())
-    return path
+    node = helper.make_node(operator, ["window"], ["pattern"], domain=domain)
+    return helper.make_model(helper.make_graph([node], "g", [], [])).SerializeToString()
 
 
 class TestOperators:
@@ -87,7 +75,8 @@ class TestFormat:
     def test_an_onnx_file_that_looks_like_it_is_loaded_as_onnx(self, tmp_path):
         model = onnx.load(write_model(tmp_path / "m.onnx"))
         model.producer_name = "ORTM"
-        path = written(tmp_path / "m.onnx", model)
+        path = tmp_path / "m.onnx"
+        onnx.save(model, path)
         assert path.read_bytes()[4:8] == b"ORTM" and ModelSession(path).name == "m"
 
 
@@ -103,8 +92,8 @@ def test_a_run_that_fails_is_one_line_and_ends_edge_sr_with_4(tmp_path, capsys):
         helper.make_node("Add", ["sum", "zeros"], ["pattern"]),
     )
     zeros = np.zeros((1, 40, 40), np.float32)
-    numbers = {"none": np.array(0.01, np.float32), "huge": np.array([1 << 60]), "zeros": zeros}
-    path = written(tmp_path / "m.onnx", of_nodes(*nodes, numbers=numbers))
+    limits = {"none": np.array(0.01, np.float32), "huge": np.array([1 << 60])}
+    path = write_nodes(tmp_path / "m.onnx", *nodes, zeros=zeros, **limits)
     assert not ModelSession(path).run(np.zeros((4, 3, 4, 4), np.float32)).any()
     # A press that lasts, or newer scans may overtake all of it, and on all taxels: one alone is not believed.
     taps = write_recording(tmp_path / "taps.npz", [0] * 200)
@@ -119,22 +108,21 @@ def test_a_run_that_fails_is_one_line_and_ends_edge_sr_with_4(tmp_path, capsys):
     assert re.match(re.escape(f"edge-sr: {path}: cannot be run: ") + ".*ConstantOfShape", line)
 
 
-def hours_of_work() -> onnx.ModelProto:
-    """A model of products of constants, which onnxruntime works on for hours, while it loads if it may."""
+def write_hours_of_work(path):
+    """Write a model of products of constants, which onnxruntime works on for hours, while it loads if it may."""
     chain = [helper.make_node("MatMul", [f"c{index}", "c0"], [f"c{index + 1}"]) for index in range(4000)]
-    return of_nodes(
+    return write_nodes(
+        path,
         helper.make_node("ConstantOfShape", ["shape"], ["c0"]),
         *chain,
         helper.make_node("Slice", [f"c{len(chain)}", "start", "end"], ["part"]),
         helper.make_node("Add", ["part", "zeros"], ["sum"]),
         helper.make_node("ReduceMax", ["window"], ["most"], keepdims=0),
         helper.make_node("Add", ["sum", "most"], ["pattern"]),
-        numbers={
-            "shape": np.array([1000, 1000]),
-            "start": np.array([0, 0]),
-            "end": np.array([40, 40]),
-            "zeros": np.zeros((1, 40, 40), np.float32),
-        },
+        shape=np.array([1000, 1000]),
+        start=np.array([0, 0]),
+        end=np.array([40, 40]),
+        zeros=np.zeros((1, 40, 40), np.float32),
     )
 
 
@@ -155,7 +143,7 @@ class TestEndlessLoad:
     def test_it_ends_at_the_limit(self, tmp_path, limits):
         """No work is done on constants while it loads, which nothing could end; the first run can be ended."""
         limits(loading, LOAD_LIMIT_S=0.5)
-        path = written(tmp_path / "slow.onnx", hours_of_work())
+        path = write_hours_of_work(tmp_path / "slow.onnx")
         with pytest.raises(ModelError, match=re.escape(f"{path}: not loaded within 0.5 s: export a smaller graph")):
             ModelSession(path)  # edge-sr would end this process by force, if its work is not over by then
         pause = threading.Event()
@@ -163,7 +151,7 @@ class TestEndlessLoad:
 
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
     def test_it_hears_a_signal_meanwhile(self, tmp_path, number):
-        path = written(tmp_path / "slow.onnx", hours_of_work())
+        path = write_hours_of_work(tmp_path / "slow.onnx")
         pipe = subprocess.PIPE
         begun = subprocess.Popen([sys.executable, "-c", PROGRAM, path], cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
         with ended(begun) as process:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, REST, FakeModel, inferred
+from edge_samples import BASELINE, PERIOD_NS, REST, inferred
 from pose_samples import PosedModel, make_posed_contract, posed_pattern, write_posed_model
 from runtime_samples import PRESS, Pushed, make_runtime
 from trust_samples import make_checked_contract, make_posed_trust
@@ -39,6 +39,17 @@ def expected(result, contract):
 
 
 class TestChoice:
+    def test_taps_without_a_pose_are_left_out_with_one_event_each(self):
+        pad = make_pad()
+        pad.tap()
+        pad.tap()
+        assert pad.kinds == [], "a sensor without poses is no fault"
+        pad.tap(PadPose(0, 0))
+        result = pad.tap(PadPose(1, 0))
+        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
+        pad.tap(PadPose(2, 0))
+        assert pad.kinds == ["tap_without_pose"] * 2
+
     def test_a_pattern_is_made_from_all_taps_with_their_poses(self, session):
         pad = Pushed(make_runtime(session))
         for count, pose in enumerate(POSES, 1):
@@ -70,17 +81,6 @@ class TestChoice:
         if before_ns is not None:
             scan = replace(scan, device_ns=scan.time_ns - before_ns)
         assert pad.runtime.push(scan).pose.x_mm == x_mm
-
-    def test_taps_without_a_pose_are_left_out_with_one_event_each(self):
-        pad = make_pad()
-        pad.tap()
-        pad.tap()
-        assert pad.kinds == [], "a sensor without poses is no fault"
-        pad.tap(PadPose(0, 0))
-        result = pad.tap(PadPose(1, 0))
-        assert result.taps_used == 2 and result.poses[:, 0].tolist() == [0, -1]
-        pad.tap(PadPose(2, 0))
-        assert pad.kinds == ["tap_without_pose"] * 2
 
     def test_a_newest_scan_without_a_pose_is_used_alone(self):
         pad = make_pad()
@@ -175,14 +175,6 @@ class TestChoice:
         for wrong in (0, 1.5, "2"):
             with pytest.raises(UsageError, match=r"taps is .*, expected a whole number from 1"):
                 RuntimeOptions(taps=wrong)
-
-    def test_a_model_without_poses_ignores_them(self):
-        plain, moved = Pushed(make_runtime(FakeModel())), Pushed(make_runtime(FakeModel()))
-        for x_mm in (0, 50):
-            without, result = plain.tap(), moved.tap(PadPose(x_mm, 0))
-            np.testing.assert_array_equal(result.pattern, without.pattern)
-            assert result.pose.x_mm == x_mm and result.poses is None and without.pose is None
-        assert result.taps_used == 2 and moved.kinds == []
 
 
 class TestChecks:

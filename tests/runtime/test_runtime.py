@@ -4,13 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan, tiny_deviation, write_model
+from edge_samples import BASELINE, REST, FakeModel, make_contract, make_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from runtime_samples import PRESS, Pushed, make_runtime
 
 from edge.api import Baseline, UsageError, WindowError
-from edge.inference.onnx_session import ModelSession
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.pattern_description import touched, touched_patch
 from firmware_bridge.scans.mounting import Mounting
@@ -37,14 +36,6 @@ class TestResult:
         assert result.baseline is BASELINE and result.baseline_age_s == 60.0
         assert result.note == "not checked: the model has no checks"
         assert result.deviation is result.interval_mm is None, "the model gives none"
-
-    def test_results_keep_their_own_pattern_and_deviation(self, tmp_path):
-        pad = Pushed(make_runtime(ModelSession(write_model(tmp_path / "sure.onnx", SURE))))
-        first, second = pad.push(2000), pad.push(4000)
-        for result, deepest_mm in ((first, 2), (second, 4)):
-            assert result.pattern.max() == pytest.approx(deepest_mm)
-            np.testing.assert_allclose(result.deviation, tiny_deviation(result.pattern), atol=1e-6)
-            assert result.interval_mm == pytest.approx(1.6 * 0.01 * (1 + deepest_mm)), "where it is touched"
 
     def test_where_nothing_is_touched_no_interval_is_told(self):
         contract = dataclasses.replace(SURE, counts_per_unit=(500.0, 500.0, -1000.0))
@@ -76,16 +67,6 @@ class TestRefusals:
         result = runtime.push(make_scan(0))
         assert result.state == "zeroing" and "sensor file" not in result.note
         assert "no stored baseline for sensor 4, only for left/4" in result.note
-
-
-class TestZeroing:
-    def test_a_refused_baseline_is_noted_and_zeroing_starts_over(self):
-        pad = Pushed(make_runtime(baselines=None), noise=4)
-        notes = [pad.push(200 if number > 50 else 0).note for number in range(100)]
-        assert notes[:99] == [None] * 99 and notes[-1].startswith("zeroing started over: taxel (1, 1) z")
-        again = [pad.push() for _ in range(100)]
-        assert all(one.state == "zeroing" and one.note is not None for one in again[:-1])
-        assert (again[-1].state, again[-1].note) == ("idle", None)
 
 
 class TestOvertaken:

@@ -61,39 +61,22 @@ class TestHistogram:
         assert histogram.count == 3 and histogram.max == 1e30 and histogram.quantile(0.5) == 1.0
 
 
-def test_it_counts_what_happened():
-    statistics = counted(
-        [
-            result(make_scan(0), "contact", 200.0),
-            result(make_scan(1), "dropped"),
-            result(make_scan(1), "contact", reused_from=0),
-            result(make_scan(2, absent=(1, 2))),
-            result(make_scan(3, stale=(1,))),
-            result(make_scan(4, stale=tuple(range(16)))),
-            result(make_scan(5, absent=(0,), stale=tuple(range(16)))),
-        ]
-    )
-    got = {name: getattr(statistics, name) for name in ("scans", "patterns", "reused", "dropped")}
-    assert got == {"scans": 7, "patterns": 2, "reused": 1, "dropped": 1} and statistics.run_time_us.count == 1
-    assert (statistics.torn_wire, statistics.torn_source, statistics.repeated) == (2, 1, 1)
-
-
 class TestSummary:
     def test_it_tells_all_of_it(self):
-        statistics = counted(
-            [
-                *(at(n, n * 500_000_000, state="contact", run_time_us=200.0, absent=(0,)) for n in range(3)),
-                replace(at(3, 1_500_000_000), baseline=BASELINE, baseline_age_s=90.0),
-            ]
-        )
+        every, half_s = tuple(range(16)), 500_000_000
+        torn = [at(n, n * half_s, "4", "contact", 200.0, absent=(0,), stale=every[9 * n :]) for n in range(3)]
+        known = replace(at(3, 3 * half_s), baseline=BASELINE, baseline_age_s=90.0)
+        again = replace(at(5, 5 * half_s, state="contact"), reused_from=2)
+        in_part, repeated = at(6, 6 * half_s, stale=(1,)), at(7, 7 * half_s, stale=every)
+        statistics = counted([*torn, known, at(4, 4 * half_s, state="dropped"), again, in_part, repeated])
         statistics.overruns = 7
         statistics.commands_refused = 2
         statistics.sink_trouble = "nobody subscribes to zenoh:a"
         for kind in ("lost", "back", "lost"):
             statistics.tell(Event(0, kind, None, ""))
         assert statistics.summary(source="EMULATED demo", wanted_rate_hz=100).splitlines() == [
-            "EMULATED demo: 4 scans, 3 patterns (0 reused), 0 dropped, 7 overrun, 0 missed",
-            "torn: 3 on the wire, 0 renewed in part; 0 repeated",
+            "EMULATED demo: 8 scans, 4 patterns (1 reused), 1 dropped, 7 overrun, 0 missed",
+            "torn: 3 on the wire, 1 renewed in part; 1 repeated",
             "run time: p50 200 us, p99 200 us, max 200 us",
             "rate held: 2.0 Hz (sensor 4), 100 Hz asked for",
             f"sensor 4: baseline {BASELINE.id} 90 s old, from file",

@@ -111,13 +111,6 @@ class TestReasons:
             assert verdict.trusted is not True and (place is not tap or verdict.reason == "unfamiliar")
             place.flat[-1] = kept
 
-    @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
-    def test_readings_of_any_size_give_a_verdict(self, scale):
-        for factor in (1, 3):
-            verdict = judge(make_check(), make_tap(2 * scale), factor=factor)
-            assert verdict.trusted is (None if scale < 0.1 else False)
-            assert verdict.mismatch is None or np.isfinite(verdict.mismatch)
-
     def test_gains_that_are_certain_leave_less_unexplained(self):
         tap = make_tap()
         tap[2, 1, 1] *= 1.2
@@ -143,14 +136,6 @@ def suspected_after(taps, check=None, first=0):
 
 
 class TestSensor:
-    def test_it_is_suspected_by_odd_and_cleared_by_good_contacts(self):
-        check = make_check()
-        told = suspected_after([ODD] * 6, check)
-        assert told[:3] == [False] * 3 and told[-1]
-        verdict = judge(check, GOOD, 6)
-        assert (verdict.trusted, verdict.reason) == (False, "sensor")
-        assert not suspected_after([GOOD] * _CONTACTS, check, first=7)[-1] and judge(check, GOOD, 99).trusted is True
-
     @pytest.mark.parametrize(
         ("taps", "suspected"),
         [
@@ -234,32 +219,8 @@ class TestTaps:
         assert event.kind == "tap_dropped" and "the tap before does not belong" in event.detail
         assert pad.tap().taps_used == 2  # the tap that has dropped the others is the first of the new contact
 
-    def test_an_older_foreign_tap_leaves_the_newer_ones(self):
-        pad = make_pad()
-        pad.tap(taxel=ELSEWHERE, press=4 * PRESS)
-        pad.tap()  # too light a press to settle that the one before is foreign
-        result = pad.push(PRESS)
-        assert [share >= 0.5 for share in result.tap_mismatch] == [False, True]
-        assert result.taps_used == len(result.window) == 2 and pad.kinds == []
-
-    def test_a_lighter_press_drops_a_tap_for_this_scan_only(self):
-        pad = make_pad(options=replace(EVERY, every_scan=False))
-        pad.tap(taxel=ELSEWHERE, press=3 * PRESS)
-        light, again = pad.push(PRESS), pad.push(PRESS)
-        assert light.taps_used == 1 and len(light.tap_mismatch) == 1 and pad.kinds == []
-        assert again.reused_from == light.scan.number and again.pattern is light.pattern
-        assert again.taps_used == len(again.window) == 1, "the pattern names the taps that it was made from"
-        assert pad.push(3 * PRESS).taps_used == 1
-        pad.push()
-        assert pad.kinds == ["tap_dropped"]
-
 
 class TestVerdict:
-    @pytest.mark.parametrize(("thickness_mm", "outside"), [(5.2, False), (5.3, True)])
-    def test_a_pad_far_outside_the_training_is_told(self, thickness_mm, outside):
-        pad = make_pad(pad=Pad(thickness_mm=thickness_mm))
-        assert (pad.push(PRESS).untrusted_reason == "pad") is outside
-
     @pytest.mark.parametrize(("pad", "outside"), [(None, True), (Pad(thickness_mm=4.5), False), (Pad(), True)])
     def test_a_model_for_one_sensor_is_not_believed_on_another(self, pad, outside):
         """Nor where no sensor file tells whose readings these are."""

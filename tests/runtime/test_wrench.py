@@ -1,15 +1,17 @@
-"""Force and torque of a traction, against closed forms, and in sinks."""
+"""Force and torque of a traction, and separate contacts of a pattern from scan to scan, against closed forms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_samples import fake_source, make_pad_contract, make_wrench_result
+from edge_samples import fake_source, make_contract, make_pad_contract, make_scan, make_wrench_result
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap_samples import arrays_of, messages_of
+from scipy import ndimage
 
-from edge.api import USPA44, Pad, find_model, load_model
+from edge.api import USPA44, Pad, Patch, PatchEvents, Result, find_model, load_model, patches
 from edge.inference.trust_model import features
 from edge.perception.pattern_description import Balance, wrench_of
 from edge.perception.result import LEAST_FORCE_N
@@ -18,7 +20,7 @@ from edge.sinks.ros2.map_messages import recorded_map
 from edge.sinks.ros2.messages import GRID, WRENCH_STAMPED, force_and_torque
 
 PITCH_MM, PIXELS = 4.7, 8
-PIXEL_MM = 4 * PITCH_MM / PIXELS
+CELL_MM = 4 * PITCH_MM / PIXELS
 AREA_MM2 = (4 * PITCH_MM) ** 2
 FORCE_N = 20 * PITCH_MM**2 / 1000
 """Force of make_wrench_result: 20 kPa on taxel 5, the second of the second row."""
@@ -44,11 +46,11 @@ def test_any_traction_gives_the_sums_over_its_pixels(height, width, pixel_mm, se
 
 def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
     """Shear k kPa/mm times the distance, square to it: k * 2 * integral of x^2, less what pixels leave of it."""
-    at = (np.arange(PIXELS) - 3.5) * PIXEL_MM
+    at = (np.arange(PIXELS) - 3.5) * CELL_MM
     traction = np.zeros((3, PIXELS, PIXELS))
     traction[0], traction[1] = -2 * at[:, None], 2 * at[None, :]  # to the right of the middle it pulls down the rows
     twist = 2 * 2 * (4 * PITCH_MM) ** 4 / 12 * (1 - 1 / PIXELS**2) / 1000
-    wrench = wrench_of(traction, PIXEL_MM)
+    wrench = wrench_of(traction, CELL_MM)
     assert wrench.force_n == pytest.approx((0, 0, 0), abs=1e-9)
     assert wrench.torque_n_mm == pytest.approx((0, 0, twist))
     assert wrench.centre_of_pressure_mm is None
@@ -56,13 +58,13 @@ def test_a_pure_twist_has_no_force_and_is_clockwise_from_above():
 
 @pytest.mark.parametrize(("share", "told"), [(0.99, False), (1.01, True), (-5, False)])
 def test_of_a_light_touch_no_centre_is_told(share, told):
-    wrench = wrench_of(even(z=share * LEAST_FORCE_N * 1000 / AREA_MM2), PIXEL_MM)
+    wrench = wrench_of(even(z=share * LEAST_FORCE_N * 1000 / AREA_MM2), CELL_MM)
     assert (wrench.centre_of_pressure_mm is not None) == told
 
 
 @pytest.mark.parametrize(("traction_kpa", "ratio"), [((3, -4, 10), 0.5), ((0, 0, 10), 0), ((1, 0, -10), None)])
 def test_the_ratio_of_shear_is_that_of_the_forces(traction_kpa, ratio):
-    assert wrench_of(even(*traction_kpa), PIXEL_MM).shear_ratio == pytest.approx(ratio)
+    assert wrench_of(even(*traction_kpa), CELL_MM).shear_ratio == pytest.approx(ratio)
 
 
 @pytest.fixture
@@ -81,11 +83,11 @@ def press():
 
 def test_force_in_a_contact_changes_as_its_readings_do_whatever_the_network_finds(press):
     balance, pattern, traction, readings, row, drag_n = press
-    level_n = wrench_of(traction, PIXEL_MM).force_n[2]
+    level_n = wrench_of(traction, CELL_MM).force_n[2]
     for number, (strength, off) in enumerate([(1.0, 1.0)] * 40 + [(1.0, 1.1), (1.2, 0.8), (0.8, 1.3)]):
         found = traction * np.array([off, 2 - off, off], np.float32)[:, None, None] * np.float32(strength)
         balanced = balance(found, pattern * np.float32(strength), readings * np.float32(strength), 7, row)
-        force_n = wrench_of(balanced, PIXEL_MM).force_n
+        force_n = wrench_of(balanced, CELL_MM).force_n
         assert force_n[2] == pytest.approx(strength * level_n, rel=0.02), number
         assert force_n[:2] == pytest.approx(strength * drag_n, abs=0.05 if strength == 1 else 0.4), number
 
@@ -95,7 +97,7 @@ def test_shear_is_never_scaled_beyond_what_pads_differ_by(press, off, most):
     balance, pattern, traction, readings, row, drag_n = press
     found = traction * np.array([off, off, 1], np.float32)[:, None, None]
     for _ in range(300):
-        force_n = wrench_of(balance(found, pattern, readings, 9, row), PIXEL_MM).force_n
+        force_n = wrench_of(balance(found, pattern, readings, 9, row), CELL_MM).force_n
     assert force_n[:2] == pytest.approx(most * drag_n, abs=0.1)
 
 
@@ -146,3 +148,89 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
 )
 def test_a_record_states_how_far_its_newtons_may_be_off(settings, expected):
     assert make_wrench_result(**settings).scale_error == (None if expected is None else pytest.approx(expected))
+
+
+CONTRACT = make_contract(scale=10, contact_level=0.5)
+PIXEL_MM = 0.47
+ACROSS_MM = (np.arange(40) - 19.5) * PIXEL_MM
+X_MM, Y_MM = np.meshgrid(ACROSS_MM, ACROSS_MM)
+
+
+def result_of(pattern, traction=None, **more):
+    wrench = None if traction is None else wrench_of(traction, 18.8 / traction.shape[-1])
+    given = {"scan": make_scan(), "source": "device", "model": "m", "state": "contact", "contact": True, **more}
+    return Result(pattern=pattern.astype(np.float32), traction=traction, wrench=wrench, **given)
+
+
+def disc(x_mm, y_mm, radius_mm, depth_mm=1.0):
+    return depth_mm * (np.hypot(X_MM - x_mm, Y_MM - y_mm) <= radius_mm)
+
+
+def test_two_contacts_have_areas_centres_and_their_shares_of_the_force():
+    traction = np.zeros((3, 8, 8), dtype=np.float32)
+    traction[2, :, :4], traction[2, :, 4:], traction[0, :, 4:] = 2, 6, 3
+    big, small = patches(result_of(disc(5, 0, 3) + disc(-5, 1, 2), traction, trusted=True), CONTRACT)
+    for one, place, radius_mm in ((big, (5, 0), 3), (small, (-5, 1), 2)):
+        assert one.centre_mm == pytest.approx(place, abs=0.1) and one.trusted
+        assert one.area_mm2 == pytest.approx(np.pi * radius_mm**2, rel=0.05)
+        assert one.size_mm == pytest.approx((2 * radius_mm,) * 2, rel=0.05), "four deviations of a disc are its width"
+        assert one.normal == pytest.approx((0, 0, 1), abs=1e-3)
+    total = np.array(result_of(disc(0, 0, 1), traction).wrench.force_n)
+    assert np.add(big.force_n, small.force_n) == pytest.approx(total)
+    assert big.shear_ratio == pytest.approx(0.5) and small.shear_ratio == 0
+
+
+def test_a_bar_has_an_axis_and_a_tilted_face_its_normal():
+    along, across = X_MM * np.cos(0.5) + Y_MM * np.sin(0.5), Y_MM * np.cos(0.5) - X_MM * np.sin(0.5)
+    (bar,) = patches(result_of((abs(along) < 6) & (abs(across) < 1)), CONTRACT)
+    assert bar.long_axis_deg == pytest.approx(np.degrees(0.5), abs=1) and bar.force_n is None is bar.shear_ratio
+    assert bar.size_mm[0] > 4 * bar.size_mm[1]
+    (face,) = patches(result_of((1 + 0.02 * X_MM) * disc(0, 0, 4)), CONTRACT)
+    assert face.normal == pytest.approx(np.array([-0.02, 0, 1]) / np.hypot(0.02, 1), abs=1e-3)
+
+
+def test_without_a_pattern_there_is_none_and_specks_are_none():
+    assert patches(result_of(np.zeros((40, 40))), CONTRACT) == []
+    assert patches(replace(result_of(np.zeros((40, 40))), pattern=None), CONTRACT) == []
+    assert len(patches(result_of(disc(3, 0, 4) + disc(-8, -8, 0.5)), CONTRACT)) == 1
+
+
+def test_areas_are_those_that_are_connected_by_edges():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        mask = rng.random((40, 40)) < rng.uniform(0.2, 0.8)
+        labels, count = ndimage.label(mask)
+        sizes = np.bincount(labels.ravel())[1:]
+        expected = sorted(sizes[sizes >= 0.05 * mask.sum()] * PIXEL_MM**2)
+        assert count and sorted(one.area_mm2 for one in patches(result_of(mask), CONTRACT)) == pytest.approx(expected)
+
+
+def told(events, results):
+    return [(one.kind, one.number) for result in results for one in events(result)]
+
+
+def test_a_contact_begins_moves_and_ends_once():
+    events, held = PatchEvents(CONTRACT), result_of(disc(-5, 0, 2))
+    free = result_of(np.zeros((40, 40)), state="idle", contact=False)
+    assert told(events, [held, held]) == [] and told(events, [held, held]) == [("begin", 1)]
+    assert told(events, [result_of(disc(-5 + 0.25 * step, 0, 2)) for step in range(9)]) == [("move", 1)] * 2
+    both = result_of(disc(-3, 0, 2) + disc(5, 5, 2))
+    assert told(events, [both] * 3) == [("begin", 2)]
+    assert told(events, [free, free, both]) == [], "missing for two results is no end"
+    lost = [replace(both, state="dropped"), replace(both, trusted=False), replace(both, contact=None)]
+    assert told(events, lost) == []
+    assert told(events, [free] * 3) == [("end", 1), ("end", 2)] and told(events, [free] * 3) == []
+    assert told(events, [held, free, held, free, held]) == [], "a flicker is no contact"
+
+
+def test_a_slip_is_told_once_until_it_has_stuck_again():
+    def sheared(ratio):
+        traction = np.zeros((3, 8, 8), dtype=np.float32)
+        traction[2], traction[0] = 5, 5 * ratio
+        return result_of(disc(0, 0, 3), traction)
+
+    events = PatchEvents(CONTRACT, slip_ratio=0.6)
+    ratios = [0.1, 0.1, 0.1, 0.61, 0.7, 0.55, 0.61, 0.4, 0.61]
+    got = [[one.kind for one in events(sheared(ratio))] for ratio in ratios]
+    assert got == [[], [], ["begin"], ["slip"], [], [], [], [], ["slip"]]
+    assert isinstance(events(sheared(0.1)), list) and isinstance(patches(sheared(0.1), CONTRACT)[0], Patch)

@@ -161,17 +161,6 @@ class TestOnDemand:
         assert events(results) == [f"sensor 4 zeroed on demand: baseline {new.id} instead of {BASELINE.id}"]
         assert results[-1].baseline_age_s == pytest.approx((120 - 100) * PERIOD_NS / 1e9)
 
-    def test_in_contact_it_is_refused_unless_forced(self):
-        bench = make_bench()
-        results = zeroed(bench, 120, LOCAL)
-        (event,) = events(results)
-        assert [(one.kind, one.sensor) for one in results[0].events] == [("in_contact", "4")]
-        assert event.startswith("zeroing refused: sensor 4 is in contact: free the pad, or force it")
-        assert {result.baseline.id for result in results} == {BASELINE.id}
-        results = zeroed(bench, 120, LOCAL, force=True)
-        assert "zeroed on demand" in events(results)[0]
-        assert results[-1].contact is False and abs(results[-1].force_counts) < 100
-
     def test_motion_puts_it_off_and_a_touch_meanwhile_starts_it_over(self):
         bench = make_bench()
         moving = zeroed(bench, 150, sway)

@@ -278,7 +278,6 @@ class FakeLink(Link):
         self.kind: SourceKind = kind
         self.ended = False
         self.reads = 0
-        self.thread: threading.Thread | None = None
         self.through = threading.Event()
         self._batches = list(batches)
         self._error = error
@@ -292,7 +291,6 @@ class FakeLink(Link):
         pass
 
     def read(self, timeout_s: float) -> list[Scan]:
-        self.thread = threading.current_thread()
         self.reads += 1
         if not self._batches:
             self.through.set()

@@ -30,8 +30,8 @@ def posed_pattern(window: np.ndarray, poses: np.ndarray, scale: int = 10) -> np.
     return np.kron(z, np.ones((scale, scale)))
 
 
-def write_posed_model(path: Path, contract: Contract | None = None, **properties: str) -> Path:
-    """Write the graph; `properties` replace keys of its metadata."""
+def write_posed_model(path: Path, contract: Contract | None = None) -> Path:
+    """Write the graph."""
     contract = contract or make_posed_contract()
     scale = contract.scale
     nodes = [
@@ -61,21 +61,19 @@ def write_posed_model(path: Path, contract: Contract | None = None, **properties
         "square": np.ones((1, 1, scale, scale), dtype=np.float32),
         "doubt": np.array(0.01, dtype=np.float32),
     }
-    return save_graph(path, nodes, contract, constants, contract.to_metadata() | properties)
+    return save_graph(path, nodes, contract, constants, contract.to_metadata())
 
 
 class PosedModel(FakeModel):
-    """The model without onnxruntime; `poses` are those of its runs."""
+    """The model without onnxruntime."""
 
     def __init__(self, contract: Contract | None = None) -> None:
         super().__init__(contract or make_posed_contract())
-        self.poses: list[np.ndarray] = []
 
     def run(self, window: np.ndarray, pad: np.ndarray | None = None, poses: np.ndarray | None = None) -> np.ndarray:
         assert poses is not None and len(poses) == len(window)
         self.windows.append(window.copy())
         self.pads.append(pad)
-        self.poses.append(poses.copy())
         pattern = posed_pattern(window, poses).astype(np.float32)
         if self.contract.interval_factor is not None:
             self.deviation = tiny_deviation(pattern)

@@ -37,10 +37,11 @@ class Pushed:
         return self.results[-1]
 
     def play(self, count, offset=0.0, **changes):
-        """Return the results of so many scans whose z is off by some counts, which may be a function of the number."""
+        """Return the results of so many scans, off by counts of z or of all axes, or by a function of the number."""
         for number in range(count):
             scan = self.scan(**changes)
-            scan.counts[2] += np.rint(offset(number) if callable(offset) else offset).astype(np.int32)
+            off = np.rint(offset(number) if callable(offset) else offset).astype(np.int32)
+            scan.counts[slice(None) if off.ndim == 3 else 2] += off
             self.results.append(self.runtime.push(scan))
         return self.results[-count:]
 

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
-from edge_samples import BASELINE, PERIOD_NS, FakeModel, fake_source, make_contract
+from edge_samples import FakeModel, fake_source, make_contract
 from map_samples import result_of
 from packed_messages import unpack
-from runtime_samples import Pushed
+from runtime_samples import Pushed, make_runtime
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -18,7 +18,6 @@ from edge.mapping.object_map import ObjectMap
 from edge.mapping.sink import MapSink
 from edge.perception.contact_options import RuntimeOptions
 from edge.perception.event import Event
-from edge.perception.runtime import Runtime
 from edge.pipeline.commands import Commands
 from edge.view.server import LiveView
 from firmware_bridge.poses import PadPose
@@ -35,20 +34,15 @@ LONG_PING = b"\x89\xfd" + bytes(4 + 125)
 class Press(Pushed):
     """Results of scans, of an emulated sensor, pressed five times in eight."""
 
-    def __init__(self, sensor="4", contract=CONTRACT, **settings):
-        usual = {
-            "source": "emulated",
-            "baselines": {sensor: BASELINE},
-            "options": RuntimeOptions(every_scan=True),
-        }
-        super().__init__(Runtime(FakeModel(contract), **usual | settings), sensor)
+    def __init__(self, contract=CONTRACT, **settings):
+        options = RuntimeOptions(every_scan=True)
+        super().__init__(make_runtime(FakeModel(contract), source="emulated", options=options, **settings))
 
-    def next(self, press_counts=None, period_ns=PERIOD_NS):
-        press = (3000 if self.number % 8 < 5 else 0) if press_counts is None else press_counts
-        return self.push(press, time_ns=(self.number + 1) * period_ns)
+    def next(self, press_counts=None):
+        return self.push((3000 if self.number % 8 < 5 else 0) if press_counts is None else press_counts)
 
-    def take(self, count, press_counts=None, period_ns=PERIOD_NS):
-        return [self.next(press_counts, period_ns) for _ in range(count)]
+    def take(self, count, press_counts=None):
+        return [self.next(press_counts) for _ in range(count)]
 
 
 class Page:
@@ -61,11 +55,11 @@ class Page:
         self.messages = []
         self.press = Press()
 
-    def viewer(self, query="", *, host="127.0.0.1", origin=None, **settings):
+    def viewer(self, query="", *, origin=None, **settings):
         headers = {} if origin is None else {"Origin": origin}
         # A viewer that has not read everything does not notice that the server closes.
         settings = {"compression": None, "additional_headers": headers, "close_timeout": 0.2} | settings
-        return connect(f"ws://{host}:{self.port}/ws{query}", **settings)
+        return connect(f"ws://127.0.0.1:{self.port}/ws{query}", **settings)
 
     def stranger(self, data=b""):
         """Open a plain connection, and send this data on it."""
@@ -121,13 +115,13 @@ class Mapped:
 
 
 @contextmanager
-def live_page(host="127.0.0.1", port=0, token=None, contract=CONTRACT, **facts):
+def live_page(host="127.0.0.1", token=None, contract=CONTRACT):
     commands = Commands()
-    with LiveView(host, port, token, contract, commands) as view:
+    with LiveView(host, 0, token, contract, commands) as view:
         page = Page(view, commands)
         source = fake_source("emulated")
         source.name, source.length_s = "pretended", None
-        view.begin(source, "fake", page.messages.append, **facts)
+        view.begin(source, "fake", page.messages.append)
         yield page
 
 
@@ -136,11 +130,11 @@ def tell(page, kind, sensor, detail):
         sink.tell(Event(1, kind, sensor, detail), {})
 
 
-def frame(viewer, kind=None, sensor=None):
+def frame(viewer, kind=None):
     """Return header and maps of the next frame, or of the next of a kind."""
     while True:
         header, maps = unpack(viewer.recv(TIMEOUT_S))
-        if kind in (None, header["kind"]) and sensor in (None, header.get("sensor")):
+        if kind in (None, header["kind"]):
             return header, maps
 
 

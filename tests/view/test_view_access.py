@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.errors import UsageError
-from edge.pipeline.commands import WAITING, Command, Commands
-from edge.pipeline.pose_queue import LONGEST_BYTES
+from edge.pipeline.commands import WAITING, Commands
 from edge.view.access import grant, is_loopback
 from edge.view.frames import Viewer, execute
 
@@ -21,17 +20,6 @@ def asks(access, path="/", host=OURS, origin=None):
     hosts = [host] if isinstance(host, str) else host
     refusal = access.refusal(path, hosts, [] if origin is None else [origin])
     return None if refusal is None else refusal.status.value
-
-
-@pytest.mark.parametrize(
-    ("paths", "status"),
-    [
-        (["/", "/ws", "/?x=1", "/ws?token="], None),
-        (["/favicon.ico", "/ws/", "//", "/page.html", "/../etc/passwd", "", "*"], 404),
-    ],
-)
-def test_page_and_socket_are_there_and_nothing_else(paths, status):
-    assert {asks(grant("127.0.0.1", "robot", None), path) for path in paths} == {status}
 
 
 # Names of the machine at each address that it listens at, and names that a stranger decides what they point to.
@@ -68,15 +56,6 @@ def test_without_a_token_only_our_page_opens_a_socket(path):
     assert {asks(access, path, origin=origin) for origin in (*strangers.split(), "")} == {403}
     assert asks(access, "/ws?origin=http://evil.example") == 403
     assert asks(access, f"/ws?origin=http://{OURS}") is None
-
-
-def test_with_the_token_a_page_may_have_any_name():
-    access = grant("127.0.0.1", "robot", TOKEN)
-    assert asks(access, f"/ws?token={TOKEN}", origin="https://robot.example") is None
-    assert asks(access, f"/ws?token={TOKEN}", "edge_upstream", "https://robot.example") is None
-    assert asks(access, "/ws?token=", origin="https://robot.example") == 403
-    assert asks(access, f"/ws?token={TOKEN}", "evil.example", "http://evil.example") == 403
-    assert asks(grant("127.0.0.1", "robot", None), "/ws", "edge_upstream") == 403
 
 
 def test_the_token_opens_and_no_other_does():
@@ -135,15 +114,6 @@ def executed(*messages):
     asked = Commands()
     why = [execute(m if isinstance(m, (str, bytes)) else json.dumps(m), Viewer(), asked) for m in messages]
     return asked, why
-
-
-def test_commands_are_polled_once_in_their_order():
-    zero = {"cmd": "zero", "sensor": "4", "force": True}
-    asked, why = executed({"cmd": "zero"}, zero, {"cmd": "reset"})
-    assert why == [None] * 3 and asked.refused == 0
-    assert asked.poll() == [Command("zero"), Command("zero", "4", True), Command("reset")]
-    assert asked.poll() == []
-    assert len(json.dumps(zero | {"sensor": "s" * 1000})) < LONGEST_BYTES
 
 
 @pytest.mark.parametrize(

@@ -142,17 +142,6 @@ def test_events_come_once_and_a_newcomer_gets_the_latest_with_their_age(heard, c
     assert [header["note"] for header, _ in look(viewer, heard, clock)] == ["again"]
 
 
-def test_an_event_between_sampled_results_is_not_lost(heard, clock):
-    press, viewer = Press(), Viewer()
-    heard.write(press.next(), {})
-    heard.write(replace(press.next(), events=(Event(5, "zeroed", "4", "baseline b"),)), {})
-    heard.write(press.next(), {})
-    event, result = look(viewer, heard, clock)
-    said = [event[0][key] for key in ("event", "sensor", "note")]
-    assert said == ["zeroed", "4", "sensor 4 zeroed on demand: baseline b"]
-    assert result[0]["scan"] == 2
-
-
 def test_a_name_of_any_bytes_can_be_shown(heard, clock):
     path = Path(os.fsdecode(b"\xff.mcap"))
     source = fake_source()
