@@ -34,12 +34,12 @@ class Person:
 
     shape = (1, 3, 4, 4)
 
-    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0, rest_counts: float = 0.0) -> None:
+    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0) -> None:
         self._mounting = mounting or Mounting()
         self._free = np.zeros((3, 4, 4))
         self._felt = self._free
         self._place = self._gripped = 0
-        self.grip_counts, self.rest_counts = grip_counts, rest_counts
+        self._grip_counts = grip_counts
         self._rng = np.random.default_rng(7)
 
     def hear(self, text: str) -> None:
@@ -64,7 +64,7 @@ class Person:
             if self._gripped:
                 self._gripped -= 1
                 self._felt = np.zeros((3, 4, 4))
-                self._felt[2] = (self.grip_counts if self._gripped else self.rest_counts) / 16
+                self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
             wire = self._felt * np.array(mounting.signs)[:, None, None]
             wire = (wire[[1, 0, 2]] if mounting.swap_xy else wire).reshape(3, 16)
             taxels = np.empty((3, 16))
@@ -199,32 +199,20 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
     assert cli.main(["doctor", "--rehearse", "--source", "demo"]) == 2
 
 
-def test_two_sensors_are_pressed_one_after_the_other_and_without_a_file_it_is_wrong():
-    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person()]
+def test_two_sensors_are_pressed_one_after_the_other_and_compared_in_a_grip():
+    people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000)]
     with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
-        done = doctor(emulator.port, "--json", "--rate-hz", 120, people=people, drift_s=1.2)
-    found = {(one["sensor"], one["name"]): one["verdict"] for one in json.loads(done.out)["findings"]}
+        asked = ("--json", "--rate-hz", 120, "--weight-g", 200)
+        done = doctor(emulator.port, *asked, people=people, drift_s=1.2)
+    findings = json.loads(done.out)["findings"]
+    found = {(one["sensor"], one["name"]): one["verdict"] for one in findings}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
     assert "Sensor 4: Press the top left" in done.err and "Sensor 6: Press the top left" in done.err
-
-
-@pytest.mark.parametrize(
-    ("people", "weight", "share", "expected"),
-    [
-        ((Person(), Person(grip_counts=5000)), (), "0.80", {"4": "ok", "6": "ok", "scale": "ok"}),
-        ((Person(), Person(rest_counts=900)), (), "1.00", {"4": "ok", "6": "wrong", "scale": "ok"}),
-        ((Person(), Person(grip_counts=5000)), ("--weight-g", 200), "0.80", {"4": "ok", "6": "ok", "scale": "wrong"}),
-    ],
-)
-def test_the_pads_of_a_grip_are_compared(people, weight, share, expected):
-    with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
-        done = doctor(emulator.port, "--json", "--rate-hz", 120, *weight, people=people, drift_s=1.2)
-    findings = json.loads(done.out)["findings"]
     assert "Let the gripper close" in done.err
     zeros = {one["measured"][7]: one["verdict"] for one in findings if one["name"] == "zero after a grip"}
     (scale,) = (one for one in findings if one["name"] == "scale in a grip")
-    assert zeros | {"scale": scale["verdict"]} == expected
-    assert f"reads {share} of" in scale["measured"]
+    assert zeros == {"4": "ok", "6": "ok"} and scale["verdict"] == "wrong"
+    assert "reads 0.80 of the newtons" in scale["measured"]
 
 
 def examined(open_link, *arguments, out=None, err=None):

@@ -165,16 +165,23 @@ class TestPerson:
 
 
 @pytest.mark.parametrize(
-    ("weighed", "found"),
-    [({}, {}), ({"a": 1000.0}, {"b": 1250.0}), ({"b": 1000.0}, {"a": 800.0}), ({"a": 1000.0, "b": 1250.0}, {})],
+    ("weighed", "rest", "found", "wrong"),
+    [
+        ({}, 0, {}, []),
+        ({"a": 1000.0}, 0, {"b": 1250.0}, []),
+        ({"b": 1000.0}, 0, {"a": 800.0}, []),
+        ({"a": 1000.0, "b": 1250.0}, 0, {}, []),
+        ({"a": 1000.0, "b": 1000.0}, 0, {}, ["scale in a grip"]),
+        ({}, 900, {}, ["zero after a grip"]),
+    ],
 )
-def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, found):
+def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, rest, found, wrong):
     grip = Grip(("a", "b"))
     for scan, z in enumerate([0] * 20 + [4000] * 120 + [0] * 30):
         assert not grip.over or scan > 140
         grip.push("a", scan / 100, z)
-        grip.push("b", scan / 100 + 0.003, -1.25 * z)
-    assert grip.over and {one.verdict for one in grip.judge(weighed)} == {"ok"}
+        grip.push("b", scan / 100 + 0.003, -1.25 * z - rest * (scan >= 140))
+    assert grip.over and [one.name for one in grip.judge(weighed) if one.verdict != "ok"] == wrong
     assert grip.counts_per_newton == pytest.approx(found, rel=0.01)
 
 
