@@ -7,7 +7,7 @@ import pytest
 from bridge_samples import REST_COUNTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from xela_server_emulator import UNIX_S, message, sensor_entry
+from xela_server_emulator import message, sensor_entry
 
 from firmware_bridge.scans.xela_server_messages import ServerDecoder
 
@@ -28,19 +28,6 @@ def only_reading(entry):
     told, counters = decoded(message(5, entry))
     (reading,) = told.readings
     return reading, counters
-
-
-def test_a_message_of_1_8_0():
-    told, counters = decoded(message(19299, sensor_entry(), sensor_entry(REST_COUNTS + 1)))
-    assert (told.sequence, told.sent_s) == (19299, UNIX_S)
-    assert counters == {}
-    first, second = told.readings
-    assert (first.sensor, second.sensor) == ("1", "2")
-    assert (first.counts.reshape(3, 4, 4) == REST_COUNTS).all() and first.counts.dtype == np.int32
-    assert (second.counts.reshape(3, 4, 4) == REST_COUNTS + 1).all()
-    assert first.ups_hz == [100.0] * 16 and first.acquired_s == UNIX_S
-    assert first.newtons is not None and first.newtons.shape == (3, 4, 4)
-    assert first.temperature_k is not None and (first.temperature_k == np.float32(301.5)).all()
 
 
 def test_axes_and_places():

@@ -56,16 +56,6 @@ def test_what_comes_later_than_usual_is_counted_and_is_trouble():
     assert server.scans.trouble is None
 
 
-def test_a_scan_for_every_renewal_however_often_it_is_told():
-    """A message every 2 ms, a renewal every 10."""
-    server = Server()
-    scans = [scan for step in range(50) for scan in server.say(2 * step, cycle(1 + step // 5))]
-    assert len(scans) == 10 and all(scan.whole for scan in scans)
-    assert [scan.number for scan in scans] == list(range(10))
-    assert [scan.time_ns for scan in scans] == [(10 * n + 2) * MS for n in range(10)]
-    assert server.counted("scans", "torn_wire", "torn_source", "repeated") == (10, 0, 0, 0)
-
-
 def test_a_still_pad_gives_repeated_scans():
     server = Server()
     scans = [scan for step in range(600) for scan in server.say(2 * step)]
