@@ -283,6 +283,14 @@ def test_ticks_lie_on_the_grid_however_long_the_work_takes(off_by_s, ticks):
         assert (ticker.wait(), time.now_ns - start_ns) == (tick, round(at_s * NS_PER_S))
 
 
+def test_no_rate_drifts():
+    time = FakeTime()
+    ticker, start_ns = Ticker(59.7544117, time.clock, time.sleep), time.now_ns
+    for _ in range(10_000):
+        ticker.wait()
+    assert abs(time.now_ns - start_ns - 10_000 / 59.7544117 * NS_PER_S) < 2
+
+
 def test_sleeping_goes_on_until_the_deadline():
     time = FakeTime(-0.5, -0.2)
     assert sleep_until(time.now_ns + NS_PER_S, time.clock, time.sleep) == START_NS + NS_PER_S

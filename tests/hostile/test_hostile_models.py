@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from edge_samples import make_contract, write_model
+from edge_samples import make_contract, save_graph, write_model
 from hostile_samples import one_line
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from edge.errors import ModelError
 from edge.inference import onnx_guard
@@ -103,20 +103,15 @@ class TestModels:
         assert capfd.readouterr().out == ""
 
     def test_an_array_that_no_machine_holds(self, tmp_path):
-        shape = numpy_helper.from_array(np.array([1 << 30, 1 << 20]), "shape")
+        contract = make_contract(taps=1)
         nodes = [
             helper.make_node("ConstantOfShape", ["shape"], ["huge"]),
-            helper.make_node("ReduceSum", ["huge"], ["s"]),
+            helper.make_node("ReduceSum", ["huge"], ["sum"], keepdims=0),
+            helper.make_node("Add", ["blank", "sum"], ["pattern"]),
         ]
-        nodes += [helper.make_node("Add", ["window", "s"], ["pattern"])]
-        ends = [
-            helper.make_tensor_value_info("window", 1, [1, 3, 4, 4]),
-            helper.make_tensor_value_info("pattern", 1, None),
-        ]
-        graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [shape])
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
-        helper.set_model_props(model, make_contract(taps=1).to_metadata())
-        (tmp_path / "huge.onnx").write_bytes(model.SerializeToString())
-        with pytest.raises(ModelError, match=r"huge\.onnx") as raised:
-            ModelSession(tmp_path / "huge.onnx")
+        blank = np.zeros(contract.output_shapes["pattern"], np.float32)
+        constants = {"shape": np.array([1 << 30, 1 << 20]), "blank": blank}
+        path = save_graph(tmp_path / "huge.onnx", nodes, contract, constants, contract.to_metadata())
+        with pytest.raises(ModelError, match=r"huge\.onnx: .*allocate") as raised:
+            ModelSession(path)
         assert one_line(raised)
