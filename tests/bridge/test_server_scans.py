@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from bridge_samples import REST_COUNTS, make_recording
+from bridge_samples import REST_COUNTS
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from xela_server_emulator import MS, UNIX_S, VendorServer, message, sensor_entry
+from xela_server_emulator import MS, UNIX_S, message, sensor_entry
 
 from firmware_bridge.scans.xela_server_messages import MOST_SENSORS, ServerDecoder
 from firmware_bridge.scans.xela_server_scans import MOST_MISSED, ServerScans
@@ -372,17 +372,3 @@ def test_a_step_of_the_servers_clock_does_not_hurt(step_s):
     scans = [scan for step in range(20, 60) for scan in server.say(10 * step, cycle(step))]
     assert len(scans) == 40
     assert all(scan.device_ns is not None and 0 <= scan.time_ns - scan.device_ns <= 51 * MS for scan in scans)
-
-
-@pytest.mark.parametrize(
-    ("spread", "message_hz", "fewest"),
-    [(0.0, 100, 100), (0.9, 100, 99), (0.5, 507, 98), (0.3, 60, 60), (1.0, 333, 80)],
-)
-def test_whatever_the_pace_of_the_messages_scans_are_whole(spread, message_hz, fewest):
-    """A second of 100 Hz. A message with the end of one cycle and the start of another skips a scan."""
-    server = VendorServer([make_recording(100)], spread=spread)
-    scans, found = ServerScans(), []
-    for number in range(message_hz):
-        found += scans.feed(server.message(number, number / message_hz, UNIX_S), round(1e9 * number / message_hz))
-    assert fewest <= len(found) <= 100
-    assert all(scan.complete for scan in found) and sum(scan.whole for scan in found) >= 0.98 * len(found)

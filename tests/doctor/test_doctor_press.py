@@ -8,7 +8,7 @@ from doctor_samples import finger, visit
 
 from edge.doctor import guided_press
 from edge.doctor.grip import Grip
-from edge.doctor.guided_press import GuidedPress, Press, find_axes, find_order, judge_force, judge_press, orders
+from edge.doctor.guided_press import GuidedPress, Press, find_order, judge_force, judge_press, orders
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
@@ -80,13 +80,6 @@ class TestAnswers:
         (order, _), mounting = judge_press(crossed)
         assert (order.verdict, mounting) == ("wrong", None) and "top right: taxel 15" in order.measured
         assert find_order([press(0, 0), press(3, 0), press(15, 15), press(12, 12)]) is None
-
-    def test_three_corners_settle_the_turn_and_the_axes(self):
-        for left_out in range(4):
-            presses = [press(place) for place in CORNERS]
-            del presses[left_out]
-            assert find_order(presses) == "as in the id map"
-            assert find_axes(presses) == (False, (1, 1))
 
     @pytest.mark.parametrize(
         ("presses", "verdict", "measured"),

@@ -44,18 +44,13 @@ class _Player(NamedTuple):
 
 
 class VendorServer:
-    """Model of a server with some sensors: its readings at any time, in the format of its version.
-
-    Attributes:
-        silent: taxels of all sensors that are no longer renewed, row-major from the top left.
-    """
+    """Model of a server with some sensors: its readings at any time, in the format of its version."""
 
     def __init__(
         self,
         recordings: Sequence[Recording],
         *,
         version: str = "1.8.0",
-        spread: float = 0.0,
         loop: bool = False,
         others: Sequence[tuple[str, int]] = (),
     ) -> None:
@@ -64,23 +59,17 @@ class VendorServer:
         Args:
             recordings: each track is one sensor.
             version: one of VERSIONS.
-            spread: share of a cycle over which its taxels come, 0..1; at 0 all at once.
             loop: True to begin again after the last cycle.
             others: model and number of taxels of sensors other than 4x4 ones, after all the others.
         """
-        self.silent: frozenset[int] = frozenset()
         self._version = version
-        self._spread = spread
         self._loop = loop
         self._others = tuple(others)
         self._players = [_player(recording, track) for recording in recordings for track in recording.tracks]
-        self._held: dict[int, NDArray[np.int32]] = {}
 
     def ended(self, elapsed_s: float) -> bool:
         """Return True once every cycle of every sensor could be sent."""
-        return not self._loop and all(
-            elapsed_s * one.rate_hz - self._spread >= len(one.counts) for one in self._players
-        )
+        return not self._loop and all(elapsed_s * one.rate_hz >= len(one.counts) for one in self._players)
 
     def welcome(self, unix_s: float) -> str:
         """Return the greeting."""
@@ -105,16 +94,12 @@ class VendorServer:
 
     def _sensor(self, index: int, elapsed_s: float, unix_s: float) -> dict[str, Any]:
         player = self._players[index]
-        taxels = np.arange(USPA44.taxel_count)
         # A message that is sent at the time of a cycle holds it, however that time was rounded.
-        begun = elapsed_s * player.rate_hz + 1e-6 - self._spread * taxels / USPA44.taxel_count
-        cycles = np.maximum(0, np.floor(begun)).astype(int)
-        rows = cycles % len(player.counts) if self._loop else np.minimum(cycles, len(player.counts) - 1)
-        counts = player.counts[rows, :, taxels]
-        silent = np.isin(taxels, list(self.silent))
-        held = self._held[index] = np.where(silent[:, None], self._held.get(index, counts), counts)
-        ups_hz = np.where(player.present[rows, taxels] & ~silent, player.rate_hz, 0.0)
-        values = held.ravel().tolist()
+        cycle = int(elapsed_s * player.rate_hz + 1e-6)
+        row = cycle % len(player.counts) if self._loop else min(cycle, len(player.counts) - 1)
+        counts = player.counts[row].T
+        ups_hz = np.where(player.present[row], player.rate_hz, 0.0)
+        values = counts.ravel().tolist()
         by_hex = ",".join(f"{value:04X}" for value in values)
         rest = player.counts[0].T
         newtons_per_count = np.array([0.0007, 0.0007, 0.00085])  # about those of real sensors
@@ -124,7 +109,7 @@ class VendorServer:
             "data": values if self._version == "1.7.7" else by_hex,
             "model": "uSPa44",
             "taxels": USPA44.taxel_count,
-            "calibrated": np.round((held - rest) * newtons_per_count, 6).ravel().tolist(),
+            "calibrated": np.round((counts - rest) * newtons_per_count, 6).ravel().tolist(),
             "temp": [302.5 if self._version == "1.8.0" else 0.0] * USPA44.taxel_count,
             "ups": np.round(ups_hz, 2).tolist(),
         }
