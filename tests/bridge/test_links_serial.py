@@ -3,6 +3,8 @@
 import contextlib
 import errno
 import os
+import subprocess
+import sys
 import termios
 import threading
 import time
@@ -211,10 +213,17 @@ def test_why_a_port_cannot_be_opened(monkeypatch, code, words):
     assert isinstance(refused.value, BridgeError) and isinstance(refused.value, OSError)
 
 
-def test_a_port_that_is_in_use_is_opened_by_nobody_else():
+def test_who_holds_a_port_is_named():
+    held = "import fcntl, sys; f = open(sys.argv[1], 'r+b', 0); fcntl.flock(f, fcntl.LOCK_EX); print(1, flush=True)"
     with SilentDevice() as device:
         with SlcanSerialLink(device.port), pytest.raises(DeviceError, match=r"in use by this program, or .*slcand"):
             SlcanSerialLink(device.port).__enter__()
+        command = [sys.executable, "-c", f"{held}; input()", device.port]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout.readline() == b"1\n"
+            with pytest.raises(DeviceError, match=rf"in use by \S+ \({process.pid}\): .*ModemManager.*udev rule ATTRS"):
+                SlcanSerialLink(device.port).__enter__()
+            process.communicate()
         with SlcanSerialLink(device.port):
             pass
 
