@@ -13,63 +13,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cli_samples import start, write_recording
-from doctor_samples import PUSHES, REST, as_scans, finger, healthy_counts
+from doctor_samples import REST, WEIGHT_COUNTS, Person, as_scans, healthy_counts
 from edge_samples import FakeLink
 
-from edge.api import USPA44, load_sensor_file
+from edge.api import load_sensor_file
 from edge.cli import main as cli
 from edge.cli.main import parser
 from edge.doctor import command, examine
-from edge.doctor.guided_press import CORNERS, orders
+from edge.doctor.guided_press import orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
 from firmware_bridge.scans.mounting import Mounting
-
-WEIGHT_COUNTS = 2400.0
-
-
-class Person:
-    """Holds a sensor, mounted somehow, and does what is asked; gives what the pad sends, scan by scan, without end."""
-
-    shape = (1, 3, 4, 4)
-
-    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0) -> None:
-        self._mounting = mounting or Mounting()
-        self._free = np.zeros((3, 4, 4))
-        self._felt = self._free
-        self._place = self._gripped = 0
-        self._grip_counts = grip_counts
-        self._rng = np.random.default_rng(7)
-
-    def hear(self, text: str) -> None:
-        for place, corner in zip(USPA44.corners, CORNERS, strict=True):
-            if f"the {corner} corner" in text:
-                self._place = place
-                self._felt = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(place)])
-        if "push towards" in text:
-            x, y = PUSHES[self._place]
-            self._felt = self._felt + np.stack([0.2 * x * self._felt[2], 0.2 * y * self._felt[2], 0 * self._felt[2]])
-        if "Lay 200 g" in text:
-            self._felt = np.zeros((3, 4, 4))
-            self._felt[2] = WEIGHT_COUNTS / 16
-        if "Let the gripper close" in text:
-            self._gripped = 150
-        if "et go" in text or "Take it off" in text:
-            self._felt = self._free
-
-    def __iter__(self):
-        while True:
-            mounting = self._mounting
-            if self._gripped:
-                self._gripped -= 1
-                self._felt = np.zeros((3, 4, 4))
-                self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
-            wire = self._felt * np.array(mounting.signs)[:, None, None]
-            wire = (wire[[1, 0, 2]] if mounting.swap_xy else wire).reshape(3, 16)
-            taxels = np.empty((3, 16))
-            taxels[:, list(mounting.order)] = wire
-            yield np.rint(REST + taxels.reshape(3, 4, 4) + self._rng.normal(0, 2, (3, 4, 4))).astype(np.int32)
 
 
 class Terminal(io.StringIO):

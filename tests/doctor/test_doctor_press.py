@@ -12,8 +12,6 @@ from edge.doctor.guided_press import GuidedPress, Press, find_order, judge_force
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
-AXES = [(swap, (x, y, z)) for swap, x, y, z in product((False, True), (1, -1), (1, -1), (1, -1))]
-UPRIGHT = list(range(16))
 CORNERS = USPA44.corners
 
 
@@ -36,13 +34,14 @@ def judged(guide):
 @pytest.mark.parametrize("name", orders())
 def test_every_turn_and_every_axis_is_found(name):
     order = orders()[name]
-    for swap, signs in AXES:
-        noise = np.random.default_rng(1).normal(0, 2, visit(list(order), swap, signs).shape)
-        asked, guide = answer_to(visit(list(order), swap, signs) + noise)
+    for swap, *signs in product((False, True), *[(1, -1)] * 3):
+        sits = Mounting(order, swap, tuple(signs))
+        script = visit(sits)
+        asked, guide = answer_to(script + np.random.default_rng(1).normal(0, 2, script.shape))
         assert guide.done and len(asked) == 12
         findings, mounting = judged(guide)
-        assert mounting == Mounting(order, swap, signs)
-        assert (findings["taxel order"].verdict == "ok") == (order == tuple(UPRIGHT))
+        assert mounting == sits
+        assert (findings["taxel order"].verdict == "ok") == (order == tuple(range(16)))
         assert (findings["axis signs"].verdict == "ok") == (not mounting.turns_axes)
 
 
@@ -54,7 +53,7 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
     assert guide.skip() == "Skipped. Let go."
     more, _ = answer_to([pressed] * 40, guide)
     assert more[1:] == [], "the finger is still there"
-    rest = visit(UPRIGHT, False, (1, 1, 1))
+    rest = visit()
     rest = rest[np.flatnonzero(rest[:, 2].any(axis=(1, 2)))[90:][0] :]  # from the press of the second corner on
     more, _ = answer_to([np.zeros((3, 4, 4))] * 25 + list(rest), guide)
     assert "Press the top right corner" in more[1] and guide.done
@@ -117,11 +116,11 @@ class TestPerson:
     def test_a_press_in_the_middle_is_no_answer(self):
         middle = np.zeros((40, 3, 4, 4))
         middle[:, 2, 1:3, 1:3] = 1000
-        asked, guide = answer_to([*middle, *np.zeros((30, 3, 4, 4)), *visit(UPRIGHT, False, (1, 1, 1))])
+        asked, guide = answer_to([*middle, *np.zeros((30, 3, 4, 4)), *visit()])
         assert len(asked) == 12 and guide.done and len(guide.presses) == 4
 
     def test_a_corner_let_go_without_a_push_is_a_press_all_the_same(self):
-        script = visit(UPRIGHT, False, (1, 1, 1))
+        script = visit()
         script[65:110] = 0
         asked, guide = answer_to(script)
         assert asked[2] == "No push was measured. Let go."
@@ -139,7 +138,7 @@ class TestPerson:
         laid = np.zeros((120, 3, 4, 4))
         laid[:, 2] = z_counts / 16 + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
         laid[:20, 2] *= np.linspace(0, 1, 20)[:, None, None]
-        script = [*visit(UPRIGHT, False, (1, 1, 1)), *laid, *np.zeros((30, 3, 4, 4))]
+        script = [*visit(), *laid, *np.zeros((30, 3, 4, 4))]
         asked, guide = answer_to(script, GuidedPress(weight_g=200.0))
         assert asked[-2:] == ["Lay 200 g on the middle of the pad, hands off.", "Good. Take it off."]
         assert guide.counts_per_newton == pytest.approx(z_counts / 1.96133, rel=0.02)
@@ -148,11 +147,11 @@ class TestPerson:
     def test_an_unsteady_weight_gives_none(self):
         laid = np.zeros((7000, 3, 4, 4))
         laid[:, 2] = (200 + 40 * (np.arange(7000) % 2))[:, None, None]
-        _, guide = answer_to([*visit(UPRIGHT, False, (1, 1, 1)), *laid], GuidedPress(weight_g=200.0))
+        _, guide = answer_to([*visit(), *laid], GuidedPress(weight_g=200.0))
         assert guide.done and judge_force(guide.counts_per_newton, kept=False).verdict == "not known"
 
     def test_a_torn_scan_is_not_taken_for_letting_go(self):
-        script = visit(UPRIGHT, False, (1, 1, 1), rest=25)
+        script = visit(rest=25)
         script[5::7, :, :2] = np.nan
         assert judged(answer_to(script)[1])[1] == Mounting()
 
