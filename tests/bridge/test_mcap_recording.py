@@ -289,9 +289,7 @@ def turned(tmp_path_factory):
 def patterns(path):
     with open_recording(path) as source:
         runtime = open_runtime(FakeModel(SURE), source, every_scan=True)
-        results = []
-        while (taken := source.take(1.0)) is not None:
-            results += [runtime.push(one) for one in taken if isinstance(one, Scan)]
+        results = [runtime.push(scan) for scan in scans_of(source)]
     return [(one.scan.time_ns, one.zeroed.tobytes()) for one in results]
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bridge_samples import REAL_RECORDINGS
+from bridge_samples import REAL_RECORDINGS, write_npz
 from hostile_samples import one_line
 
 from firmware_bridge.errors import BaselineRefusedError, RecordingError
@@ -29,24 +29,15 @@ def write_csv(folder: Path, text: str | bytes, name: str = "finger.csv") -> Path
     return path
 
 
-def npz_arrays() -> dict[str, np.ndarray]:
-    counts = np.arange(4 * 48, dtype=np.int32).reshape(4, 3, 4, 4)
-    counts[1, :, 2, 3] = -1
-    return {
-        "format": np.array("tactile-recording"),
-        "version": np.array(1),
-        "sensor": np.array(["4", "6", "4", "6"]),
-        "scan": np.array([0, 0, 1, 1], dtype=np.int64),
-        "time_ns": np.array([10, 15, 20_000_010, 30_000_015], dtype=np.int64),
-        "counts": counts,
-    }
+COUNTS = np.arange(4 * 48, dtype=np.int32).reshape(4, 3, 4, 4)
+COUNTS[1, :, 2, 3] = -1
+TIMES_NS = np.array([10, 15, 20_000_010, 30_000_015])
 
 
-def write_npz(folder: Path, **changes: object) -> Path:
-    path = folder / "finger.npz"
-    arrays = npz_arrays() | changes
-    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
-    return path
+def write_two(folder: Path, **changes: object) -> Path:
+    """Write two scans of each of two sensors."""
+    arrays = {"scan": [0, 0, 1, 1], "time_ns": TIMES_NS, "sensor": ["4", "6", "4", "6"], "counts": COUNTS} | changes
+    return write_npz(folder / "finger.npz", COUNTS, **arrays)
 
 
 def test_csv(tmp_path):
@@ -237,13 +228,12 @@ def test_the_vendors_log(tmp_path):
 
 
 def test_npz(tmp_path):
-    recording = load_recording(write_npz(tmp_path, pattern=np.zeros((4, 40, 40)), rate_hz=np.array(50.0)))
+    recording = load_recording(write_two(tmp_path, pattern=np.zeros((4, 40, 40)), rate_hz=np.array(50.0)))
     assert recording.rate_hz == 50.0
     assert [track.sensor for track in recording.tracks] == ["4", "6"]
-    counts = npz_arrays()["counts"]
     for track, rows in zip(recording.tracks, ([0, 2], [1, 3]), strict=True):
-        assert track.counts.dtype == np.int32 and (track.counts == counts[rows]).all()
-        assert track.time_ns is not None and track.time_ns.tolist() == npz_arrays()["time_ns"][rows].tolist()
+        assert track.counts.dtype == np.int32 and (track.counts == COUNTS[rows]).all()
+        assert track.time_ns is not None and track.time_ns.tolist() == TIMES_NS[rows].tolist()
     assert recording.tracks[0].mean_rate_hz == pytest.approx(50.0)
 
 
@@ -281,12 +271,12 @@ OF_65 = {"sensor": np.arange(65).astype(str), "counts": np.zeros((65, 3, 4, 4), 
 )
 def test_npz_that_is_none(tmp_path, words, changes):
     with pytest.raises(RecordingError, match=words) as refused:
-        load_recording(write_npz(tmp_path, **changes))
+        load_recording(write_two(tmp_path, **changes))
     assert one_line(refused)
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    whole = write_npz(tmp_path).read_bytes()
+    whole = write_two(tmp_path).read_bytes()
     (tmp_path / "folder.csv").mkdir()
     for name, content, words in (
         ("gone.csv", None, r"gone\.csv: cannot be read: No such file"),
