@@ -297,12 +297,12 @@ def test_files_that_cannot_be_read(tmp_path):
 # Where a pad is free: its baseline, if the recording has none.
 
 
-def scans(*levels, seed=3):
-    """Return counts of (count, press) parts, with the noise of a still pad; a press of None moves all the time."""
-    rng, parts = np.random.default_rng(seed), []
+def scans(*levels, noise_counts=3):
+    """Return counts of (count, press) parts of a pad; a press is a number, one for each scan, or None: it grows."""
+    rng, parts = np.random.default_rng(3), []
     for count, press in levels:
-        part = 30000 + rng.normal(0, 3, (count, 3, 4, 4))
-        part[:, 2] += np.linspace(200, 3000, count)[:, None, None] if press is None else press
+        part = 30000 + rng.normal(0, noise_counts, (count, 3, 4, 4))
+        part[:, 2] += (np.linspace(200, 3000, count) if press is None else np.broadcast_to(press, count))[:, None, None]
         parts.append(part)
     return np.concatenate(parts).round().astype(np.int32)
 
@@ -323,14 +323,10 @@ def test_a_still_grip_is_not_free():
         free_stretch(scans((200, 1000), (40, None), (FEWEST_RECORDED - 5, 0), (40, None)))
 
 
-def recovering(scans, counts, seed=3):
+def recovering(count, counts):
     """Counts of a pad that recovers by so many counts a taxel on z after a grip."""
-    rng = np.random.default_rng(seed)
-    grip = 30000 + rng.normal(0, 2, (40, 3, 4, 4))
-    grip[:, 2] += 600 + 20 * np.sin(np.arange(40))[:, None, None]
-    free = 30000 + rng.normal(0, 2, (scans, 3, 4, 4))
-    free[:, 2] += counts * np.linspace(1, 0, scans)[:, None, None]
-    return np.concatenate([grip, free]).round().astype(np.int32)
+    grip, free = (40, 600 + 20 * np.sin(np.arange(40))), (count, counts * np.linspace(1, 0, count))
+    return scans(grip, free, noise_counts=2)
 
 
 def test_where_a_pad_only_recovers_its_freest_scans_are_taken():

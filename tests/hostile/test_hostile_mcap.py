@@ -99,35 +99,31 @@ def of_scans(*changes, **settings):
 
 
 @pytest.mark.parametrize(
-    ("words", "changes"),
-    [
-        ("sensor", {"sensor": ""}),
-        ("sensor", {"sensor": "a\nb"}),
-        ("number", {"number": -1}),
-        ("time_ns", {"time_ns": -1}),
-        ("time_ns", {"time_ns": 1 << 61}),
-        ("device_time_ns", {"device_time_ns": -2}),
-        ("fresh", {"fresh": 0x1FFFF}),
-        ("fresh", {"renewed": 0x10000}),
-        ("fresh", {"fresh": 0xFFFE, "renewed": 1}),
-        ("one on each axis", {"fresh": 0xFFFE, "renewed": 0}),
-        ("one on each axis", {"counts": np.full(48, -1)}),
-        ("counts", {"counts": np.full(48, -2)}),
-        ("counts", {"counts": np.full(48, 0x10000)}),
-        ("vendor_newtons", {"vendor_newtons": np.zeros(47)}),
-        ("vendor_newtons", {"vendor_newtons": np.full(48, np.nan)}),
-        ("vendor_newtons", {"vendor_newtons": np.full(48, -1001.0)}),
-        ("vendor_temperature_k", {"vendor_temperature_k": np.full(16, 199.0)}),
-        ("vendor_ups_hz", {"vendor_ups_hz": np.full(16, -1.0)}),
-    ],
-)
-def test_scans_that_cannot_be(tmp_path, changes, words):
-    refused(written(tmp_path, *of_scans(changes)), rf"topic '/t1': .*{words}")
-
-
-@pytest.mark.parametrize(
     ("words", "records"),
     [
+        *(
+            (rf"topic '/t1': .*{name}", of_scans(changes))
+            for name, changes in (
+                ("sensor", {"sensor": ""}),
+                ("sensor", {"sensor": "a\nb"}),
+                ("number", {"number": -1}),
+                ("time_ns", {"time_ns": -1}),
+                ("time_ns", {"time_ns": 1 << 61}),
+                ("device_time_ns", {"device_time_ns": -2}),
+                ("fresh", {"fresh": 0x1FFFF}),
+                ("fresh", {"renewed": 0x10000}),
+                ("fresh", {"fresh": 0xFFFE, "renewed": 1}),
+                ("one on each axis", {"fresh": 0xFFFE, "renewed": 0}),
+                ("one on each axis", {"counts": np.full(48, -1)}),
+                ("counts", {"counts": np.full(48, -2)}),
+                ("counts", {"counts": np.full(48, 0x10000)}),
+                ("vendor_newtons", {"vendor_newtons": np.zeros(47)}),
+                ("vendor_newtons", {"vendor_newtons": np.full(48, np.nan)}),
+                ("vendor_newtons", {"vendor_newtons": np.full(48, -1001.0)}),
+                ("vendor_temperature_k", {"vendor_temperature_k": np.full(16, 199.0)}),
+                ("vendor_ups_hz", {"vendor_ups_hz": np.full(16, -1.0)}),
+            )
+        ),
         *(
             (f"topic '/t2': {name}", (*OF_A_BASELINE, message(BASELINE, REST, 2, **changes), *of_scans({})))
             for name, changes in (
