@@ -163,6 +163,7 @@ def test_deformation_is_corrected_once():
     ("settings", "word"),
     [
         ({"order": (0,) * 16}, "each of 0..15 once"),
+        ({"order": tuple(range(15))}, "each of 0..15 once"),
         ({"signs": (1, 0, 1)}, "three of 1 and -1"),
         ({"gains": (float("nan"),) * 48}, "48 positive"),
         ({"gains": (1.0,) * 3}, "48 positive"),
