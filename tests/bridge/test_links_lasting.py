@@ -102,8 +102,10 @@ def test_a_long_outage_is_asked_after_every_two_seconds():
 def test_a_device_that_falls_silent_is_opened_and_told_once():
     """An adapter that was reset has a port, but its channel is closed until it is opened."""
     world = World(mute=[(1.0, 1.0 + LINK_SILENT_S + 0.015)])
-    notices, link, heard_s = lasting(world, 4.0)
-    assert kinds(notices) == ["silent", "back"]
+    inner = WorldLink(world)
+    inner.trouble = "nothing arrives from a sensor"
+    notices, link, heard_s = lasting(world, 4.0, inner=inner)
+    assert kinds(notices) == ["trouble", "silent", "back"], "nor is a trouble that lasts told again"
     assert len(world.opened_at_s) == 2 and min(time_s for time_s in heard_s if time_s > 1.1) < 2.0
     assert link.counters()["outages"] == 1
 

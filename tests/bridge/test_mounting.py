@@ -74,22 +74,6 @@ def test_every_sensor_has_every_taxel_once(model, sensors, triggered):
     assert all(sorted(taxel for _, taxel in model.wire_order(sensor)) == [*range(16)] for sensor in names)
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [
-        CanFrame(0x004, DATA[:7]),
-        CanFrame(0x004, b""),
-        CanFrame(0x004, DATA, extended=True),
-        CanFrame(0x004, DATA, remote=True),
-        CanFrame(0x004, b"", remote=True),
-    ],
-)
-def test_foreign_frames(frame):
-    assembler = ScanAssembler(USPA44_MAP)
-    assert assembler.feed_frame(frame, 0) == []
-    assert (assembler.counters()["foreign"], assembler.counters()["readings"]) == (1, 0)
-
-
 mountings = st.builds(
     Mounting,
     order=st.permutations(AS_MAPPED).map(tuple),

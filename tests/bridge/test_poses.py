@@ -43,14 +43,6 @@ def test_there_is_no_pose_beyond_those_that_came():
     assert track.at(10 * MS + 2 * GAP_NS + AHEAD_NS + 1) is None
 
 
-def test_shortly_after_the_last_pose_the_course_goes_on():
-    track = PoseTrack()
-    track.add(0, PadPose(0, 0, error_mm=0))
-    track.add(10 * MS, PadPose(1, 0, error_mm=0))
-    pose = track.at(15 * MS)
-    assert pose.x_mm == pytest.approx(1.5) and pose.error_mm == pytest.approx(0.5)
-
-
 def test_poses_of_one_burst_show_no_speed():
     """Lines that a program writes at once arrive within microseconds, whatever their distance in time was."""
     track = PoseTrack()
@@ -62,10 +54,11 @@ def test_poses_of_one_burst_show_no_speed():
     one = PoseTrack()
     one.add(0, PadPose(7, 7, 0, 0, 0), holds=True)
     one.add(5 * MS, PadPose(0, 0, 350, 0, 0))
-    one.add(10 * MS, PadPose(0, 0, 0, 0, 0))
+    one.add(10 * MS, PadPose(1, 0, 0, 0, 0))
     ahead = one.at(14 * MS)
-    assert (ahead.x_mm, ahead.turn_deg % 360, ahead.error_deg) == pytest.approx((0, 8, 8)), "not from where it rested"
-    assert one.at(18 * MS) == PadPose(0, 0, 0, 0, 0), "poses of 5 ms say nothing of 8 ms more"
+    assert (ahead.x_mm, ahead.error_mm) == pytest.approx((1.8, 0.8)), "not from where it rested"
+    assert (ahead.turn_deg % 360, ahead.error_deg) == pytest.approx((8, 8))
+    assert one.at(18 * MS) == PadPose(1, 0, 0, 0, 0), "poses of 5 ms say nothing of 8 ms more"
 
 
 def test_a_pose_that_holds_is_that_of_all_times_until_the_next():

@@ -67,8 +67,8 @@ def write_recording(path: Path, counts: np.ndarray, rate_hz: float | None = None
     return path
 
 
-def write_npz(path: Path, counts: np.ndarray, time_ns: Any = None, sensors: Any = None, **more: Any) -> Path:
-    """Write a recording for numpy: by default of one sensor, at 100 Hz."""
+def write_npz(path: Path, counts: np.ndarray, /, time_ns: Any = None, sensors: Any = None, **more: Any) -> Path:
+    """Write a recording for numpy, by default of one sensor, at 100 Hz; an array of `more` that is None is left out."""
     scan = np.arange(len(counts))
     arrays: dict[str, Any] = {
         "format": "tactile-recording",
@@ -78,7 +78,7 @@ def write_npz(path: Path, counts: np.ndarray, time_ns: Any = None, sensors: Any 
         "time_ns": np.array(scan * 10_000_000 if time_ns is None else time_ns),
         "counts": counts,
     }
-    np.savez(path, **arrays, **more)
+    np.savez(path, **{name: array for name, array in (arrays | more).items() if array is not None})
     return path
 
 

@@ -3,7 +3,9 @@
 import numpy as np
 
 from edge.doctor.examine import Watched
+from edge.doctor.guided_press import CORNERS
 from firmware_bridge.pad_geometry import USPA44
+from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.scans.scan import ABSENT, Scan, ScanSeries
 
 REST = np.array([32_700, 32_900, 37_300])[:, None, None] + np.arange(16).reshape(4, 4) * 37
@@ -50,25 +52,64 @@ def finger(place: int, force: float = 4000.0) -> np.ndarray:
 
 
 PUSHES = {0: (1, 1), 3: (-1, 1), 15: (-1, -1), 12: (1, -1)}
+WEIGHT_COUNTS = 2400.0
 
 
-def visit(order: list[int], swap: bool, signs: tuple[int, int, int], *, rest: int = 20, hold: int = 45) -> np.ndarray:
-    """Return the counts of a pad that a person presses as asked, noiseless and over its rest, (n, 3, 4, 4).
+class Person:
+    """Holds a sensor, mounted somehow, and does what is asked; gives what the pad sends, scan by scan, without end."""
 
-    `order` holds the taxel of the id map at each place as the person sees it; with `swap` the wire's x is the pad's y.
+    shape = (1, 3, 4, 4)
+
+    def __init__(self, mounting: Mounting | None = None, grip_counts: float = 4000.0) -> None:
+        self._mounting = mounting or Mounting()
+        self._felt = self._free = np.zeros((3, 4, 4))
+        self._place = self._gripped = 0
+        self._grip_counts = grip_counts
+        self._rng = np.random.default_rng(7)
+
+    def hear(self, text: str) -> None:
+        """Do what a request says."""
+        for place, corner in zip(USPA44.corners, CORNERS, strict=True):
+            if f"the {corner} corner" in text:
+                self._place = place
+                self._felt = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(place)])
+        if "push towards" in text:
+            x, y = PUSHES[self._place]
+            self._felt = self._felt + np.stack([0.2 * x * self._felt[2], 0.2 * y * self._felt[2], 0 * self._felt[2]])
+        if "Lay 200 g" in text:
+            self._felt = np.zeros((3, 4, 4))
+            self._felt[2] = WEIGHT_COUNTS / 16
+        if "Let the gripper close" in text:
+            self._gripped = 150
+        if "et go" in text or "Take it off" in text:
+            self._felt = self._free
+
+    def deformation(self) -> np.ndarray:
+        """Return what the wire has over its rest, noiseless, (3, 4, 4)."""
+        wire = self._felt * np.array(self._mounting.signs)[:, None, None]
+        wire = (wire[[1, 0, 2]] if self._mounting.swap_xy else wire).reshape(3, 16)
+        taxels = np.empty((3, 16))
+        taxels[:, list(self._mounting.order)] = wire
+        return taxels.reshape(3, 4, 4)
+
+    def __iter__(self):
+        while True:
+            if self._gripped:
+                self._gripped -= 1
+                self._felt = np.zeros((3, 4, 4))
+                self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
+            yield np.rint(REST + self.deformation() + self._rng.normal(0, 2, (3, 4, 4))).astype(np.int32)
+
+
+def visit(mounting: Mounting | None = None, *, rest: int = 20, hold: int = 45) -> np.ndarray:
+    """Return the deformations of a pad that a person presses as asked, (n, 3, 4, 4).
+
     Between presses are `rest` scans; each press, and each push, takes `hold`.
     """
-    seen = []
-    for place in (0, 3, 15, 12):
-        z = finger(place)
-        still = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), z])
-        x, y = PUSHES[place]
-        pushed = still + np.stack([0.2 * x * z, 0.2 * y * z, np.zeros((4, 4))])
-        seen += [np.zeros((3, 4, 4))] * rest + [still] * hold + [pushed] * hold
-    seen += [np.zeros((3, 4, 4))] * 2 * rest
-    wire = np.stack(seen) * np.array(signs)[:, None, None]
-    if swap:
-        wire = wire[:, [1, 0, 2]]
-    flat = np.empty((len(wire), 3, 16))
-    flat[:, :, order] = wire.reshape(len(wire), 3, 16)
-    return flat.reshape(-1, 3, 4, 4)
+    person, seen = Person(mounting), []
+    for corner in CORNERS:
+        for request, scans in (("Let go", rest), (f"the {corner} corner", hold), ("push towards", hold)):
+            person.hear(request)
+            seen += [person.deformation()] * scans
+    person.hear("Let go")
+    return np.stack(seen + [person.deformation()] * 2 * rest)
