@@ -45,7 +45,7 @@ TRUTHS: Final[Mapping[str, Run]] = {"sinking": lambda one: one.frozen.patterns()
 def second_world(bench: Workbench, report: Report) -> None:
     """Evaluate the shipped models and their checks in a world of other physics, an elastic half-space."""
     sensors, presses = (3, 8) if bench.quick else (24, 24)
-    other = draw_presses(SEEDS[0], sensors, presses)
+    other = draw_presses(SEEDS[0], sensors, presses, taps=4)
     test = draw_presses(SEEDS[1], sensors, presses, taps=4)
     own = draw_presses(SEEDS[1], sensors, 6 * presses, series=1)
     model, posed, mine = bench.model(), bench.model(POSED_MODEL), test.frozen.presses.pad
@@ -104,9 +104,8 @@ def _ways(
         return [Pad(counts_per_newton=float(value)) for value in one.counts_per_newton]
 
     def several(one: Pressed, taps: int) -> Maps:
-        given = min(taps, one.frozen.presses.taps)
-        poses = stated_poses(np.random.default_rng(SEED), one.frozen.presses.poses[:, :given], USUAL)
-        return infer(posed, one.frozen.windows(given), [None] * len(poses), poses).patterns
+        poses = stated_poses(np.random.default_rng(SEED), one.frozen.presses.poses[:, :taps], USUAL)
+        return infer(posed, one.frozen.windows(taps), [None] * len(poses), poses).patterns
 
     def nearness(run: Run) -> float:
         maps = run(other)
