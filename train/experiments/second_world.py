@@ -32,7 +32,7 @@ from train.physics.pad_draws import INPUTS, RANGES
 from train.report import Report, Row, with_interval
 
 SEEDS: Final = (8_200_101, 8_200_102)
-"""Of the sensors on which methods are fitted, and of those on which they are judged."""
+"""Seeds of the sensors on which methods are fitted, and of those on which they are compared."""
 _FACTORS: Final = (0.5, 0.7, 1.0, 1.4, 2.0)
 _SHAPES: Final = 5  # known shapes by which the gain of each sensor is found
 
