@@ -57,7 +57,7 @@ def nonnegative(bench: Workbench, report: Report) -> None:
     other, second = (draw_presses(seed, sensors, presses, taps=4).frozen for seed in SEEDS)
     other = other.pick(np.arange(len(other)) % 6 == 0)
     report.say(
-        f"{name_of(model)} through the runtime's session beside the inverse of `train/experiments/nonnegative.py`, by "
+        f"{name_of(model)} through the runtime's session, and the inverse of `train/experiments/nonnegative.py`, by "
         f"one tap and by four half a pitch apart: {len(test)} figures, those of [posed-taps](posed-taps.md), and "
         f"{len(second)} presses of the [second world](second-world.md). All nuisances. Nothing known: operators of the "
         "nominal pad; else those of the constants of a sensor file, and gains. Each row has a factor, fitted on "
