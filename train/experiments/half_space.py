@@ -17,7 +17,6 @@ from scipy.linalg import solve
 from firmware_bridge.pad_geometry import USPA44
 from train.data.frozen_presses import FrozenPresses
 from train.data.presses import PressSet
-from train.physics.tpsf import heights_pattern
 
 _Array = NDArray[np.floating]
 _PIXELS, _PATTERN_MM = 40, 4 * USPA44.pitch_mm
@@ -32,15 +31,15 @@ _FIGURES: Final = (
 
 
 class Pressed(NamedTuple):
-    """Presses as they are read, and what training would have drawn for each: its contact and a Gaussian around it."""
+    """Presses as they are read, with the gaps of the shapes before contact, in the pixels of their patterns."""
 
     frozen: FrozenPresses
-    drawn: NDArray[np.float32]
+    gaps_mm: NDArray[np.float32]
     counts_per_newton: NDArray[np.float32]  # (n,), of each one's sensor
 
     def pick(self, index: NDArray[np.bool_]) -> "Pressed":
         """Return the presses at an index."""
-        return Pressed(self.frozen.pick(index), self.drawn[index], self.counts_per_newton[index])
+        return Pressed(self.frozen.pick(index), self.gaps_mm[index], self.counts_per_newton[index])
 
 
 def places(count: int, side_mm: float) -> tuple[_Array, _Array]:
@@ -162,5 +161,4 @@ def draw_presses(seed: int, pads: int, per_pad: int, taps: int = 1, series: int 
     arrays: dict[str, Any] = {name: np.array(values, kinds.get(name, np.float32)) for name, values in rows.items()}
     presses = PressSet(**arrays)
     gains_of, gaps_mm, newtons = (np.array(one, np.float32) for one in zip(*others, strict=True))
-    drawn = heights_pattern(gaps_mm, presses.touching, presses.indentation_mm, _PATTERN_MM / _PIXELS)
-    return Pressed(FrozenPresses(presses, gains_of), drawn, newtons)
+    return Pressed(FrozenPresses(presses, gains_of), gaps_mm, newtons)

@@ -19,6 +19,7 @@ from edge.inference.bundled import POSED_MODEL
 from edge.inference.onnx_session import ModelSession
 from edge.perception.gain_learning import load_contact_model
 from edge.terminal.progress_bar import tracked
+from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.pad_constants import Pad
 from train.data.press_batches import stated_poses
 from train.data.presses import SEED
@@ -29,6 +30,7 @@ from train.experiments.workbench import Workbench, infer, name_of
 from train.learning.contact_mixture import learned
 from train.physics.gripped import MAX_INDENTATION_MM, SCALE
 from train.physics.pad_draws import INPUTS, RANGES
+from train.physics.tpsf import heights_pattern
 from train.report import Report, Row, with_interval
 
 SEEDS: Final = (8_200_101, 8_200_102)
@@ -39,7 +41,15 @@ _SHAPES: Final = 5  # known shapes by which the gain of each sensor is found
 Maps = NDArray[np.floating]
 Run = Callable[[Pressed], Maps]
 """Method from presses to their patterns, or a truth to compare these with, (n, H, W) in [mm]."""
-TRUTHS: Final[Mapping[str, Run]] = {"sinking": lambda one: one.frozen.patterns(), "as drawn": lambda one: one.drawn}
+
+
+def drawn(one: Pressed) -> NDArray[np.float32]:
+    """Return what training would have drawn for contacts: their depth, and a Gaussian around it."""
+    presses, pixel_mm = one.frozen.presses, USPA44.pixel_pitch_mm(SCALE)
+    return heights_pattern(one.gaps_mm, presses.touching, presses.indentation_mm, pixel_mm)
+
+
+TRUTHS: Final[Mapping[str, Run]] = {"sinking": lambda one: one.frozen.patterns(), "as drawn": drawn}
 
 
 def second_world(bench: Workbench, report: Report) -> None:
@@ -49,7 +59,7 @@ def second_world(bench: Workbench, report: Report) -> None:
     test = draw_presses(SEEDS[1], sensors, presses, taps=4)
     own = draw_presses(SEEDS[1], sensors, 6 * presses, series=1)
     model, posed, mine = bench.model(), bench.model(POSED_MODEL), test.frozen.presses.pad
-    between = with_interval(psnr_db(test.drawn, test.frozen.patterns(), MAX_INDENTATION_MM), mine)
+    between = with_interval(psnr_db(drawn(test), test.frozen.patterns(), MAX_INDENTATION_MM), mine)
     report.say(
         f"{name_of(model)} and {name_of(posed)}, through the runtime's session. {len(test.frozen)} presses of "
         f"{sensors} sensors on an elastic half-space (`train/experiments/half_space.py`, seed {SEEDS[1]}); what is "
@@ -107,13 +117,15 @@ def _ways(
         poses = stated_poses(np.random.default_rng(SEED), one.frozen.presses.poses[:, :taps], USUAL)
         return infer(posed, one.frozen.windows(taps), [None] * len(poses), poses).patterns
 
+    wanted = truth(other)
+
     def nearness(run: Run) -> float:
         maps = run(other)
-        return float(psnr_db(fit_gain(maps, truth(other)) * maps, truth(other), MAX_INDENTATION_MM).mean())
+        return float(psnr_db(fit_gain(maps, wanted) * maps, wanted, MAX_INDENTATION_MM).mean())
 
     yield "bilinear", lambda one: bilinear(one.frozen.windows(1)[:, 0, 2], SCALE), "the world"
-    matrix = fit_linear_map(readings(other), truth(other).reshape(len(other.frozen), -1), 1e-2)
-    yield "linear map fitted in this world", lambda one: (readings(one) @ matrix).reshape(truth(one).shape), "-"
+    matrix = fit_linear_map(readings(other), wanted.reshape(len(wanted), -1), 1e-2)
+    yield "linear map fitted in this world", lambda one: (readings(one) @ matrix).reshape(-1, *wanted.shape[1:]), "-"
     plain, name = all_alike(None), model.name
     yield from ((name, plain, whose) for whose in ("-", "the world", "each sensor", "each pattern"))
     scaled = max((all_alike(None, *factors) for factors in product(_FACTORS, _FACTORS)), key=nearness)
