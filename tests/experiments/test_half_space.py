@@ -21,6 +21,14 @@ def test_a_flat_round_punch_has_its_force_and_its_surface():
     assert sunk_mm[outside] == pytest.approx(expected_mm, rel=0.05)
 
 
+def test_a_ball_is_let_go_of_where_it_would_pull():
+    """Hertz: force (4 / 3 pi) sqrt(R) d^1.5 within sqrt(R d)."""
+    away_mm = np.hypot(*places(CELLS, USPA44.width_mm))
+    pressure, _ = pressed(away_mm**2 / 80, DEPTH_MM)
+    assert pressure.sum() * CELL_MM**2 == pytest.approx(4 / (3 * np.pi) * 40**0.5 * DEPTH_MM**1.5, rel=0.03)
+    assert away_mm[pressure > 0].max() == pytest.approx((40 * DEPTH_MM) ** 0.5, abs=CELL_MM)
+
+
 def test_a_point_below_an_even_round_load_sinks_as_far_as_it_should():
     """On the axis ((1 - nu) (s - z) + z (1 - z / s) / 2) / G for a pressure of 1, s the distance of the load's rim."""
     poisson, z = 0.45, 2.5

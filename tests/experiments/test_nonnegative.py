@@ -9,7 +9,7 @@ from train.physics.contact import BARE
 from train.physics.gripped import GrippedPad
 from train.physics.pad_draws import Pad
 
-SHIFT_MM = 2.35
+SHIFT_MM, TURN_DEG = 2.35, 60
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,6 @@ def test_drag_is_no_other_press(inverse, pressed):
 
 
 def test_an_earlier_tap_helps_from_where_it_was_and_from_no_other_place(inverse, pressed):
-    right = found_db(inverse, pressed, [0, 1], [(0, 0, 0), (SHIFT_MM, 0, 0)])
-    wrong = found_db(inverse, pressed, [0, 1], [(0, 0, 0), (-SHIFT_MM, 0, 0)])
-    assert right > 30 and right > wrong + 3
+    right = found_db(inverse, pressed, [0, 1], [(0, 0, 0), (SHIFT_MM, 0, TURN_DEG)])
+    for wrong in ((-SHIFT_MM, 0, TURN_DEG), (SHIFT_MM, 0, -TURN_DEG)):
+        assert right > 30 and right > found_db(inverse, pressed, [0, 1], [(0, 0, 0), wrong]) + 3
