@@ -14,10 +14,12 @@ SHIFT_MM, TURN_DEG = 2.35, 60
 
 @pytest.fixture(scope="module")
 def pressed():
-    """A dome beside the middle: by the pad, by one that is SHIFT_MM to the right, and once more with drag."""
+    """A dome beside the middle: by the pad, by one that is shifted and turned, and once more with drag."""
     gripped = GrippedPad(Pad())
     x_mm, y_mm = gripped.places_mm
-    heights_mm = np.stack([-(np.hypot(x_mm - 3 + right, y_mm + 2) ** 2) / 12 for right in (0, SHIFT_MM, 0)])
+    cosine, sine = np.cos(np.radians(TURN_DEG)), np.sin(np.radians(TURN_DEG))
+    moved = (SHIFT_MM + cosine * x_mm - sine * y_mm, sine * x_mm + cosine * y_mm)
+    heights_mm = np.stack([-(np.hypot(x - 3, y + 2) ** 2) / 12 for x, y in ((x_mm, y_mm), moved, (x_mm, y_mm))])
     slides_mm = np.array([[0.0, 0.0], [0.0, 0.0], [0.3, 0.1]])
     return gripped.press(heights_mm, np.full(3, 0.4), slides_mm, np.zeros(3), np.full(3, 0.6), [BARE] * 3)
 
