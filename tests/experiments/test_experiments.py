@@ -20,6 +20,8 @@ COLUMNS = {
         {"off mm", "over one tap, not stated", "left out %, stated"},
         {"model", "over one tap"},
     ],
+    "nonnegative": [{"world", "known", "over one tap", "run time us"}],
+    "second-world": [{"method", "sinking, PSNR dB", "as drawn, wrong %"}, {"truth"}, {"sensor, after 10 %"}],
     "fig5": [{"surface", "beta by search mm"}, {"slope per N"}],
     "fig7": [{"method", "error %", "ms a pattern"}],
 }

@@ -15,16 +15,21 @@ from train.errors import ended_by_errors
 from train.experiments.families import families, pads
 from train.experiments.fig5 import fig5
 from train.experiments.fig7 import fig7
+from train.experiments.nonnegative import nonnegative
 from train.experiments.paper_tables import angle, table3, table4, taps, unseen
 from train.experiments.posed_taps import posed_taps
 from train.experiments.real import real
+from train.experiments.second_world import second_world
 from train.experiments.trust_checks import trust_checks
 from train.experiments.workbench import Experiment, Workbench
 from train.report import Report
 
 EXPERIMENTS: Final[dict[str, Experiment]] = {
     work.__name__.replace("_", "-"): work
-    for work in (families, pads, trust_checks, posed_taps, real, table3, table4, angle, taps, unseen, fig5, fig7)
+    for work in (
+        *(families, pads, trust_checks, posed_taps, nonnegative, real, second_world, table3, table4, angle, taps),
+        *(unseen, fig5, fig7),
+    )
 }
 """Functions of the experiments by name; the first line of each one's docstring is its help."""
 
