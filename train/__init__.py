@@ -1,5 +1,5 @@
 """The simulated sensor, its truth, and the networks trained on both."""
 
-from firmware_bridge.extras import need
+from firmware_bridge.errors import need
 
 need("train", "torch", "scipy", "trimesh", "shapely", "joblib")

@@ -16,7 +16,7 @@ from edge.pipeline.commands import Commands
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.ros2.messages import base_topic
-from firmware_bridge.extras import how_to_install
+from firmware_bridge.errors import how_to_install
 from firmware_bridge.poses import TimedPose
 
 LOOK_NS: Final = 500_000_000

@@ -13,7 +13,7 @@ from edge.perception.event import Event
 from edge.perception.result import Result
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink, check_new
-from firmware_bridge.extras import how_to_install
+from firmware_bridge.errors import how_to_install
 from firmware_bridge.schedule import NS_PER_S
 
 _NUMBERS: Final = ("force_counts", "force_n", "area_mm2", "interval_mm", "mismatch")

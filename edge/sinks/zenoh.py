@@ -22,7 +22,7 @@ from edge.perception.result import Result
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.sink import Sink
 from edge.sinks.json_records import CountersInTurn, event_record, pack, record
-from firmware_bridge.extras import how_to_install
+from firmware_bridge.errors import how_to_install
 
 if TYPE_CHECKING:
     import zenoh

@@ -10,8 +10,7 @@ from typing import Any, Final, Self
 
 from firmware_bridge.can.gs_usb import BITRATE_BIT_S
 from firmware_bridge.can.slcan import CanFrame
-from firmware_bridge.errors import DeviceError, LinkLostError, SourceError
-from firmware_bridge.extras import how_to_install
+from firmware_bridge.errors import DeviceError, LinkLostError, SourceError, how_to_install
 from firmware_bridge.links.base import SourceKind, not_open
 from firmware_bridge.links.discovery import can_networks
 from firmware_bridge.links.frame_link import FrameLink

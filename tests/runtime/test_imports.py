@@ -12,7 +12,7 @@ import pytest
 from bridge_samples import make_counts, write_recording
 from edge_samples import ROOT
 
-from firmware_bridge.extras import how_to_install, need
+from firmware_bridge.errors import how_to_install, need
 
 FORBIDDEN = {"torch", "onnx", "trimesh", "scipy", "shapely", "skimage", "pytest", "hypothesis"}
 UNUSED_IN_A_REPLAY = {
@@ -111,8 +111,8 @@ NOTHING_INSTALLED = [sys.executable, "-E", "-S"]
 def test_from_the_sources_their_folder_is_named_and_from_a_wheel_its_name(tmp_path):
     assert how_to_install("zenoh") == f"pip install '{ROOT}[zenoh]'"
     (tmp_path / "firmware_bridge").mkdir()
-    shutil.copy(ROOT / "firmware_bridge/extras.py", tmp_path / "firmware_bridge")
-    script = "from firmware_bridge.extras import how_to_install\nprint(how_to_install('zenoh'))"
+    shutil.copy(ROOT / "firmware_bridge/errors.py", tmp_path / "firmware_bridge")
+    script = "from firmware_bridge.errors import how_to_install\nprint(how_to_install('zenoh'))"
     told = subprocess.run([*NOTHING_INSTALLED, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert told.stdout == "pip install 'tactile-edge-sr[zenoh]'\n"
 

@@ -23,7 +23,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 from torch import Tensor
 
-from firmware_bridge.extras import how_to_install
+from firmware_bridge.errors import how_to_install
 from firmware_bridge.pad_geometry import USPA44
 from train.errors import TrainError
 from train.physics.elastic_layer import Layer
