@@ -34,7 +34,7 @@ zenoh = pytest.importorskip("zenoh")
 
 class TestMessages:
     def test_a_new_pattern_comes_with_all_its_maps_and_who_writes_comes_and_goes(self, endpoint, consume):
-        """What else there is of each result: tests/sinks/test_every_sink.py."""
+        """The rest of each result is in tests/sinks/test_every_sink.py."""
         consumer, results = consume(endpoint), make_results(40)
         sink = open_sink(f"zenoh:grip?connect={endpoint}", CONTRACT, fake_source())
         for result in results:

@@ -1,4 +1,4 @@
-"""What differs from sensor to sensor: faults of readings, and pads, told to a network as by the runtime."""
+"""Differences between sensors: faults of readings, and pads as the runtime states them to a network."""
 
 from dataclasses import replace
 from math import inf

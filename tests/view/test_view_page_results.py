@@ -68,7 +68,7 @@ def test_force_and_torque_are_told_and_drawn(open_page):
             "wrench_torque": r"\u22120\.9, 0\.9\sN\smm",
             "wrench_twist": r"\u22121\.[23]\sN\smm",
             "centre_of_pressure_mm": r"\u22122\.[34], \u22122\.[34]\smm",
-            "wrench_origin": "nominal",
+            "wrench_origin": r"nominal \u00b1 45\s%",
         }.items():
             playwright.expect(number(page, name)).to_have_text(re.compile(f"^{text}$"))
         centre = CENTRE - PITCH

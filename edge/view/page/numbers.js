@@ -88,7 +88,8 @@ const NUMBERS = {
     ["twist", "wrench_twist", "Torque about the pad's normal.", ({ made }) => amount(made.wrench?.torque_n_mm[2], 1, "N\u00a0mm")],
     ["pressure centre", "centre_of_pressure_mm", "Point where the normal force acts; the ring on the pattern.",
       ({ made }) => list(made.wrench?.centre_of_pressure_mm, 1, "mm")],
-    ["sensitivity", "wrench_origin", "Where the force scale comes from: nominal is that of the average sensor.", ({ made }) => made.wrench_origin ?? "\u2013"],
+    ["sensitivity", "wrench_origin", "Where the force scale comes from, nominal is that of the average sensor, and how far off all newtons may be.",
+      ({ made, result }) => `${made.wrench_origin ?? "\u2013"} ${known(result.scale_error) ? `\u00b1 ${number(100 * result.scale_error)}${THIN}%` : ""}`],
   ],
   Uncertainty: [
     ["to be believed", "trusted", "Whether the readings fit the pattern; one that is not checked, or a pattern that is not to be believed must not be acted on.",
