@@ -135,9 +135,8 @@ class NonnegativeInverse:
             white = np.linalg.inv(np.linalg.cholesky(covariance))
             reads.append((white @ read).astype(np.float32))
             parts.append(np.stack([white @ one @ see for one in self._read]).astype(np.float32))
-        shares = np.tile(
-            [1.0, 0.0, 0.0], (len(taps), 1)
-        )  # of pressure and slip in each tap, over the newest's pressure
+        # Pressure and slip of each tap, over the newest's pressure.
+        shares = np.tile([1.0, 0.0, 0.0], (len(taps), 1))
         pressure = np.full(_WIDE**2, mean_mpa, dtype=np.float32)
         for _ in range(_ROUNDS):
             matrix = np.concatenate([np.tensordot(share, part, 1) for share, part in zip(shares, parts, strict=True)])
