@@ -35,6 +35,7 @@ from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
+from firmware_bridge.scans.pad_constants import PAD_RANGES
 from firmware_bridge.schedule import GIVEN_UP_S, NS_PER_S, POLL_S
 from firmware_bridge.sensor_file.model import SensorEntry, SensorFile, load_sensor_file
 from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
@@ -113,7 +114,7 @@ class Visit:
             findings.append(judge_force(guide.weighed, kept=self._options.out is not None))
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
-        if guide.weighed is not None:
+        if guide.weighed is not None and guide.weighed.interval[1] <= PAD_RANGES["counts_per_newton"][1]:
             self.weighed[name] = guide.weighed
         if found is not None:
             self.mountings[name] = found
@@ -133,9 +134,10 @@ class Visit:
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
             if enter_pressed():
                 return
-        errors = self._known.scale_errors
-        before = self._known.counts_per_newton.items()
-        known = {name: Weighed(value, errors.get(name, PARTLY_ERROR)) for name, value in before}
+        known = {name: Weighed(value, PARTLY_ERROR) for name, value in self._known.counts_per_newton.items()}
+        for name, (low, high) in self._known.scale_intervals.items():
+            value = known[name].counts_per_newton
+            known[name] = Weighed(value, max(high - value, value - low) / value)
         examined.findings.extend(grip.judge(known | self.weighed))
         self.weighed.update(grip.weighed)
 
@@ -338,8 +340,9 @@ def keep(
                 baseline = Baseline.of(name, counts, baseline.created_unix_s, baseline.scans, baseline.origin)
             per_newton, interval = entry.counts_per_newton, entry.counts_per_newton_interval
             if name in weighed:
-                per_newton, error = (round(one, 4) for one in weighed[name])
-                interval = (round(per_newton * (1 - error), 1), round(per_newton * (1 + error), 1))
+                per_newton = round(weighed[name].counts_per_newton, 2)
+                low, high = weighed[name].interval
+                interval = (round(low, 2), round(high, 2))
             pads = [None if pad is None else pad.turned(turned) for pad in (entry.pad, entry.learned)]
             entries[name] = SensorEntry(
                 entry.mounting.then(turned),

@@ -55,10 +55,12 @@ class Grip:
         if np.count_nonzero(gripped) < HELD_SCANS // 2:
             return unclear
         findings: list[Finding] = []
+        off_share = 0.0
         for name, z in ((first, here), (second, there)):
             rest, held = float(np.median(z[-FREE_SCANS:])), float(np.median(z[gripped]))
             lost = "it has lost its zero: zero the free pad again, and look whether something bears on it"
-            verdict = "ok" if rest <= max(OFF_COUNTS, 0.1 * held) else "wrong"
+            verdict = "ok" if rest <= 0.1 * held else "wrong"
+            off_share = max(off_share, rest / held)
             norm = "under a tenth of the grip"
             findings.append(judged("zero after a grip", verdict, f"sensor {name}: {rest:.0f} counts", norm, lost))
         ratio = float(here[gripped] @ there[gripped] / (there[gripped] @ there[gripped]))
@@ -68,12 +70,16 @@ class Grip:
             verdict = "ok" if 1 / 1.1 <= share <= 1.1 else "wrong"
             measured = f"sensor {first} reads {share:.2f} of the newtons of sensor {second}"
             return [*findings, judged("scale in a grip", verdict, measured, "alike within 10 %", off)]
-        for name, partner, factor in ((second, first, 1 / ratio), (first, second, ratio)):
-            if partner in weighed and all(one.verdict == "ok" for one in findings):  # of zeros
-                known = weighed[partner]
-                self.weighed = {name: Weighed(known.counts_per_newton * factor, math.hypot(known.error, GRIP_ERROR))}
         measured = f"sensor {first} reads {ratio:.2f} of the counts of sensor {second}"
         # Sensors differ by a quarter either way.
         off = "sensors differ less: lay a weight on each (--weight-g)"
-        verdict = "ok" if 0.6 <= ratio <= 1.67 else "look"
-        return [*findings, judged("scale in a grip", verdict, measured, "0.6 to 1.67", off)]
+        findings.append(
+            judged("scale in a grip", "ok" if 0.6 <= ratio <= 1.67 else "look", measured, "0.6 to 1.67", off)
+        )
+        if any(one.verdict != "ok" for one in findings):  # a scale from here would look right
+            return findings
+        for name, partner, factor in ((second, first, 1 / ratio), (first, second, ratio)):
+            if partner in weighed:
+                per_newton, error = weighed[partner]
+                self.weighed = {name: Weighed(per_newton * factor, math.hypot(error, GRIP_ERROR, off_share))}
+        return findings

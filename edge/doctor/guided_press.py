@@ -147,11 +147,18 @@ class Weighed(NamedTuple):
     counts_per_newton: float
     error: float
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The interval itself."""
+        return self.counts_per_newton * (1 - self.error), self.counts_per_newton * (1 + self.error)
 
-COVERED_ERROR: Final = 0.06
-PARTLY_ERROR: Final = 0.2
-"""By simulated discs of 2 N on 16 pads of the whole range, up to 2 mm off the middle: those that cover the pad read
-0.92 to 1.03 of the right counts (5 to 95 %), those of 10 and 14 mm 0.77 to 1.10."""
+
+LEAST_SHARE: Final = 0.25  # of the mean, on the taxel that reads least under a weight that covers the pad
+COVERED_ERROR: Final = 0.08
+PARTLY_ERROR: Final = 0.3
+"""By simulated discs of 2 N that lie as their weight lets them, on 8 pads of the whole range, in the middle and 1.5 mm
+off: those of 22 and 28 mm read 0.93 to 1.04 of the right counts, those of 19 mm that pass as covering up to 1.09, and
+those of 14 and 16 mm, which do not, 0.68 to 1.15."""
 
 
 def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
@@ -297,8 +304,7 @@ def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
         return None
     mean = np.mean(steady, axis=0)
     mean *= np.sign(mean.sum())
-    # Beside what presses it the layer bulges, and the magnets there rise.
-    covered = mean.min() > -0.2 * mean.mean()
+    covered = mean.min() >= LEAST_SHARE * mean.mean()
     yield from _wait("Good. Take it off.", _free, FREE_SCANS)
     return Weighed(float(mean.sum()) / (weight_g / 1000 * 9.80665), COVERED_ERROR if covered else PARTLY_ERROR)
 

@@ -34,7 +34,7 @@ class Out(Flag):
         RECORD: the JSON record, and with it zenoh, MCAP, the live page and, of a single value, ROS diagnostics.
         NPZ: arrays that `edge-sr convert` makes of a recording.
         ROS: members of tactile_edge_sr/msg/Result.
-        MAP: maps next to the record: in lines of JSON, in packed messages and as images of MCAP.
+        MAP: maps next to the record: in lines of JSON, in packed messages and as grids of MCAP.
         ALL: all but maps.
     """
 
@@ -359,9 +359,9 @@ FIELDS: Final = (
           out=_RECORD_NPZ, byte=76),
     Field("gains_certainty", _REAL, "gains_certainty", "how certain the gains of the sensor's channels are: 1 exact, "
           "0 as uncertain as those of a new sensor; unknown without gains", decimals=3, out=_RECORD_NPZ),
-    Field("scale_error", _REAL, "scale_error", "by what share all newtons of this sensor may be off together: half of "
-          "the 90 % interval of its counts per newton; unknown where these were given without one", decimals=3,
-          out=_RECORD_NPZ),
+    Field("scale_error", _REAL, "scale_error", "by what share all newtons of this sensor may be off together: from "
+          "its counts per newton to the farther end of their 90 % interval; unknown before it is zeroed, and where "
+          "they were given without one", decimals=3, out=_RECORD_NPZ),
     Field("note", _TEXT, "note", "why there is no pattern, which reading is held, how old a reading is or may be, "
           "what is wrong with the baseline", out=Out.RECORD),
     Field("event", _TEXT, "event", "what happened before this scan: earlier taps forgotten, what came of zeroing "

@@ -54,7 +54,7 @@ class Settings:
     counts_per_newton: float | Mapping[str, float] | None
     pad: Pad | Mapping[str, Pad] | None
     measured: Mapping[str, Pad] | None
-    scale_errors: Mapping[str, float]
+    scale_intervals: Mapping[str, tuple[float, float]]
 
 
 class Sensor:
@@ -77,7 +77,7 @@ class Sensor:
         self.events: list[Untimed] = []
         self.last = LastPattern(geometry.scan_shape, every_scan=options.every_scan)
         self.pad = SensorPad(
-            contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_errors)
+            contract, pad, _of(name, settings.counts_per_newton), check, _of(name, settings.scale_intervals)
         )
         self._name = name
         self._received_ns: int | None = None
@@ -208,7 +208,7 @@ class Runtime:
         contacts: distribution of contacts by which gains are learned, if the options ask for that; without it none are.
         mountings: directions of a sensor's axes, and its gains, by name; without one the axes are as wired.
         measured: pads without what was learned, by name, from which learning begins; None for `pad`.
-        scale_errors: halves of the 90 % intervals of counts per newton, as a share of them, by name.
+        scale_intervals: 90 % intervals of counts per newton, by name.
         unix_time_s: dates baselines that are taken, and gives the age of a stored one at the first scan of its sensor;
             from then on ages follow scan time.
 
@@ -236,7 +236,7 @@ class Runtime:
         mountings: Mapping[str, Mounting] | None = None,
         pad: Pad | Mapping[str, Pad] | None = None,
         measured: Mapping[str, Pad] | None = None,
-        scale_errors: Mapping[str, float] | None = None,
+        scale_intervals: Mapping[str, tuple[float, float]] | None = None,
         options: RuntimeOptions = DEFAULTS,
         clock_ns: Callable[[], int] = time.perf_counter_ns,
         unix_time_s: Callable[[], float] = time.time,
@@ -268,7 +268,7 @@ class Runtime:
             counts_per_newton=counts_per_newton,
             pad=pad,
             measured=measured,
-            scale_errors=scale_errors or {},
+            scale_intervals=scale_intervals or {},
         )
         self._sensors: dict[str, Sensor] = {}
         self._events: list[Untimed] = []

@@ -241,8 +241,8 @@ class SensorPad:
         counts_per_unit: (3, rows or 1, cols or 1), counts of a network unit, with the gains that the model wants out.
         gains_certainty: of these gains; None without.
         wrench_origin: whether the model gets the sensor's counts per newton.
-        scale_error: half of the 90 % interval of its counts per newton, as a share of them: as it was given, else of
-            the sensors that the model was trained for; None where counts per newton were given without.
+        scale_error: how far its counts per newton may be off, as a share of them, at an end of their 90 % interval; of
+            all sensors that the model was trained for where it takes none of its own, None where they have no interval.
     """
 
     def __init__(
@@ -251,9 +251,9 @@ class SensorPad:
         pad: Pad | None,
         counts_per_newton: float | None,
         check: PatternCheck | None,
-        scale_error: float | None = None,
+        interval: tuple[float, float] | None = None,
     ) -> None:
-        self._given_error = scale_error
+        self._interval = interval  # of these counts per newton
         self.check, self.counts_per_newton, self._contract = check, counts_per_newton, contract
         self.use(pad)
 
@@ -262,6 +262,9 @@ class SensorPad:
         contract, self.pad = self._contract, pad
         if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
             pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
+            others = {name: ends for name, ends in pad.intervals.items() if name != "counts_per_newton"}
+            own = {} if self._interval is None else {"counts_per_newton": self._interval}
+            pad = replace(pad, intervals=others | own)
         self.row: NDArray[np.float32] = contract.pad_row(pad)
         self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
         if contract.takes_gains and pad is not None and pad.gains is not None:
@@ -270,11 +273,17 @@ class SensorPad:
         if self.check is not None:
             self.check.use_pad(self.row, outside=contract.is_outside(pad))
         self.gains_certainty = None if pad is None or pad.gains is None else pad.gains_certainty
-        calibrated = pad is not None and pad.counts_per_newton is not None
-        ranges = {name: 0.9 * spread / centre for name, centre, spread in contract.pad_inputs}  # they are even ones
-        of_model = ranges.get("counts_per_newton")
-        self.wrench_origin: WrenchOrigin = "calibrated" if calibrated and of_model is not None else "nominal"
-        self.scale_error = of_model
-        if pad is not None and pad.counts_per_newton is not None:
-            ends = pad.intervals.get("counts_per_newton")
-            self.scale_error = self._given_error if ends is None else (ends[1] - ends[0]) / 2 / pad.counts_per_newton
+        taken = [name for name, _, _ in contract.pad_inputs]
+        per_newton = None if pad is None else pad.counts_per_newton
+        self.wrench_origin: WrenchOrigin = "nominal"
+        self.scale_error: float | None = None
+        if "counts_per_newton" in taken:
+            at = taken.index("counts_per_newton")
+            _, centre, spread = contract.pad_inputs[at]
+            if self.row[len(taken) + at]:
+                self.wrench_origin = "calibrated"
+            else:  # unknown, or too little: the model is given none
+                per_newton, self.scale_error = None, 0.9 * spread / centre  # pads were drawn evenly
+        if pad is not None and per_newton is not None and "counts_per_newton" in pad.intervals:
+            low, high = pad.intervals["counts_per_newton"]
+            self.scale_error = max(high - per_newton, per_newton - low) / per_newton

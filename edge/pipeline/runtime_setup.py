@@ -87,7 +87,7 @@ def open_runtime(
         geometry=known.geometry,
         baselines=of_single_csv(stored_baselines(baselines, known), source.name),
         counts_per_newton=(known.counts_per_newton or None) if counts_per_newton is None else counts_per_newton,
-        scale_errors=known.scale_errors if counts_per_newton is None else None,
+        scale_intervals=known.scale_intervals if counts_per_newton is None else None,
         mountings=known.mountings,
         pad=known.pads if pad is None else pad,
         measured=known.measured_pads if pad is None else None,

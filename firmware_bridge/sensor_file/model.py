@@ -133,14 +133,9 @@ class SensorFile:
         return self._known("counts_per_newton")
 
     @property
-    def scale_errors(self) -> dict[str, float]:
-        """Half of the 90 % interval of each sensor's counts per newton, as a share of them, where it is available."""
-        known = {name: one for name, one in self.sensors.items() if one.counts_per_newton is not None}
-        return {
-            name: (ends[1] - ends[0]) / 2 / one.counts_per_newton
-            for name, one in known.items()
-            if (ends := one.counts_per_newton_interval) is not None and one.counts_per_newton is not None
-        }
+    def scale_intervals(self) -> dict[str, tuple[float, float]]:
+        """90 % intervals of the counts per newton by sensor name, where they are available."""
+        return self._known("counts_per_newton_interval")
 
     @property
     def frames(self) -> dict[str, PadFrame]:
@@ -217,6 +212,11 @@ def _entry(table: Table, name: str, geometry: SensorGeometry) -> SensorEntry:
     taken = {key: table.take(key, read, required=False) for key, read in readers.items()}
     table.end()
     known = {key: value for key, value in taken.items() if value is not None}
+    if "counts_per_newton_interval" in known:
+        low, high = known["counts_per_newton_interval"]
+        if not low <= known.get("counts_per_newton", math.nan) <= high:
+            found = f"{[low, high]} of {known.get('counts_per_newton', 'no counts_per_newton')}"
+            table.refuse("counts_per_newton_interval", found, "an interval around counts_per_newton")
     mounting = {key: known.pop(key) for key in ("order", "swap_xy", "signs", "gains") if key in known}
     for key, read in parts.items():
         if key in known:

@@ -62,13 +62,14 @@ def sensor_files(draw):
     entries = {}
     for name in draw(st.sets(names, min_size=1, max_size=3)):
         created = draw(st.sampled_from((1, 1.5, 1.7e9)))
+        per_newton = draw(st.none() | st.floats(1e-3, 1e6))
         entries[name] = SensorEntry(
             draw(mountings),
-            draw(st.none() | st.floats(1e-3, 1e6)),
+            per_newton,
             draw(st.none() | st.integers(0, 9).map(lambda seed, n=name, at=created: baseline(n, seed, at))),
             draw(st.none() | pads()),
             frame=draw(st.none() | frames),
-            counts_per_newton_interval=draw(st.none() | st.just((900.0, 1100.0))),
+            counts_per_newton_interval=None if per_newton is None else (per_newton, 1e6),
         )
     return SensorFile(draw(st.sampled_from(OF_16)), draw(st.none() | names), entries)
 
@@ -79,7 +80,7 @@ def test_what_is_written_is_read(tmp_path, written):
     save_sensor_file(tmp_path / "s.toml", written)
     read = load_sensor_file(tmp_path / "s.toml")
     assert (read.model, read.adapter, read.mountings) == (written.model, written.adapter, written.mountings)
-    assert (read.counts_per_newton, read.scale_errors) == (written.counts_per_newton, written.scale_errors)
+    assert (read.counts_per_newton, read.scale_intervals) == (written.counts_per_newton, written.scale_intervals)
     assert read.pads == written.pads
     assert {name: one.id for name, one in read.baselines.items()} == {
         name: one.id for name, one in written.baselines.items()
@@ -91,6 +92,7 @@ GRID = "[[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11], [12, 13, 14, 15]]"
 GOOD = {
     "format": '"tactile-sensor"', "version": "1", "model": '"uSPa44"', "adapter": '"D30BL366"',
     "order": GRID, "swap_xy": "false", "signs": "[1, 1, 1]", "gains": "[1, 1.5, 1]", "counts_per_newton": "1180",
+    "counts_per_newton_interval": "[1100, 1260]",
     "id": '"0000"', "created_unix_s": "1000.0", "scans": "100", "x": GRID, "y": GRID, "z": GRID,
 }  # fmt: skip
 
@@ -117,6 +119,8 @@ def text_of(**changes):
         *(("gains", f"[1, 1, {last}]", "positive numbers, 3, or 3 x 4 x 4") for last in ("0", "1" + "0" * 400)),
         ("gains", f"[{GRID}, {GRID}]", "positive numbers, 3, or 3 x 4 x 4"),
         *(("counts_per_newton", value, "a number from 0.001 to 1e+06") for value in ("nan", "1" + "0" * 400)),
+        *(("counts_per_newton_interval", value, "around counts_per") for value in ("[1200, 1300]", "[1000, 1100]")),
+        ("counts_per_newton_interval", "[1300, 1000]", "the lower first"),
         ("id", '"ffff"', "which the counts give, or none; the baseline was changed"),
         *(("created_unix_s", value, "a number from 1 to 1e+11") for value in ("0", "1" + "0" * 400)),
         ("scans", "1.0", "a whole number from 1"),

@@ -116,7 +116,8 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     entry = known.sensors["4"]
     assert entry.mounting == sits and known.model == "uSPa44" and known.adapter is None
     assert entry.counts_per_newton == pytest.approx(WEIGHT_COUNTS / 1.96133, rel=0.02)
-    assert known.scale_errors == {"4": pytest.approx(0.06, abs=0.001)}
+    ends = [entry.counts_per_newton * share for share in (0.92, 1.08)]
+    assert entry.counts_per_newton_interval == pytest.approx(ends, rel=1e-4)
     in_place = REST.reshape(3, 16)[:, list(sits.order)].reshape(3, 4, 4)
     assert entry.baseline is not None and np.abs(entry.baseline.counts - in_place).max() <= 2
 

@@ -134,15 +134,18 @@ class TestPerson:
         assert mounting is None and {one.verdict for one in findings.values()} == {"not known"}
 
     @pytest.mark.parametrize(
-        ("z_counts", "covers", "error", "verdict"),
-        [(2353.6, True, 0.06, "ok"), (2353.6, False, 0.2, "look"), (200.0, True, 0.06, "look")],
+        ("z_counts", "beside", "error", "verdict"),
+        [
+            (2353.6, 1.0, 0.08, "ok"),
+            (2353.6, 0.3, 0.08, "ok"),
+            (2353.6, 0.2, 0.3, "look"),
+            (2353.6, -0.4, 0.3, "look"),  # the layer bulges beside the weight
+            (200.0, 1.0, 0.08, "look"),
+        ],
     )
-    def test_a_weight_gives_counts_per_newton(self, z_counts, covers, error, verdict):
-        """Beside a weight that is smaller than the pad the layer bulges: the taxels there read the other way."""
-        laid, share = np.zeros((120, 3, 4, 4)), np.full((4, 4), 1 / 16)
-        if not covers:
-            share[...] = -0.03
-            share[1:3, 1:3] = (1 + 12 * 0.03) / 4
+    def test_a_weight_gives_counts_per_newton(self, z_counts, beside, error, verdict):
+        laid, share = np.zeros((120, 3, 4, 4)), np.full((4, 4), beside / 16)
+        share[1:3, 1:3] = (16 - 12 * beside) / 64
         laid[:, 2] = z_counts * share + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
         laid[:20, 2] *= np.linspace(0, 1, 20)[:, None, None]
         script = [*visit(), *laid, *np.zeros((30, 3, 4, 4))]
@@ -172,7 +175,8 @@ class TestPerson:
         ({"a": Weighed(1000.0, 0.06), "b": Weighed(1250.0, 0.06)}, 0, {}, []),
         ({"a": Weighed(1000.0, 0.06), "b": Weighed(1000.0, 0.06)}, 0, {}, ["scale in a grip"]),
         ({}, 900, {}, ["zero after a grip"]),
-        ({"a": Weighed(1000.0, 0.06)}, 900, {}, ["zero after a grip"]),
+        ({"a": Weighed(1000.0, 0.06)}, 600, {}, ["zero after a grip"]),
+        ({"a": Weighed(1000.0, 0.0)}, 250, {"b": (1250.0, 0.067)}, []),
     ],
 )
 def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, rest, found, wrong):
@@ -184,6 +188,18 @@ def test_a_grip_gives_a_pad_the_scale_of_its_partner(weighed, rest, found, wrong
     assert grip.over and [one.name for one in grip.judge(weighed) if one.verdict != "ok"] == wrong
     assert grip.weighed.keys() == found.keys()
     assert all(one == pytest.approx(found[name], rel=0.01) for name, one in grip.weighed.items())
+
+
+def test_a_pad_gets_no_scale_by_a_partner_that_reads_a_third():
+    grip = Grip(("a", "b"))
+    for scan, z in enumerate([0] * 20 + [4000] * 120 + [0] * 30):
+        grip.push("a", scan / 100, 3 * z)
+        grip.push("b", scan / 100, z)
+    assert [one.verdict for one in grip.judge({"a": Weighed(1000.0, 0.06)})] == [
+        "ok",
+        "ok",
+        "look",
+    ] and not grip.weighed
 
 
 def test_a_grip_of_one_pad_alone_settles_nothing():

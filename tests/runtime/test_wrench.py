@@ -20,6 +20,7 @@ from edge.sinks.ros2.map_messages import recorded_map
 from edge.sinks.ros2.messages import GRID, WRENCH_STAMPED, force_and_torque
 
 PITCH_MM, PIXELS = 4.7, 8
+NEAR = {"counts_per_newton": (1300.0, 1500.0)}
 CELL_MM = 4 * PITCH_MM / PIXELS
 AREA_MM2 = (4 * PITCH_MM) ** 2
 FORCE_N = 20 * PITCH_MM**2 / 1000
@@ -141,13 +142,22 @@ def test_ros_takes_the_wrench_before_the_calibrated_force():
     [
         ({}, 0.45),  # 90 % of the even range of the sensors that the model was trained for
         ({"counts_per_newton": 1500.0}, None),
-        ({"counts_per_newton": {"4": 1500.0}, "scale_errors": {"4": 0.06}}, 0.06),
-        ({"pad": Pad(counts_per_newton=2000.0)}, None),
-        ({"pad": Pad(counts_per_newton=2000.0, intervals={"counts_per_newton": (1900.0, 2100.0)})}, 0.05),
+        ({"counts_per_newton": {"4": 1500.0}, "scale_intervals": {"4": (1410.0, 1590.0)}}, 0.06),
+        ({"pad": Pad(counts_per_newton=1200.0)}, None),
+        ({"pad": Pad(counts_per_newton=1200.0, intervals=NEAR)}, 0.25),  # to its farther end
+        ({"pad": Pad(intervals=NEAR), "counts_per_newton": 1500.0}, None),  # that is no interval of these
+        ({"pad": Pad(counts_per_newton=1200.0), "scale_intervals": {"4": (1140.0, 1260.0)}}, None),
     ],
 )
 def test_a_record_states_how_far_its_newtons_may_be_off(settings, expected):
-    assert make_wrench_result(**settings).scale_error == (None if expected is None else pytest.approx(expected))
+    made = make_wrench_result(**settings)
+    assert made.scale_error == (None if expected is None else pytest.approx(expected))
+    assert made.wrench_origin == ("calibrated" if settings else "nominal")
+
+
+def test_counts_per_newton_that_are_hardly_known_are_not_given_to_the_model():
+    wide = make_wrench_result(counts_per_newton={"4": 1500.0}, scale_intervals={"4": (900.0, 2100.0)})
+    assert (wide.wrench_origin, wide.scale_error) == ("nominal", pytest.approx(0.45))
 
 
 CONTRACT = make_contract(scale=10, contact_level=0.5)

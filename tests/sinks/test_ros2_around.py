@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from mcap_samples import make_results, odd_scans
 from ros2_samples import ENVIRONMENT, contact, keep_published, sink
 
-from edge.api import Event, Note, Result, SinkError, UsageError
+from edge.api import USPA44, Event, Note, Result, SinkError, UsageError
 from edge.cli.main import parser
 from edge.sinks.json_records import record
 from edge.sinks.registry import check_sink
@@ -226,6 +226,25 @@ def test_another_image_is_not_taken_for_a_map():
     said = ros_messages.IMAGE.decode(map_messages.image(np.zeros((2, 2), np.float32), "4", 0))
     with pytest.raises(ValueError, match=r"encoding 'mono8', expected 32FC1"):
         map_messages.recorded_map(ros_messages.IMAGE.name, ros_messages.IMAGE.encode({**said, "encoding": "mono8"}))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"column_count": 20},
+        {"column_count": 0},
+        {"row_stride": 0},
+        {"fields": [{"name": "pattern", "offset": 0, "type": 8}]},
+        {"fields": [{"name": "pattern", "offset": 2, "type": 7}]},
+        {"data": np.zeros(39, np.uint8)},
+    ],
+)
+def test_another_grid_is_not_taken_for_a_map(changes):
+    made = map_messages.grid("pattern", np.ones((4, 4), np.float32), "4", UNIX_NS, USPA44)
+    assert map_messages.recorded_map(ros_messages.GRID.name, made) == pytest.approx(np.full((4, 4), 1e-3))
+    with pytest.raises(ValueError, match="a grid of "):
+        other = ros_messages.GRID.encode(ros_messages.GRID.decode(made) | changes)
+        map_messages.recorded_map(ros_messages.GRID.name, other)
 
 
 def test_a_result_says_its_numbers_apart_and_all_of_it_as_json():

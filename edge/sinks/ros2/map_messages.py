@@ -94,7 +94,19 @@ def recorded_map(schema: str, data: bytes | memoryview) -> NDArray[np.float32]:
         count, kinds = len(found["fields"]), {one["type"] for one in found["fields"]}
         if kinds != {_FLOAT32}:
             raise ValueError(f"a grid of numbers of type {sorted(kinds)}, expected {_FLOAT32}, float32")
-        layers = found["data"].view("<f4").reshape(-1, found["column_count"], count).transpose(2, 0, 1)
+        columns, strides = found["column_count"], (found["row_stride"], found["cell_stride"])
+        offsets = [one["offset"] for one in found["fields"]]
+        wanted = (4 * count * columns, 4 * count)
+        if (
+            columns == 0
+            or strides != wanted
+            or offsets != list(range(0, 4 * count, 4))
+            or len(found["data"]) % wanted[0]
+        ):
+            raise ValueError(
+                f"a grid of {columns} columns, strides {strides}, fields at {offsets}: expected whole rows"
+            )
+        layers = found["data"].view("<f4").reshape(-1, columns, count).transpose(2, 0, 1)
         return layers[0] if count == 1 else layers
     found = IMAGE.decode(data)
     if found["encoding"] not in ("32FC1", "32FC3") or found["is_bigendian"]:

@@ -97,7 +97,7 @@ RESULT: Final = MessageType(
     "tactile_edge_sr/msg/Result",
     f"""\
 # What was made of one scan, without its maps. Not known: NaN of numbers, -1 of contact.
-std_msgs/Header header     # wall clock time of the scan; frame_id as of images
+std_msgs/Header header     # wall clock time of the scan; frame_id as of its maps
 {_MEMBERS}
 string record              # all of it as JSON, as in a line of jsonl:
 """,
