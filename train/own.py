@@ -37,7 +37,7 @@ from edge.inference.onnx_session import ModelSession, load_session
 from edge.terminal.argument_types import positive
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
-from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file
+from firmware_bridge.sensor_file.model import SensorFile, load_sensor_file, with_scale
 from train.data.frozen_presses import FrozenPresses, freeze_presses
 from train.data.make_presses import make_presses, quiet_workers
 from train.data.press_batches import OneSensor
@@ -112,11 +112,7 @@ def knowledge_of(file: SensorFile, name: str | None) -> Knowledge:
     if name not in file.sensors:
         raise DatasetError(f"--sensor {name}: the sensor file has {names}")
     entry = file.sensors[name]
-    pad = entry.used_pad or Pad()
-    if entry.counts_per_newton is not None and pad.counts_per_newton is None:
-        ends = entry.counts_per_newton_interval
-        intervals = dict(pad.intervals) | ({} if ends is None else {"counts_per_newton": ends})
-        pad = replace(pad, counts_per_newton=entry.counts_per_newton, intervals=intervals)
+    pad = with_scale(entry.used_pad, entry.counts_per_newton, entry.counts_per_newton_interval) or Pad()
     ranges = dict(RANGES)
     for constant, value in pad.constants.items():
         apart = _FIFTH * (RANGES[constant][1] - RANGES[constant][0]) / 2

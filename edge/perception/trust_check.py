@@ -10,7 +10,6 @@ taps travel in the model, from `train.trust`, UNFAMILIAR and FOREIGN.
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from edge.perception.tap_tracker import TapTracker
 from edge.perception.taxel_health import Health
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.pad_constants import GAIN_SPREAD, Pad
+from firmware_bridge.sensor_file.model import with_scale
 
 LEAST_COUNTS: Final = 100.0  # largest z of the weakest contact that is checked: below it, drift is half of the reading
 MOST_MISMATCH: Final = 0.8
@@ -260,11 +260,7 @@ class SensorPad:
     def use(self, pad: Pad | None) -> None:
         """Take a pad from now on, converted once for all runs of the model."""
         contract, self.pad = self._contract, pad
-        if self.counts_per_newton is not None and (pad is None or pad.counts_per_newton is None):
-            pad = replace(pad or Pad(), counts_per_newton=self.counts_per_newton)
-            others = {name: ends for name, ends in pad.intervals.items() if name != "counts_per_newton"}
-            own = {} if self._interval is None else {"counts_per_newton": self._interval}
-            pad = replace(pad, intervals=others | own)
+        pad = with_scale(pad, self.counts_per_newton, self._interval)
         self.row: NDArray[np.float32] = contract.pad_row(pad)
         self.counts_per_unit = np.asarray(contract.counts_per_unit, dtype=np.float32)[:, None, None]
         if contract.takes_gains and pad is not None and pad.gains is not None:

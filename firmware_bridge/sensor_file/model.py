@@ -67,6 +67,16 @@ class PadFrame:
             raise ValueError(f"quaternion is {self.quaternion}, expected x, y, z, w of norm 1")
 
 
+def with_scale(pad: Pad | None, counts_per_newton: float | None, interval: tuple[float, float] | None) -> Pad | None:
+    """Return a pad with its sensor's counts per newton, and their 90 % interval, where it has none of its own."""
+    if counts_per_newton is None or (pad is not None and pad.counts_per_newton is not None):
+        return pad
+    pad = pad or Pad()
+    intervals = {name: ends for name, ends in pad.intervals.items() if name != "counts_per_newton"}
+    own = {} if interval is None else {"counts_per_newton": interval}
+    return replace(pad, counts_per_newton=counts_per_newton, intervals=intervals | own)
+
+
 @dataclass(frozen=True)
 class SensorEntry:
     """Properties of one sensor."""

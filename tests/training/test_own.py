@@ -46,6 +46,18 @@ def test_pads_are_drawn_as_wide_as_what_is_not_known():
     assert "thickness_mm to 11%" in text and "gains to 1.5 %" in text and "not known: poisson, " in text
 
 
+@pytest.mark.parametrize(("interval", "expected"), [((1050.0, 1200.0), (1050.0, 1200.0)), (None, None)])
+def test_a_weight_draws_pads_within_its_own_interval(interval, expected):
+    """Not within one that the pad has without a value."""
+    entry = SensorEntry(
+        pad=Pad(intervals={"counts_per_newton": (10.0, 20.0)}),
+        counts_per_newton=1100.0,
+        counts_per_newton_interval=interval,
+    )
+    low, high = knowledge_of(SensorFile(sensors={"4": entry}), None).ranges["counts_per_newton"]
+    assert expected in (None, (low, high)) and low < 1100 < high
+
+
 @pytest.mark.parametrize(
     ("names", "asked", "complaint"),
     [
