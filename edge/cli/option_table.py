@@ -86,7 +86,7 @@ RESULTS: Final = (
         _runtime("contact_on_counts", positive),
         _runtime("contact_off_counts", positive),
         Option("--counts-per-newton C", lambda text: positive(text, *PAD_RANGES["counts_per_newton"]),
-               "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
+               "summed z readings for one newton, which gives forces in N; edge-sr doctor measures it by a weight"),
         _runtime("idle_reset_s", positive),
         _runtime("taps", whole(1)),
         about="A tap is one press, from touch to release. Counts are the units of raw readings.",
@@ -336,7 +336,6 @@ Of a recording it takes the scans during which the pad is still and pressed leas
                 Option("--drift-s T", positive, "seconds to measure the free pad (default %(default)g)", default=60),
                 Option("--no-press", bool, "skip the presses on the corners"),
                 Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
-                Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
             ),
             Group(
                 "results",
@@ -353,8 +352,6 @@ examples:
   edge-sr doctor --rehearse
   edge-sr doctor
   edge-sr doctor --out sensor.toml
-  edge-sr doctor --weight-g 200 \\
-          --out sensor.toml
   edge-sr --sensor sensor.toml
 
 Enter skips a request. Ctrl-C ends the doctor: what is measured until then is printed, and written with --out once the \

@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
+from edge.doctor.findings import Finding, judged
 from edge.doctor.guided_press import Weighed
-from edge.doctor.taxel_checks import Finding, judged
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 
 ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
@@ -72,7 +72,7 @@ class Grip:
             return [*findings, judged("scale in a grip", verdict, measured, "alike within 10 %", off)]
         measured = f"sensor {first} reads {ratio:.2f} of the counts of sensor {second}"
         # Sensors differ by a quarter either way.
-        off = "sensors differ less: lay a weight on each (--weight-g)"
+        off = "sensors differ less: lay a weight on each"
         findings.append(
             judged("scale in a grip", "ok" if 0.6 <= ratio <= 1.67 else "look", measured, "0.6 to 1.67", off)
         )

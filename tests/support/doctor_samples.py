@@ -67,8 +67,8 @@ class Person:
         self._grip_counts = grip_counts
         self._rng = np.random.default_rng(7)
 
-    def hear(self, text: str) -> None:
-        """Do what a request says."""
+    def hear(self, text: str) -> str | None:
+        """Do what a request says, and return a line to type, if any."""
         for place, corner in zip(USPA44.corners, CORNERS, strict=True):
             if f"the {corner} corner" in text:
                 self._place = place
@@ -83,6 +83,7 @@ class Person:
             self._gripped = 150
         if "et go" in text or "Take it off" in text:
             self._felt = self._free
+        return None
 
     def deformation(self) -> np.ndarray:
         """Return what the wire has over its rest, noiseless, (3, 4, 4)."""
