@@ -21,7 +21,7 @@ def believed(result: Result) -> bool:
 
 @dataclass(frozen=True)
 class Rendering:
-    """How an image is made of a result, always with the same range, so that images can be compared.
+    """Settings of an image, which has the same range whatever the result, so that images can be compared.
 
     Attributes:
         render: "pattern", or "vector_rgb" for the forces on the pad, as the plugin of Paxini sensors draws them.
