@@ -113,13 +113,7 @@ def _lines(forms: Mapping[str, str]) -> str:
     return "".join(f"{form}\t{meaning}\n" for form, meaning in forms.items())
 
 
-TABLE: Final = {
-    "": Subcommand(
-        "edge.cli.run_command:follow",
-        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
-        "pattern: a fine map of how deep an object presses into the pad, in mm.",
-        RUN,
-        f"""\
+COMMAND_LIST: Final = """\
 commands (each has its own --help):
 demo\tan emulated sensor; no hardware needed
 devices\tlist what is plugged in, and what to type to read it
@@ -131,7 +125,23 @@ map\tfuse the patterns into a map of an object larger than the pad
 baseline\tmeasure the free pad once, and store it
 models\tlist the bundled models
 bench\tmeasure error and run time on this machine
+"""
+EXAMPLES: Final = """\
+examples:
+  edge-sr devices
+  edge-sr doctor --out sensor.toml
+  edge-sr --sensor sensor.toml --view
+  edge-sr --sink jsonl:- | your-program
+"""
 
+TABLE: Final = {
+    "": Subcommand(
+        "edge.cli.run_command:follow",
+        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
+        "pattern: a fine map of how deep an object presses into the pad, in mm.",
+        RUN,
+        f"""\
+{COMMAND_LIST}
 sources, SRC (found by itself if one adapter is plugged in):
 {_lines(SOURCES)}
 outputs, S:
@@ -147,12 +157,7 @@ lines on stdin, where it is no terminal:
 
 The signal SIGUSR1 is like key z.
 
-examples:
-  edge-sr devices
-  edge-sr doctor --out sensor.toml
-  edge-sr --sensor sensor.toml --view
-  edge-sr --sink jsonl:- | your-program
-
+{EXAMPLES}
 Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
 """,
     ),
