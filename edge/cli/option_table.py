@@ -13,8 +13,7 @@ from edge.terminal.argument_types import not_negative, port, positive, whole
 from firmware_bridge.links.registry import FORMS as SOURCES
 from firmware_bridge.scans.can_id_maps import ID_MAPS, USPA44_MAP
 from firmware_bridge.scans.pad_constants import PAD_RANGES
-from firmware_bridge.zeroing.baseline import FEWEST_SCANS
-from firmware_bridge.zeroing.free_stretch import FEWEST_RECORDED
+from firmware_bridge.zeroing.baseline import FEWEST_RECORDED, FEWEST_SCANS
 
 _SETTINGS: Final[dict[Any, Any]] = {bool: {"action": "store_true"}, list: {"action": "append", "default": []}}
 """Settings of argparse for an option without a value, and for one that may be repeated."""
