@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.doctor.guided_press import CORNERS
+from edge.perception.result import NOISE_COUNTS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
@@ -17,7 +18,6 @@ WATCHED_S: Final = 5.0  # for which the free pad is watched
 _LATE_S: Final = 1.0  # from a request to what a person does
 _PRESS_COUNTS: Final = 5000.0  # summed z of a press
 _COUNTS_PER_N: Final = 1176.0  # of the average sensor
-_NOISE_COUNTS: Final = 2.0
 _RATE_HZ: Final = 100.0
 
 
@@ -52,7 +52,7 @@ class Rehearsal(Emulator):
         noise = np.random.default_rng(0)
         while True:
             self._load = self._next if time.monotonic() >= self._next_s else self._load
-            reading = track.counts[0] + self._load + noise.normal(0, _NOISE_COUNTS, USPA44.scan_shape)
+            reading = track.counts[0] + self._load + noise.normal(0, NOISE_COUNTS, USPA44.scan_shape)
             yield np.rint(reading).astype(np.int32)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge.perception.contact_options import OFF_COUNTS
-from edge.perception.taps import NOISE_COUNTS
+from edge.perception.result import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
 from firmware_bridge.pad_geometry import AXES
 from firmware_bridge.scans.scan import ABSENT, Scan
