@@ -26,9 +26,6 @@ Reason = Literal["stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "b
 """Why a pattern is not to be believed: a taxel repeats itself; no contact reads like that; the pattern does not explain
 its readings; contacts together are unfamiliar, or contradict the gains of the sensor file; the model expects a large
 error; it was trained on no press so deep or strong, or on no such pad; the baseline is in doubt."""
-REASONS: Final[tuple[Reason, ...]] = (
-    *("stuck", "unfamiliar", "unexplained", "sensor", "uncertain", "beyond", "pad", "baseline"),
-)
 REASON_TEXTS: Final[dict[Reason, str]] = {
     "stuck": "a taxel repeats itself (stuck?)",
     "unfamiliar": "readings like no contact (a magnet or steel near? the id map? the axes?)",
