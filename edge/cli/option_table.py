@@ -54,15 +54,6 @@ SENSOR: Final = (
     Option("--rate-hz R", positive, "scans a second at which a recording is played; for a device, its expected rate"),
     Option("--force", bool, "use a sensor file of an emulated sensor on a real one all the same"),
 )
-_READ: Final = Group("sensor",
-    *SENSOR,
-    Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
-           "start)"),
-    Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
-           "(default: never)"),
-    Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
-           "several sensors SENSOR=P; repeat it for several"),
-)
 RESULTS: Final = (
     Group("model",
         Option("--model M", str, "bundled model, of those that edge-sr models lists, or model file (default "
@@ -95,7 +86,18 @@ RESULTS: Final = (
         _runtime("every_scan", bool),
     ),
 )
-RUN: Final = (_READ, *RESULTS)
+RUN: Final = (
+    Group("sensor",
+        *SENSOR,
+        Option("--baseline FILE", Path, "readings of the free pad, from edge-sr baseline (default: measure them at the "
+               "start)"),
+        Option("--give-up-s T", not_negative, "end when the source has been lost for T seconds; 0: at once "
+               "(default: never)"),
+        Option("--poses P", list, "positions of the pad, which a robot sends: zenoh[:KEY] or ros2:TOPIC; for one of "
+               "several sensors SENSOR=P; repeat it for several"),
+    ),
+    *RESULTS,
+)
 # fmt: on
 
 

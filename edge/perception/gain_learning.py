@@ -36,12 +36,7 @@ REMEMBERED: Final = 64
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
 HELD_SCANS: Final = 200
-CONTRADICTED: Final = 6.0
-"""Disagreement of contacts with the measured gains from which these are another sensor's. The most that a sensor's own
-gains reached in a thousand contacts is 4.4, on 48 simulated sensors (docs/decisions.md)."""
 CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
-_EVEN: Final = 1e-3
-"""Deviation to which each axis' mean is held: that of z is counts per newton, and of x and y the in-plane share."""
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
 _ARRAYS: Final = (
     *("share", "means", "factors", "widening", "bias"),
@@ -302,8 +297,8 @@ def _without(precision: NDArray[np.float64], dead: NDArray[np.bool_]) -> NDArray
 
 
 def _even_axes() -> NDArray[np.floating]:
-    """Return the precision that holds each axis' mean."""
-    return np.kron(np.eye(len(AXES)), np.full((TAXELS, TAXELS), (TAXELS * _EVEN) ** -2.0))
+    """Return the precision that holds each axis' mean within 0.001: of z counts per newton, else the in-plane share."""
+    return np.kron(np.eye(len(AXES)), np.full((TAXELS, TAXELS), (TAXELS * 1e-3) ** -2.0))
 
 
 def _prior(constants: int) -> NDArray[np.float64]:
@@ -368,7 +363,8 @@ class Learn:
         self.waiting, self._force_counts, self._seen = False, 0.0, 0
         learned = learner.learn(self._strongest, dead)
         enough = self._from_file and learner.contacts >= CONTRADICTED_CONTACTS
-        if check is not None and enough and learner.disagreement > CONTRADICTED:
+        # A sensor's own gains reached 4.4 at most in a thousand contacts, on 48 simulated sensors (docs/decisions.md).
+        if check is not None and enough and learner.disagreement > 6.0:
             if not check.suspected:
                 why = "its contacts contradict the gains of its sensor file: is it another sensor's file?"
                 self._report("suspected", why)

@@ -36,8 +36,6 @@ With the others 3.5 % of simulated contacts less than 30 % off are not believed,
 REPEATS: Final = 5
 """Repeats of a taxel in a row that make a pattern doubtful, while most of the others are new: no run of real sensors is
 longer than 3."""
-SAME_STRENGTH: Final = 0.85
-"""Strength of a press, over that of an earlier tap, from which the two are compared for good."""
 NOT_OF_IT: Final = 0.5  # share from which an earlier tap does not belong to the contact
 
 
@@ -184,8 +182,8 @@ class Check:
     ) -> tuple[list[int], tuple[float, ...] | None]:
         """Return the numbers of the taps of a window that belong to the contact, and the mismatch of each earlier one.
 
-        A press as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have begun.
-        `scaled` is the window in network units, (K, 3, rows, cols).
+        A press nearly as strong as the earlier one settles it, and the tap is forgotten; a lighter one may only have
+        begun. `scaled` is the window in network units, (K, 3, rows, cols).
         """
         every = list(range(window.taps))
         if self._check is None:
@@ -196,7 +194,7 @@ class Check:
         settled = [
             number
             for number in (dropped if posed else dropped[:1])
-            if scaled[0, 2].sum() >= SAME_STRENGTH * scaled[number, 2].sum()
+            if scaled[0, 2].sum() >= 0.85 * scaled[number, 2].sum()
         ]
         for number in settled:
             self._report("tap_dropped", f"{_which(number, alone=posed)} not belong to this contact, and is forgotten")
