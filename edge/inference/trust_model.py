@@ -1,4 +1,4 @@
-"""Forward model and checks of a model, by which the runtime decides whether a pattern is to be believed.
+"""Forward model and checks that a model brings along, by which `edge.perception.trust_check` decides what to believe.
 
 Two small networks tell whether any contact reads like that, by features that training and runtime make here. They do
 not depend on the force but for its size. The forward model gives the readings that a pattern makes: it explains a

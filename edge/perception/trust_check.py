@@ -52,7 +52,7 @@ class PatternCheck:
 
     def __init__(self, trust: Trust, contract: Contract) -> None:
         self._trust = trust
-        self._constants = len(contract.pad_inputs)
+        self._constants, self._takes_gains = len(contract.pad_inputs), contract.takes_gains
         self._unit_counts = contract.counts_per_unit[2]
         self._deepest = 1.1 * contract.output_full_scale  # a little more than the deepest press in training
         self.use_pad(np.zeros(contract.pad_width, dtype=np.float32))
@@ -69,7 +69,7 @@ class PatternCheck:
         """Check from now on with a pad as model input, maybe far outside those of the training; the evidence stays."""
         self._pad_row, self._outside = pad_row, outside
         self._operator = self._trust.forward.of_pad(pad_row[: self._constants])
-        certainty = float(pad_row[-1]) if len(pad_row) > 2 * self._constants else 0.0
+        certainty = float(pad_row[-1]) if self._takes_gains else 0.0
         self._gain_error = GAIN_SPREAD * (1 - certainty)
 
     def belonging(
@@ -132,6 +132,8 @@ class PatternCheck:
         """Add the evidence of each contact once, by its strongest scan, when the next one begins."""
         if tap != self._tap:
             if self._tap is not None:
+                # A doubtful contact, up to 1.5, speaks for the sensor; none counts for more than 4.5 either way. So
+                # three clear faults in a row pass 12, and two to four good contacts lead from 12 to 20 below 6.
                 step = min(max(self._score - 1.5, -4.5), 4.5)
                 self._evidence = min(max(self._evidence + step, 0.0), 20.0)
                 self.suspected = self._wrong_file or self._evidence > (6.0 if self.suspected else 12.0)
@@ -168,7 +170,7 @@ def most_doubt(z_counts: float) -> float:
 def _share(log_odds: float) -> float:
     if math.isnan(log_odds):
         return 1.0
-    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))
+    return 1 / (1 + math.exp(-min(max(log_odds, -30.0), 30.0)))  # beyond 30 it is 0 or 1 to ten digits
 
 
 class Check:
