@@ -36,12 +36,8 @@ REMEMBERED: Final = 64
 BOUND: Final = 0.25  # largest deviation of a gain from 1
 _FREEDOM: Final = 5.0  # degrees of freedom of Student's t, which weighs down contacts that no component explains well
 HELD_SCANS: Final = 200
-CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which that is decided
+CONTRADICTED_CONTACTS: Final = 25  # fewest distinct contacts by which measured gains are found to be another sensor's
 _OPEN: Final = 1 / np.sqrt(3)  # prior deviation of a constant over half of its range: uniform within it
-_ARRAYS: Final = (
-    *("share", "means", "factors", "widening", "bias"),
-    *("names", "middles", "halves", "constant_widening"),
-)
 _Z: Final = slice(2 * TAXELS, 3 * TAXELS)
 _LINEAR: Final = GAINS + 2 * TAXELS + TAXELS + GAINS
 """Linear parameters beside the pad's constants: inverse gains, leans of x and y, unevenness of z, and offsets."""
@@ -77,7 +73,9 @@ def load_contact_model(path: Path = CONTACTS) -> ContactModel:
         EdgeError: the file cannot be read, or is of another pad.
     """
     try:
-        arrays = read_npz(path, _ARRAYS, 1 << 23)
+        of_contacts = ("share", "means", "factors", "widening", "bias")
+        of_constants = ("names", "middles", "halves", "constant_widening")
+        arrays = read_npz(path, (*of_contacts, *of_constants), 1 << 23)
         names, middles, halves = (arrays[name].tolist() for name in ("names", "middles", "halves"))
         constants = tuple(zip(names, middles, halves, strict=True))
         factors = arrays["factors"].astype(np.float64)

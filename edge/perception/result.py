@@ -7,6 +7,7 @@ import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -188,9 +189,6 @@ def _bits(taxels: bytes) -> int:
     return int.from_bytes(np.packbits(np.frombuffer(taxels, dtype=np.bool_), bitorder="little").tobytes(), "little")
 
 
-_NONE_DEAD: Final[Mapping[int, str]] = {}
-
-
 class Origin(NamedTuple):
     """Fields that all results of a run have in common."""
 
@@ -261,7 +259,7 @@ class Step:
     baseline: Baseline | None = None
     baseline_age_s: float | None = None
     drift: Drift | None = None
-    dead: Mapping[int, str] = _NONE_DEAD
+    dead: Mapping[int, str] = MappingProxyType({})
     gains_certainty: float | None = None
     scale_error: float | None = None
     notes: tuple[Note, ...] = ()
@@ -285,7 +283,7 @@ class Step:
                 self.notes = (*self.notes, waited_note(waited_ns))
         # What no stage has set is not in the dictionary, and has its default in the result.
         values: dict[str, Any] = dict(vars(self))
-        for name in _OF_STAGES:
+        for name in ("readings", "doubted", "due", "estimate", "_origin"):
             values.pop(name, None)
         due, made = self.due, self.estimate
         if made is not None:
@@ -298,8 +296,6 @@ class Step:
             values |= {"trusted": False, "untrusted_reason": "baseline"}
         return Result(**values, **self._origin._asdict())
 
-
-_OF_STAGES: Final = ("readings", "doubted", "due", "estimate", "_origin")
 
 NOISE_COUNTS: Final = 2.0  # standard deviation of a reading at rest: 1.7 to 2.6 in recordings
 _CHANGE_COUNTS: Final = math.sqrt(2) * NOISE_COUNTS  # the same of a change, since noise is in both scans
