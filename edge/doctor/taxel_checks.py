@@ -16,7 +16,6 @@ from firmware_bridge.schedule import NS_PER_S
 from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNTS, LOAD_LIMIT_COUNTS
 
 AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
-FEWEST_SCANS: Final = 50
 
 
 Verdict = Literal["ok", "look", "wrong", "not known"]
