@@ -107,7 +107,8 @@ def baseline(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
         from edge.pipeline.replay_setup import recorded_baselines, sensor_settings
 
         kind, known = "replay", sensor_settings(options.sensor, options.id_map)
-        baselines, notes = recorded_baselines(options.source[0].removeprefix("replay:"), known, options.rate_hz)
+        played = options.source[0].removeprefix("replay:")
+        baselines, notes = recorded_baselines(played, known, options.rate_hz, force=options.force)
         print("\n".join(notes), file=err)
     else:
         with stop_on_signals() as stop, _source(options, give_up_s=0) as source:

@@ -228,7 +228,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         failed: BridgeError | None = None
         whole = False
         with reader:
-            refuse_emulated(known, link.kind, options.force)
+            refuse_emulated(known, link.kind, link.origin, options.force)
             try:
                 visit.watch(watched)
                 whole = not stop.is_set()

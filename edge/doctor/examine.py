@@ -229,6 +229,6 @@ def examine(
     known = sensor_settings(sensor, id_map)
     reader, known, watched = prepare(texts, known, stored_baselines(baselines, known), rate_hz)
     with reader:
-        refuse_emulated(known, reader.link.kind, force=False)
+        refuse_emulated(known, reader.link.kind, reader.link.origin, force=False)
         watch(reader, watched, duration_s, threading.Event() if stop is None else stop)
     return judge(watched, time.time()).findings
