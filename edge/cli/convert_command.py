@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from edge.errors import SinkError, UsageError
+from edge.perception.record_fields import FIELDS, Out
 from edge.pipeline.sink import check_new
 from edge.pipeline.source_setup import sensor_settings, unmapped
 from edge.terminal.progress_bar import progress
@@ -18,9 +19,12 @@ from firmware_bridge.recording.tracks import Recording
 from firmware_bridge.scans.mounting import Mounting
 from firmware_bridge.sensor_file.model import SensorEntry
 
+_NOT_IN_NPZ: Final = [
+    one.name for one in FIELDS if Out.RECORD in one.out and Out.NPZ not in one.out and one.name != "pose"
+]
 _WITHOUT: Final = {
-    (".mcap", ".npz"): "events, counters, the wall clock, and newtons and temperatures of the vendor's server",
-    (".mcap", ".csv"): "all but counts, times and poses: patterns, events, baselines and the mounting",
+    (".mcap", ".npz"): f"events, counters, the wall clock, and of each record {', '.join(_NOT_IN_NPZ)}",
+    (".mcap", ".csv"): "all but counts, times and poses: errors of poses, patterns, events, baselines, the mounting",
     (".npz", ".mcap"): "what was computed (edge-sr replay computes it), the device's times, later baselines",
     (".csv", ".mcap"): "the time of day, which the file does not state",
 }
