@@ -106,7 +106,7 @@ class Visit:
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
         geometry, weight_g = self._known.geometry, self._options.weight_g
-        guide = GuidedPress(weight_g, geometry)
+        guide = GuidedPress(weight_g, geometry, examined.z_noise_counts[name])
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
         findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)

@@ -209,13 +209,18 @@ class GuidedPress:
         weighed: counts per newton of the summed z, where a weight was laid on; else None.
     """
 
-    def __init__(self, weight_g: float | None = None, geometry: SensorGeometry = USPA44) -> None:
-        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g]."""
+    def __init__(
+        self, weight_g: float | None = None, geometry: SensorGeometry = USPA44, z_noise_counts: float = 0.0
+    ) -> None:
+        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g].
+
+        `z_noise_counts` is the standard deviation of the free pad's summed z, which it has under a still weight, too.
+        """
         self.done = False
         self.presses: list[Press] = []
         self.weighed: Weighed | None = None
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(geometry.corners, weight_g)
+        self._dialogue = self._all(geometry.corners, weight_g, z_noise_counts)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
@@ -244,7 +249,7 @@ class GuidedPress:
             self.done = True
             return None
 
-    def _all(self, corners: Sequence[int], weight_g: float | None) -> Dialogue[None]:
+    def _all(self, corners: Sequence[int], weight_g: float | None, z_noise_counts: float) -> Dialogue[None]:
         for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
@@ -257,7 +262,7 @@ class GuidedPress:
                 break
             self.presses.append(press)
         if weight_g is not None:
-            self.weighed = yield from _weigh(weight_g)
+            self.weighed = yield from _weigh(weight_g, z_noise_counts)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
@@ -286,7 +291,7 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
     return Press(place, taxel, float(mean[2].sum()), push)
 
 
-def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
+def _weigh(weight_g: float, z_noise_counts: float) -> Dialogue[Weighed | None]:
     """Return what a weight shows; None where nothing steady was laid on."""
     steady: list[NDArray[np.float32]] = []  # of z
 
@@ -294,9 +299,13 @@ def _weigh(weight_g: float) -> Dialogue[Weighed | None]:
         steady.append(reading.zeroed[2])
         del steady[:-STEADY_SCANS]
         sums = np.abs(np.sum(steady, axis=(1, 2)))
-        low, high = sums.min(), sums.max()
-        still = high - low < max(30.0, 0.02 * high)
-        return bool(len(steady) == STEADY_SCANS and low > 100.0 and still)
+        if len(sums) < STEADY_SCANS or sums.min() <= 100.0:
+            return False
+        # Noise alone spreads 50 readings over 4.5 of its deviations, and the means of ten of them over 0.7; hardly ever
+        # over these limits.
+        allowed, means = max(30.0, 0.02 * sums.max()), sums.reshape(5, -1).mean(axis=1)
+        spread_by_noise = np.ptp(sums) < max(allowed, 7 * z_noise_counts)
+        return bool(spread_by_noise and np.ptp(means) < max(allowed, 1.5 * z_noise_counts))
 
     ask = f"Lay {weight_g:g} g on the pad, flat and covering all of it, hands off."
     laid = yield from _wait(ask, lies_still, 1)

@@ -160,6 +160,27 @@ class TestPerson:
         _, guide = answer_to([*visit(), *laid], GuidedPress(weight_g=200.0))
         assert guide.done and judge_force(guide.weighed, kept=False).verdict == "not known"
 
+    @pytest.mark.parametrize(
+        ("course", "steady"),
+        [
+            ("lies", True),
+            ("is laid down", False),
+            ("tilts", False),
+        ],
+    )
+    @pytest.mark.parametrize("noise", [1.0, 2.0, 6.0, 12.0])
+    def test_a_weight_is_steady_where_it_moves_no_more_than_the_pad_s_own_noise(self, course, steady, noise):
+        time_s = np.arange(400) / 100
+        share = {"lies": time_s**0, "is laid down": time_s / 5, "tilts": 1 + 0.1 * np.sin(2 * np.pi * time_s)}[course]
+        for seed in range(20):
+            laid = np.random.default_rng(seed).normal(0, noise, (400, 3, 4, 4))
+            laid[:, 2] += 147.1 * share[:, None, None]
+            _, guide = answer_to(
+                [*visit(), *laid, *np.zeros((30, 3, 4, 4))], GuidedPress(200.0, z_noise_counts=4 * noise)
+            )
+            assert (guide.weighed is not None) is steady, seed
+            assert not steady or guide.weighed == pytest.approx((1200.0, 0.08), rel=0.01)
+
     def test_a_torn_scan_is_not_taken_for_letting_go(self):
         script = visit(rest=25)
         script[5::7, :, :2] = np.nan
