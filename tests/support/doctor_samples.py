@@ -101,7 +101,9 @@ class Person:
                 self._gripped -= 1
                 self._felt = np.zeros((3, 4, 4))
                 self._felt[2] = (self._grip_counts if self._gripped else 0.0) / 16
-            yield np.rint(REST + self.deformation() + self._rng.normal(0, self._noise_counts, (3, 4, 4))).astype(np.int32)
+            yield np.rint(REST + self.deformation() + self._rng.normal(0, self._noise_counts, (3, 4, 4))).astype(
+                np.int32
+            )
 
 
 def visit(mounting: Mounting | None = None, *, rest: int = 20, hold: int = 45) -> np.ndarray:
