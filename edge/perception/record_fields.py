@@ -297,8 +297,8 @@ FIELDS: Final = (
     Field("expected_rmse_mm", _REAL, "expected_rmse_mm",
           "RMS error, over all pixels, that patterns of the same uncertainty had on taps not trained on",
           decimals=5, byte=152),
-    Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of it; unknown "
-          "where the model takes no further one", out=_RECORD_NPZ, byte=72),
+    Field("another_tap", _YES_OR_NO, "another_tap", "whether another tap is expected to take away 2 % of the "
+          "error; unknown where the model takes no further one", out=_RECORD_NPZ, byte=72),
     Field("next_tap", _REAL, "next_tap", "from the end of a tap to the next one: where to touch next, dx, dy in mm and "
           "turn in degrees from the newest tap's pad; records hold `target` too, the same pose in the object's plane; "
           "unknown without poses",
