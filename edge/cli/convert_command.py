@@ -12,6 +12,7 @@ from edge.perception.record_fields import FIELDS, Out
 from edge.pipeline.sink import check_new
 from edge.pipeline.source_setup import sensor_settings, unmapped
 from edge.terminal.progress_bar import progress
+from firmware_bridge.errors import as_typed
 from firmware_bridge.in_place import write_in_place
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.formats import load_recording
@@ -43,11 +44,10 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> None:
     if was == ending:
         raise UsageError(f"{source} and {target} have the same format: copy it, or name the new file otherwise")
     if was in _WRITERS and (was, ending) not in _WITHOUT:
-        made = source.with_suffix(".mcap").name
+        made = as_typed(source.with_suffix(".mcap").name)
         rate = f" --rate-hz {options.rate_hz or 'R'}" if was == ".csv" else ""
-        raise UsageError(
-            f"{source} becomes no {ending}: edge-sr convert {source} {made}{rate}; edge-sr convert {made} {target}"
-        )
+        first, then = f"{as_typed(source)} {made}{rate}", f"{made} {as_typed(target)}"
+        raise UsageError(f"{source} becomes no {ending}: edge-sr convert {first}; edge-sr convert {then}")
     if options.rate_hz is not None and was != ".csv":
         raise UsageError(f"--rate-hz is for a .csv alone: {source} has times of its own")
     check_new(target)

@@ -6,14 +6,13 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from types import MappingProxyType
 from typing import Any
 
 from edge.pipeline.scan_reader import Source
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, unmapped, with_recorded
 from edge.terminal.progress_bar import progress
-from firmware_bridge.errors import BaselineRefusedError
+from firmware_bridge.errors import BaselineRefusedError, as_typed
 from firmware_bridge.links.registry import place_recordings, recording_paths
 from firmware_bridge.links.replay import ReplayLink
 from firmware_bridge.recording.tracks import Recording
@@ -158,7 +157,7 @@ def _remedy(path: Path, rate_hz: float | None) -> str:
     rate = "" if rate_hz is None else f" --rate-hz {rate_hz:g}"
     return (
         "If it holds something all the time, take the baseline of a recording of this sensor in which it lets go: "
-        f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {quote(str(path))}{rate} "
+        f"edge-sr baseline --source replay:OTHER{rate} --out zero.json; edge-sr replay {as_typed(path)}{rate} "
         "--baseline zero.json shows patterns, marked as not to be believed"
     )
 
