@@ -29,7 +29,7 @@ lint: $(VENV)/.dev  ## format, lint, types, import rules, plain English
 docs: $(VENV)/.docs  ## README.md, docs/ and reports/ as a site, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-wheels: $(VENV)/.dev  ## two wheels in dist/: the runtime, with completion and man page; and training, export, bench
+wheels: $(VENV)/.wheels  ## two wheels in dist/: the runtime, with completion and man page; and training, export, bench
 	$(BIN)/python release/wheels.py
 
 PRESSES := data/gripped.npz data/taps4.npz data/taps7.npz
@@ -96,6 +96,10 @@ $(VENV)/.runtime: pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/.runtime
 	$(PIP) --editable '.[dev]'
+	touch $@
+
+$(VENV)/.wheels: $(VENV)/.runtime
+	$(PIP) --editable '.[wheels]'
 	touch $@
 
 $(VENV)/.docs: $(VENV)/.runtime

@@ -21,7 +21,7 @@ from edge.api import (
     UsageError,
     unfinished_load,
 )
-from edge.cli.option_table import COMMANDS, TABLE, runtime_options
+from edge.cli.option_table import COMMAND_LIST, COMMANDS, EXAMPLES, TABLE, Option, runtime_options
 from edge.sinks.registry import check_apart, check_sink
 from edge.terminal.argument_types import EXIT_USAGE, Parser
 from firmware_bridge.errors import harmless
@@ -32,6 +32,8 @@ _FIXED: Final[dict[str, dict[str, Any]]] = {
     "replay": {"source": [], "id_map": None, "give_up_s": None, "poses": []},
 }
 """Options of a run that a command of its kind does not have, with the values that they have there."""
+_USUAL: Final = ("--source", "--sensor", "--model", "--sink", "--view", "--duration-s")
+"""Options of the short help, `edge-sr -h`."""
 _EXIT_CODES: Final = {DeviceError: 3, BaselineRefusedError: 3, ModelError: 4, SinkError: 5}
 """Exit codes of errors; of all others it is that of wrong usage."""
 
@@ -77,6 +79,9 @@ def _command(arguments: Sequence[str]) -> int | None:
         near = get_close_matches(name, COMMANDS, n=1)
         all_ = f"commands are {', '.join(COMMANDS)}; to run, give options alone"
         raise UsageError(f"no command {name!r}: {f'did you mean {near[0]}?' if near else all_}")
+    if [*arguments] == ["-h"]:
+        print(parser(usual=True).format_help(), end="")
+        return None
     options = parsed_options(name, rest)
     module, _, function = TABLE[name].does.partition(":")
     try:
@@ -90,15 +95,22 @@ def _command(arguments: Sequence[str]) -> int | None:
     return does(options, sys.stdout, sys.stderr)
 
 
-def parser(command: str = "") -> argparse.ArgumentParser:
-    """Return the parser of a command, or of `edge-sr` without one."""
+def parser(command: str = "", *, usual: bool = False) -> argparse.ArgumentParser:
+    """Return the parser of a command, or of `edge-sr` without one, with its `usual` options or all."""
     name, help_ = f"edge-sr {command}".rstrip(), TABLE[command]
     given = [word for group in help_.groups for word in group.arguments]
     usage = " ".join((name, *(given or ["[options]"]))) + ("" if command else f"\n       {name} COMMAND [options]")
-    made = Parser(prog=name, usage=usage, description=help_.about, epilog=help_.more)
+    all_ = "edge-sr --help lists all options, sources, outputs and keys."
+    more = "\n".join((COMMAND_LIST, EXAMPLES, all_)) if usual else help_.more
+    made = Parser(prog=name, usage=usage, description=help_.about, epilog=more, add_help=bool(command))
+    if not command:
+        made.add_argument("-h", "--help", action="help", help="show all options; -h shows the usual ones")
     for listed in help_.groups:
+        shown = [one for one in listed.options if not usual or (isinstance(one, Option) and one.name in _USUAL)]
+        if not shown:
+            continue
         group = made if listed.title is None else made.add_argument_group(listed.title, listed.about)
-        for one in listed.options:
+        for one in shown:
             to = group.add_mutually_exclusive_group() if isinstance(one, tuple) else group
             for option in one if isinstance(one, tuple) else (one,):
                 to.add_argument(option.name, **option.settings)

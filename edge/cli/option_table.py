@@ -86,7 +86,7 @@ RESULTS: Final = (
         _runtime("contact_on_counts", positive),
         _runtime("contact_off_counts", positive),
         Option("--counts-per-newton C", lambda text: positive(text, *PAD_RANGES["counts_per_newton"]),
-               "summed z readings for one newton, which gives forces in N; edge-sr doctor --weight-g measures it"),
+               "summed z readings for one newton, which gives forces in N; edge-sr doctor measures it by a weight"),
         _runtime("idle_reset_s", positive),
         _runtime("taps", whole(1)),
         about="A tap is one press, from touch to release. Counts are the units of raw readings.",
@@ -113,13 +113,7 @@ def _lines(forms: Mapping[str, str]) -> str:
     return "".join(f"{form}\t{meaning}\n" for form, meaning in forms.items())
 
 
-TABLE: Final = {
-    "": Subcommand(
-        "edge.cli.run_command:follow",
-        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
-        "pattern: a fine map of how deep an object presses into the pad, in mm.",
-        RUN,
-        f"""\
+COMMAND_LIST: Final = """\
 commands (each has its own --help):
 demo\tan emulated sensor; no hardware needed
 devices\tlist what is plugged in, and what to type to read it
@@ -131,7 +125,23 @@ map\tfuse the patterns into a map of an object larger than the pad
 baseline\tmeasure the free pad once, and store it
 models\tlist the bundled models
 bench\tmeasure error and run time on this machine
+"""
+EXAMPLES: Final = """\
+examples:
+  edge-sr devices
+  edge-sr doctor --out sensor.toml
+  edge-sr --sensor sensor.toml --view
+  edge-sr --sink jsonl:- | your-program
+"""
 
+TABLE: Final = {
+    "": Subcommand(
+        "edge.cli.run_command:follow",
+        "Reads a tactile sensor and computes, for each scan (one reading of all taxels, the cells of the sensor), a "
+        "pattern: a fine map of how deep an object presses into the pad, in mm.",
+        RUN,
+        f"""\
+{COMMAND_LIST}
 sources, SRC (found by itself if one adapter is plugged in):
 {_lines(SOURCES)}
 outputs, S:
@@ -147,12 +157,7 @@ lines on stdin, where it is no terminal:
 
 The signal SIGUSR1 is like key z.
 
-examples:
-  edge-sr devices
-  edge-sr doctor --out sensor.toml
-  edge-sr --sensor sensor.toml --view
-  edge-sr --sink jsonl:- | your-program
-
+{EXAMPLES}
 Exit codes: 2 wrong usage, 3 sensor, 4 model, 5 output, 6 ended by force.
 """,
     ),
@@ -336,7 +341,6 @@ Of a recording it takes the scans during which the pad is still and pressed leas
                 Option("--drift-s T", positive, "seconds to measure the free pad (default %(default)g)", default=60),
                 Option("--no-press", bool, "skip the presses on the corners"),
                 Option("--rehearse", bool, "on an emulated pad that does what is asked: no sensor is needed"),
-                Option("--weight-g G", positive, "weight in grams to lay on the pad, which gives forces in newtons"),
             ),
             Group(
                 "results",
@@ -353,8 +357,6 @@ examples:
   edge-sr doctor --rehearse
   edge-sr doctor
   edge-sr doctor --out sensor.toml
-  edge-sr doctor --weight-g 200 \\
-          --out sensor.toml
   edge-sr --sensor sensor.toml
 
 Enter skips a request. Ctrl-C ends the doctor: what is measured until then is printed, and written with --out once the \

@@ -8,8 +8,7 @@ import select
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,11 +17,19 @@ from typing import TextIO
 import numpy as np
 
 from edge.doctor.examine import Examined, Watched, judge, prepare, watch
+from edge.doctor.findings import Finding, page, summary, worst
 from edge.doctor.grip import ASK as GRIP
 from edge.doctor.grip import Grip
-from edge.doctor.guided_press import PARTLY_ERROR, PATIENCE_S, GuidedPress, Weighed, judge_force, judge_press
+from edge.doctor.guided_press import (
+    ASK_WEIGHT,
+    PARTLY_ERROR,
+    PATIENCE_S,
+    GuidedPress,
+    Weighed,
+    judge_force,
+    judge_press,
+)
 from edge.doctor.rehearsal import WATCHED_S, Rehearsal
-from edge.doctor.taxel_checks import Finding, Verdict
 from edge.errors import UsageError
 from edge.pipeline.gain_keeper import forget_learned
 from edge.pipeline.source_setup import refuse_emulated, sensor_settings, stored_baselines
@@ -30,7 +37,7 @@ from edge.terminal.argument_types import columns, wrapped
 from edge.terminal.progress_bar import drawn, progress, rewritable
 from edge.terminal.stop_signals import stop_on_signals
 from firmware_bridge import in_place
-from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, as_typed
+from firmware_bridge.errors import BridgeError, LinkLostError, SensorFileError, as_typed, harmless
 from firmware_bridge.links.base import LinkReader
 from firmware_bridge.links.serial_ports import serial_ports
 from firmware_bridge.pad_geometry import USPA44
@@ -42,11 +49,12 @@ from firmware_bridge.sensor_file.toml_writer import changing, save_sensor_file
 from firmware_bridge.zeroing.baseline import Baseline, deformation
 
 
-def enter_pressed() -> bool:
-    """Return whether Enter was pressed on the terminal since the last call; never waits."""
+def typed_line() -> str | None:
+    """Return the last line that was typed on the terminal since the last call, or None; never waits."""
     if not _stdin_is_terminal() or not select.select([sys.stdin.fileno()], [], [], 0)[0]:
-        return False
-    return b"\n" in os.read(sys.stdin.fileno(), 1024)
+        return None
+    lines = os.read(sys.stdin.fileno(), 1024).decode(errors="replace").split("\n")
+    return harmless(lines[-2]) if len(lines) > 1 else None
 
 
 def _stdin_is_terminal() -> bool:
@@ -105,14 +113,17 @@ class Visit:
             self._grip((names[0], names[1]), examined)
 
     def _press_one(self, name: str, whose: str, examined: Examined) -> None:
-        geometry, weight_g = self._known.geometry, self._options.weight_g
-        guide = GuidedPress(weight_g, geometry, examined.z_noise_counts[name])
+        geometry, answers = self._known.geometry, self._rehearsal is not None or _stdin_is_terminal()
+        guide = GuidedPress(geometry, weigh=answers, z_noise_counts=examined.z_noise_counts[name])
         self._say(f"{whose}Hold the pad in the orientation in which patterns are to be drawn.")
         self._lead(guide, name, examined, whose)
         findings, found = judge_press(guide.presses, geometry, kept=self._options.out is not None)
-        if weight_g is not None:
+        if guide.weight_g is not None:
             findings.append(judge_force(guide.weighed, kept=self._options.out is not None))
         self.unfinished |= any(finding.verdict == "not known" for finding in findings)
+        if answers and guide.weight_g is None and name not in self._known.counts_per_newton:
+            remedy = "forces in newtons are a quarter off either way until a weight is laid on: run the doctor again"
+            findings.append(Finding("force", "not known", "no weight was laid on", "", remedy))
         examined.findings.extend(replace(finding, sensor=name) for finding in findings)
         if guide.weighed is not None and guide.weighed.interval[1] <= PAD_RANGES["counts_per_newton"][1]:
             self.weighed[name] = guide.weighed
@@ -132,7 +143,7 @@ class Visit:
                     mounting = self._known.mountings.get(scan.sensor)
                     zeroed = deformation(scan.counts, examined.baselines[scan.sensor], mounting)
                     grip.push(scan.sensor, scan.time_ns / NS_PER_S, float(np.nansum(zeroed[2])))
-            if enter_pressed():
+            if typed_line() is not None:
                 return
         known = {name: Weighed(value, PARTLY_ERROR) for name, value in self._known.counts_per_newton.items()}
         for name, (low, high) in self._known.scale_intervals.items():
@@ -143,11 +154,11 @@ class Visit:
 
     def _lead(self, guide: GuidedPress, name: str, examined: Examined, whose: str) -> None:
         """Lead a person through a dialogue about one sensor."""
-        baseline, mounting = examined.baselines[name], self._known.mountings.get(name)
+        baseline, mounting, asked = examined.baselines[name], self._known.mountings.get(name), guide.first
         if not (self._stop.is_set() or self._link.ended):
             self._ask(whose, guide.first)
         received_s = asked_s = time.monotonic()
-        enter_pressed()  # one of before is no answer to this request
+        typed_line()  # one of before is no answer to this request
         while not (guide.done or self._stop.is_set() or self._link.ended):
             if time.monotonic() - received_s > GIVEN_UP_S:
                 why = f"no scan for {GIVEN_UP_S:.0f} s: check power and plug"
@@ -158,18 +169,22 @@ class Visit:
                 if scan.sensor == name:
                     received_s = time.monotonic()
                     requests.append(guide.push(deformation(scan.counts, baseline, mounting), scan.time_ns / NS_PER_S))
-            if enter_pressed():
-                requests.append(guide.skip())
-            for request in filter(None, requests):
-                self._ask(whose, request)
+            if (line := self._typed_line()) is not None:
+                requests.append(guide.type(line))
+            for asked in filter(None, requests):
+                self._ask(whose, asked)
                 asked_s = time.monotonic()
-            self._show_load(guide.felt, asked_s + PATIENCE_S - time.monotonic())
+            if not asked.endswith(ASK_WEIGHT):  # what is being typed would be drawn over
+                self._show_load(guide.felt, asked_s + PATIENCE_S - time.monotonic())
         self._rewrite("")
 
     def _ask(self, whose: str, request: str) -> None:
         self._say(whose + request)
         if self._rehearsal is not None:
             self._rehearsal.answer(request)
+
+    def _typed_line(self) -> str | None:
+        return typed_line() if self._rehearsal is None else self._rehearsal.typed_line()
 
     def _show_load(self, felt: float, left_s: float) -> None:
         """Show the load, as a share of that of a press, in a line that is rewritten in place."""
@@ -216,7 +231,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
     before = stored_baselines(options.baseline, known)
     if options.rehearse and (options.source or known.model_map.geometry != USPA44):
         raise UsageError("--rehearse brings its own sensor, a uSPa44: leave --source and other pads out")
-    with stop_on_signals() as stop, Rehearsal(options.weight_g) if options.rehearse else nullcontext() as rehearsal:
+    with stop_on_signals() as stop, Rehearsal() if options.rehearse else nullcontext() as rehearsal:
         sources = options.source if rehearsal is None else [f"slcan:{rehearsal.port}"]
         reader, known, watched = prepare(sources, known, before, options.rate_hz)
         link = reader.link
@@ -266,7 +281,7 @@ def run(options: argparse.Namespace, out: TextIO, err: TextIO) -> int:
         else:
             files = [f"kept in {options.out}"] if kept else []
             files += [f"the former file is now {options.out}{in_place.BACKUP_SUFFIX}"] if kept and replaced else []
-            if kept and options.weight_g is not None:
+            if kept and visit.weighed:
                 then = f"python -m train.own {as_typed(options.out)} --recordings FOLDER --out mine"
                 files += wrapped(f"train a model for it alone: {then}", columns())
             kind = "" if link.kind == "device" else f" ({link.kind.upper()})"
@@ -365,33 +380,3 @@ def _serial_number(port: str) -> str | None:
     device, ports = str(Path(port).resolve()), serial_ports()
     number = next((one.serial_number for one in ports if one.path == device), None)
     return number if [one.serial_number for one in ports].count(number) == 1 else None
-
-
-def worst(findings: Iterable[Finding]) -> Verdict:
-    """Return the gravest verdict; "not known" counts as ok."""
-    verdicts = {finding.verdict for finding in findings}
-    return "wrong" if "wrong" in verdicts else "look" if "look" in verdicts else "ok"
-
-
-def summary(findings: Iterable[Finding]) -> str:
-    """Return a short count of the findings that are not ok; "not known" is neither well nor wrong."""
-    count = Counter(finding.verdict for finding in findings)
-    unknown = [f"{count['not known']} not known"] if count["not known"] else []
-    if count["wrong"] or count["look"]:
-        return ", ".join([f"{count['wrong']} wrong", f"{count['look']} to look at", *unknown])
-    return ", ".join(["nothing wrong", *unknown]) if unknown else "all well"
-
-
-def page(findings: Sequence[Finding], columns: int) -> str:
-    """Return all findings as text, those of the link first, in lines of `columns` at most unless a word is wider."""
-    marks = {"ok": "ok", "look": "LOOK", "wrong": "WRONG", "not known": "?"}
-    lines: list[str] = []
-    indent = " " * 8
-    for sensor in dict.fromkeys(finding.sensor for finding in findings):
-        lines.append("link" if sensor is None else f"sensor {sensor}")
-        for finding in (one for one in findings if one.sensor == sensor):
-            norm = f" (norm: {finding.norm})" if finding.norm else ""
-            text = f"{finding.name}: {finding.measured}{norm}"
-            lines += wrapped(text, columns, f"  {marks[finding.verdict]:6}", indent)
-            lines += wrapped(finding.remedy, columns, f"{indent}-> ", f"{indent}   ")
-    return "\n".join(lines)

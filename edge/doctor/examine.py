@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from edge.doctor import link_checks
 from edge.doctor import taxel_checks as taxels
+from edge.doctor.findings import Finding, judged
 from edge.doctor.link_checks import LineFacts
-from edge.doctor.taxel_checks import FEWEST_SCANS, Finding, Samples, judged
+from edge.doctor.taxel_checks import FEWEST_SCANS, Samples
 from edge.errors import UsageError
 from edge.pipeline.source_setup import links_to, refuse_emulated, sensor_settings, stored_baselines, with_recorded
 from edge.validation import check_baselines, check_positive

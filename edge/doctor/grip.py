@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
+from edge.doctor.findings import Finding, judged
 from edge.doctor.guided_press import Weighed
-from edge.doctor.taxel_checks import Finding, judged
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 
 ASK: Final = "Let the gripper close on something firm, so that both pads press it, hold it for two seconds, and open."
@@ -71,10 +71,10 @@ class Grip:
             measured = f"sensor {first} reads {share:.2f} of the newtons of sensor {second}"
             return [*findings, judged("scale in a grip", verdict, measured, "alike within 10 %", off)]
         measured = f"sensor {first} reads {ratio:.2f} of the counts of sensor {second}"
-        off = "sensors differ less: lay a weight on each (--weight-g)"
+        off = "sensors differ less: lay a weight on each"
         scale = judged("scale in a grip", "ok" if 0.6 <= ratio <= 1.67 else "look", measured, "0.6 to 1.67", off)
         if scale.verdict == "ok" and first not in weighed and second not in weighed:
-            remedy = "each of them may read a quarter more or less: lay a weight on one, or on both (--weight-g)"
+            remedy = "each of them may read a quarter more or less: lay a weight on one, or on both"
             scale = Finding("scale in a grip", "not known", measured, "", remedy)
         findings.append(scale)
         if any(one.verdict != "ok" for one in findings):  # a scale from here would look right

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.taxel_checks import Finding, judged
+from edge.doctor.findings import Finding, judged
 from edge.perception.contact_options import OFF_COUNTS, ON_COUNTS
 from firmware_bridge.pad_geometry import USPA44, SensorGeometry
 from firmware_bridge.scans.mounting import Mounting
@@ -153,6 +153,12 @@ class Weighed(NamedTuple):
         return self.counts_per_newton * (1 - self.error), self.counts_per_newton * (1 + self.error)
 
 
+ASK_WEIGHT: Final = (
+    "For forces in newtons, weigh something flat that covers the whole pad. Type its grams and Enter; Enter alone "
+    "leaves it out."
+)
+LIGHTEST_G: Final = 20  # 0.2 N, three times what counts as a contact
+HEAVIEST_G: Final = 4000  # 40 N, the deepest presses of the training
 LEAST_SHARE: Final = 0.25  # of the mean, on the taxel that reads least under a weight that covers the pad
 COVERED_ERROR: Final = 0.08
 PARTLY_ERROR: Final = 0.3
@@ -173,7 +179,7 @@ def judge_force(weighed: Weighed | None, *, kept: bool) -> Finding:
         remedy = "it bears on a part of the pad: lay it on something flat that covers all of it, and weigh both"
         return Finding("force", "look", measured, norm, remedy)
     if not low <= counts_per_newton <= high:
-        remedy = "is the weight as heavy as --weight-g states, and does it lie on the pad alone?"
+        remedy = "is the weight as heavy as was typed, and does it lie on the pad alone?"
         return Finding("force", "look", measured, norm, remedy)
     use = "" if kept else f"edge-sr --counts-per-newton {counts_per_newton:.0f}"
     return Finding("force", "ok", measured, norm, use)
@@ -191,8 +197,8 @@ class Reading(NamedTuple):
     time_s: float
 
 
-class _SkippedError(Exception):
-    """Raised in a dialogue where the person skips the request."""
+class _TypedError(Exception):
+    """Raised in a dialogue with the line that the person types; it leaves a request out that asks for no line."""
 
 
 T = TypeVar("T")
@@ -200,27 +206,27 @@ Dialogue = Generator[str | None, Reading, T]
 
 
 class GuidedPress:
-    """Dialogue that asks a person for four presses on corners, one after the other, then for a weight.
+    """Dialogue that asks a person for four presses on corners, one after the other, then to lay a weight on the pad.
 
     Attributes:
         first: the first request.
         done: True when there are no more requests.
         presses: those that were felt.
+        weight_g: mass of the weight in [g]; None where there is none.
         weighed: counts per newton of the summed z, where a weight was laid on; else None.
     """
 
-    def __init__(
-        self, weight_g: float | None = None, geometry: SensorGeometry = USPA44, z_noise_counts: float = 0.0
-    ) -> None:
-        """Prepare to ask; a weight is asked for where `weight_g` holds its mass in [g].
+    def __init__(self, geometry: SensorGeometry = USPA44, *, weigh: bool = False, z_noise_counts: float = 0.0) -> None:
+        """Prepare to ask, with `weigh` for a weight, too.
 
         `z_noise_counts` is the standard deviation of the free pad's summed z, which it has under a still weight, too.
         """
         self.done = False
         self.presses: list[Press] = []
+        self.weight_g: float | None = None
         self.weighed: Weighed | None = None
         self._held: NDArray[np.float32] = np.zeros(geometry.scan_shape, dtype=np.float32)
-        self._dialogue = self._all(geometry.corners, weight_g, z_noise_counts)
+        self._dialogue = self._all(geometry.corners, weigh, z_noise_counts)
         self.first: Final = next(self._dialogue) or ""
 
     def push(self, zeroed: NDArray[np.float32], time_s: float) -> str | None:
@@ -231,9 +237,9 @@ class GuidedPress:
         self._held = np.where(np.isnan(zeroed), self._held, zeroed)
         return self._go_on(lambda: self._dialogue.send(Reading(self._held, time_s)))
 
-    def skip(self) -> str | None:
-        """Leave the open request out; returns the next one, or None."""
-        return self._go_on(lambda: self._dialogue.throw(_SkippedError()))
+    def type(self, line: str = "") -> str | None:
+        """Take a line: an answer, or Enter alone, which leaves the open request out; returns the next one, or None."""
+        return self._go_on(lambda: self._dialogue.throw(_TypedError(line)))
 
     @property
     def felt(self) -> float:
@@ -245,24 +251,26 @@ class GuidedPress:
             return None
         try:
             return step()
-        except (StopIteration, _SkippedError):  # a dialogue without another way ends where it is skipped
+        except (StopIteration, _TypedError):  # a dialogue without another way ends where it is skipped
             self.done = True
             return None
 
-    def _all(self, corners: Sequence[int], weight_g: float | None, z_noise_counts: float) -> Dialogue[None]:
+    def _all(self, corners: Sequence[int], weigh: bool, z_noise_counts: float) -> Dialogue[None]:
         for place, name in zip(corners, CORNERS, strict=True):
             try:
                 press = yield from _corner(place, name)
-            except _SkippedError:
+            except _TypedError:
                 # A finger that is still there would be taken for one on the next corner.
                 if (yield from _wait("Skipped. Let go.", _free, FREE_SCANS)) is None:
-                    break
+                    return
                 continue
             if press is None:  # nobody is there, or nothing is felt: three corners are enough, and fewer settle nothing
-                break
+                return
             self.presses.append(press)
-        if weight_g is not None:
-            self.weighed = yield from _weigh(weight_g, z_noise_counts)
+        if weigh:
+            self.weight_g = yield from _mass_g()
+        if self.weight_g is not None:
+            self.weighed = yield from _weigh(self.weight_g, z_noise_counts)
 
 
 def _corner(place: int, name: str) -> Dialogue[Press | None]:
@@ -289,6 +297,30 @@ def _corner(place: int, name: str) -> Dialogue[Press | None]:
         push = (float(x), float(y))
     yield from _wait("Good. Let go." if push else "No push was measured. Let go.", _free, FREE_SCANS)
     return Press(place, taxel, float(mean[2].sum()), push)
+
+
+def _mass_g() -> Dialogue[float | None]:
+    """Ask for the mass of a weight, in [g]; None where there is none, or nobody answers."""
+    request = ASK_WEIGHT
+    while True:
+        try:
+            yield from _wait(request, lambda _: False, 1)
+            return None
+        except _TypedError as typed:
+            line = str(typed).strip()
+            if not line:
+                return None
+            mass_g = _number(line)
+            if LIGHTEST_G <= mass_g <= HEAVIEST_G:
+                return mass_g
+            request = f"{line!r} is not a mass of {LIGHTEST_G} to {HEAVIEST_G} grams. {ASK_WEIGHT}"
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
 
 
 def _weigh(weight_g: float, z_noise_counts: float) -> Dialogue[Weighed | None]:

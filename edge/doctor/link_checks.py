@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from edge.doctor.taxel_checks import Finding, Samples, graded, judged
+from edge.doctor.findings import Finding, graded, judged
+from edge.doctor.taxel_checks import Samples
 from firmware_bridge.links.base import Link
 from firmware_bridge.links.serial_ports import LATENCY_ROOT, latency_timer_ms
 from firmware_bridge.pad_geometry import USPA44

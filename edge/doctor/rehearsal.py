@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from edge.doctor.guided_press import CORNERS
+from edge.doctor.guided_press import ASK_WEIGHT, CORNERS
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.recording.tracks import Recording, Track
@@ -17,6 +17,7 @@ WATCHED_S: Final = 5.0  # for which the free pad is watched
 _LATE_S: Final = 1.0  # from a request to what a person does
 _PRESS_COUNTS: Final = 5000.0  # summed z of a press
 _COUNTS_PER_N: Final = 1176.0  # of the average sensor
+_WEIGHT_G: Final = 200.0
 _NOISE_COUNTS: Final = 2.0
 _RATE_HZ: Final = 100.0
 
@@ -24,9 +25,9 @@ _RATE_HZ: Final = 100.0
 class Rehearsal(Emulator):
     """Emulated adapter on `port`, with a pad that does what is asked: no reading of it is taken for a device's."""
 
-    def __init__(self, weight_g: float | None) -> None:
-        """Prepare a pad on which a weight in [g] may be laid."""
-        self._newtons = 0.0 if weight_g is None else weight_g / 1000 * 9.80665
+    def __init__(self) -> None:
+        """Prepare the free pad."""
+        self._typed: str | None = None
         self._load = self._next = np.zeros(USPA44.scan_shape)
         self._next_s = 0.0
         rest = np.array([32_700, 32_800, 37_400])[:, None, None] + 37 * np.arange(16).reshape(4, 4)
@@ -45,8 +46,15 @@ class Rehearsal(Emulator):
             row, col = np.unravel_index(z.argmax(), z.shape)
             load[:] = 0.2 * z * (1 if col < 2 else -1), 0.2 * z * (1 if row < 2 else -1), z
         elif request.startswith("Lay"):
-            load[2] = self._newtons * _COUNTS_PER_N / USPA44.taxel_count
+            load[2] = _WEIGHT_G / 1000 * 9.80665 * _COUNTS_PER_N / USPA44.taxel_count
+        elif request.endswith(ASK_WEIGHT):
+            self._typed = f"{_WEIGHT_G:g}"
         self._next_s, self._next = time.monotonic() + _LATE_S, load
+
+    def typed_line(self) -> str | None:
+        """Return what is typed since the last call, or None."""
+        line, self._typed = self._typed, None
+        return line
 
     def _scans(self, track: Track) -> Iterator[NDArray[np.int32]]:
         noise = np.random.default_rng(0)

@@ -1,12 +1,12 @@
-"""Findings, checks of the taxels of one sensor, and the statistics of its scans that they judge. No I/O, no clock."""
+"""Checks of the taxels of one sensor, and the statistics of its scans that they judge. No I/O, no clock."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge.doctor.findings import Finding, graded, judged
 from edge.perception.contact_options import OFF_COUNTS
 from edge.perception.taps import NOISE_COUNTS
 from edge.perception.taxel_health import RANGE_ENDS
@@ -17,31 +17,6 @@ from firmware_bridge.zeroing.baseline import COUNTS_ON_CIRCLE, CREEP_LIMIT_COUNT
 
 AROUND: Final = 16  # scans before and after a scan that show whether it alone was late
 FEWEST_SCANS: Final = 50
-
-
-Verdict = Literal["ok", "look", "wrong", "not known"]
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Finding on one thing that was examined; "look" is for what works but may not for long."""
-
-    name: str
-    verdict: Verdict
-    measured: str  # with its unit
-    norm: str = ""  # expected range; empty where that goes without saying
-    remedy: str = ""  # in plain words; empty where there is nothing to do
-    sensor: str | None = None  # its name; None for the link
-
-
-def judged(name: str, verdict: Verdict, measured: str, norm: str, remedy: str) -> Finding:
-    """Return a finding, which has a remedy unless all is well."""
-    return Finding(name, verdict, measured, norm, "" if verdict == "ok" else remedy)
-
-
-def graded(value: float, look: float, wrong: float) -> Verdict:
-    """Return the verdict on a value of which less is better, by the largest values that are "ok" and "look"."""
-    return "ok" if value <= look else "look" if value <= wrong else "wrong"
 
 
 class Samples:

@@ -6,7 +6,9 @@ import os
 import re
 import signal
 import time
+from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from itertools import chain, repeat
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +22,7 @@ from edge.api import load_sensor_file
 from edge.cli import main as cli
 from edge.cli.main import parser
 from edge.doctor import command, examine
-from edge.doctor.guided_press import orders
+from edge.doctor.guided_press import ASK_WEIGHT, orders
 from firmware_bridge.emulation.slcan_emulator import Emulator
 from firmware_bridge.links.serial_ports import Port
 from firmware_bridge.recording.tracks import Recording, Track
@@ -28,18 +30,22 @@ from firmware_bridge.scans.mounting import Mounting
 
 
 class Terminal(io.StringIO):
-    """Terminal that shows prompts to a person."""
+    """Terminal that shows prompts to people, who type a line of `typed`, or Enter alone, where grams are asked for."""
 
-    def __init__(self, *people: Person) -> None:
+    def __init__(self, people: Sequence[Person] = (), typed: Sequence[str] = ()) -> None:
         super().__init__()
-        self._people = people
+        self._people, self._typed = people, chain(typed, repeat(""))
+        self.keyboard, self.stdin = os.openpty()
 
     def isatty(self) -> bool:
         return bool(self._people)
 
     def write(self, text: str) -> int:
         for person in self._people:
-            person.hear(text)
+            if (line := person.hear(text)) is not None:
+                os.write(self.keyboard, line.encode() + b"\n")
+        if text == "\n" and " ".join(self.getvalue().split()).endswith(ASK_WEIGHT):
+            os.write(self.keyboard, next(self._typed).encode() + b"\n")
         return super().write(text)
 
 
@@ -60,10 +66,14 @@ def doctor(port, *arguments, **settings):
     return done
 
 
-def look(port, *arguments, drift_s=0.7, people=()):
+class _Stdin(redirect_stdout):
+    _stream = "stdin"
+
+
+def look(port, *arguments, drift_s=0.7, people=(), typed=()):
     """Return the exit code, the output, and the prompts to the people."""
-    out, err = io.StringIO(), Terminal(*people)
-    with redirect_stdout(out), redirect_stderr(err):
+    out, err = io.StringIO(), Terminal(people, typed)
+    with redirect_stdout(out), redirect_stderr(err), _Stdin(os.fdopen(err.stdin)), os.fdopen(err.keyboard):
         rate = () if "--rate-hz" in arguments else ("--rate-hz", 200)
         asked = ("--source", f"slcan:{port}", "--drift-s", drift_s, *rate, *arguments)
         code = cli.main(["doctor", *map(str, asked)])
@@ -106,8 +116,8 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
     person = Person(sits)
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         monkeypatch.setenv("COLUMNS", "40")
-        asked = ("--rate-hz", 400, "--weight-g", 200, "--out", file)
-        done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
+        asked = ("--rate-hz", 400, "--out", file)
+        done = doctor(emulator.port, *asked, people=[person], typed=["0.2", "200"], drift_s=0.4)
     assert "taxel order: turned" in done.out, done.out
     shown = re.sub(re.escape(str(file)) + r"|\x1b\[K|" + emulator.port, "", done.out + done.err).splitlines()
     assert [line for line in shown if len(line) > 40] == []
@@ -133,7 +143,7 @@ def test_a_person_finds_order_axes_and_force_which_the_next_run_goes_by(monkeypa
 def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
     file, out, err = tmp_path / "practice.toml", io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
-        code = cli.main(["doctor", "--rehearse", "--weight-g", "200", "--out", str(file), "--json"])
+        code = cli.main(["doctor", "--rehearse", "--out", str(file), "--json"])
     found = {one["name"]: one["verdict"] for one in json.loads(out.getvalue())["findings"]}
     assert code == 0 and found["taxel order"] == found["axis signs"] == found["force"] == "ok", out.getvalue()
     assert err.getvalue().count("Still pressing") == 4 and "Lay 200 g" in err.getvalue()
@@ -146,8 +156,8 @@ def test_a_rehearsal_needs_no_sensor_and_gives_none_away(tmp_path):
 def test_two_sensors_are_pressed_one_after_the_other_and_compared_in_a_grip():
     people = [Person(Mounting(orders()["turned by 180 degrees clockwise"])), Person(grip_counts=5000, z_noise_counts=6)]
     with Emulator([recording(*people, rate_hz=120.0)], jitter_s=0.0) as emulator:
-        asked = ("--json", "--rate-hz", 120, "--weight-g", 200)
-        done = doctor(emulator.port, *asked, people=people, drift_s=1.2)
+        asked = ("--json", "--rate-hz", 120)
+        done = doctor(emulator.port, *asked, people=people, typed=["200", "200"], drift_s=1.2)
     findings = json.loads(done.out)["findings"]
     found = {(one["sensor"], one["name"]): one["verdict"] for one in findings}
     assert done.code == 1 and found["4", "taxel order"] == "wrong" and found["6", "taxel order"] == "ok"
@@ -170,46 +180,46 @@ def examined(open_link, *arguments, out=None, err=None):
 def test_a_sensor_that_falls_silent_while_it_is_pressed(limits):
     limits(command, GIVEN_UP_S=0.3)
     link = FakeLink([as_scans(healthy_counts())], endless=True)
-    code, out = examined(lambda: link, "--drift-s", 0.1, "--json", err=Terminal(Person()))
+    code, out = examined(lambda: link, "--drift-s", 0.1, "--json", err=Terminal([Person()]))
     settled = {one["name"]: one["verdict"] for one in json.loads(out)["findings"]}
     assert code == 1
     assert settled["guided press"] == "wrong" and settled["taxel order"] == "not known"
 
 
 class Impatient(Person):
-    """Presses the first two corners, then types what they were given."""
+    """Presses the first two corners, and types Enter at the others, and before anything is asked."""
 
-    def __init__(self, type_now) -> None:
-        super().__init__()
-        self._type_now = type_now
-
-    def hear(self, text: str) -> None:
+    def hear(self, text: str) -> str | None:
         if "bottom" in text and "corner" in text:
-            self._type_now()
-        else:
-            super().hear(text)
+            return self.at_the_bottom()
+        super().hear(text)
+        return "" if "watching for" in text else None  # which is no answer
+
+    def at_the_bottom(self) -> str | None:
+        return ""
 
 
-def test_enter_skips_a_request_and_what_is_not_measured_is_no_success(stdin):
+def test_enter_skips_a_request_and_what_is_not_measured_is_no_success():
     """At the keyboard of a real pseudo-terminal; the felt load is shown meanwhile."""
-    leader, follower = os.openpty()
-    with os.fdopen(follower) as keyboard:
-        stdin(keyboard)
-        os.write(leader, b"\n")  # before anything is asked: no answer to it
-        person = Impatient(lambda: os.write(leader, b"\n"))
-        with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
-            asked = ("--rate-hz", 400, "--json")
-            done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
-    os.close(leader)
+    person = Impatient()
+    with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
+        asked = ("--rate-hz", 400, "--json")
+        done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
     settled = {one["name"]: (one["verdict"], one["measured"]) for one in json.loads(done.out)["findings"]}
     assert settled["taxel order"] == ("not known", "2 of 4 corners measured")
+    assert settled["force"] == ("not known", "no weight was laid on")
     assert done.err.count("Skipped. Let go.") == 2 and done.code == 1
     assert re.search(r"\rfelt \[[# ]{10}\] (60|59) s left, Enter skips", done.err)
 
 
+class Leaving(Impatient):
+    def at_the_bottom(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
 def test_ctrl_c_at_a_request_keeps_the_baseline(tmp_path):
     file = tmp_path / "s.toml"
-    person = Impatient(lambda: signal.raise_signal(signal.SIGINT))
+    person = Leaving()
     with Emulator([recording(person, rate_hz=400.0)], jitter_s=0) as emulator:
         asked = ("--rate-hz", 400, "--out", file)
         done = doctor(emulator.port, *asked, people=[person], drift_s=0.4)
@@ -244,7 +254,7 @@ def test_the_serial_number_of_the_adapter_is_kept(plugged, tmp_path):
 
 
 def test_a_recording_is_examined_but_not_pressed(tmp_path):
-    out, err = io.StringIO(), Terminal(Person())
+    out, err = io.StringIO(), Terminal([Person()])
     write_recording(tmp_path / "r.npz", [0] * 150)
     kept = tmp_path / "sensor.toml"
     with redirect_stdout(out), redirect_stderr(err):

@@ -12,8 +12,8 @@ from test_doctor_command import doctor, examined, recording
 
 from edge.api import Baseline, Pad, SensorFileError, Source
 from edge.cli.main import main
-from edge.doctor.command import check_writable, keep, summary
-from edge.doctor.taxel_checks import Finding
+from edge.doctor.command import check_writable, keep
+from edge.doctor.findings import Finding, summary
 from edge.pipeline.gain_keeper import keep_learned
 from edge.pipeline.source_setup import refuse_emulated
 from firmware_bridge.emulation.slcan_emulator import Emulator

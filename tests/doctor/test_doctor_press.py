@@ -8,21 +8,31 @@ from doctor_samples import finger, visit
 
 from edge.doctor import guided_press
 from edge.doctor.grip import Grip
-from edge.doctor.guided_press import GuidedPress, Press, Weighed, find_order, judge_force, judge_press, orders
+from edge.doctor.guided_press import (
+    ASK_WEIGHT,
+    GuidedPress,
+    Press,
+    Weighed,
+    find_order,
+    judge_force,
+    judge_press,
+    orders,
+)
 from firmware_bridge.pad_geometry import USPA44
 from firmware_bridge.scans.mounting import Mounting
 
 CORNERS = USPA44.corners
 
 
-def answer_to(deformations, guide=None, period_s=0.01):
-    """Return the questions of a guide, and the guide, for these deformations (n, 3, 4, 4)."""
-    guide = guide or GuidedPress()
+def answer_to(deformations, guide=None, period_s=0.01, typed=()):
+    """Return the questions of a guide, and the guide, for these deformations (n, 3, 4, 4); grams are `typed`."""
+    guide, lines = guide or GuidedPress(weigh=bool(typed)), list(typed)
     asked = [guide.first]
     for number, zeroed in enumerate(deformations):
         ask = guide.push(zeroed.astype(np.float32), number * period_s)
-        if ask is not None:
+        while ask is not None:
             asked.append(ask)
+            ask = guide.type(lines.pop(0)) if ask.endswith(ASK_WEIGHT) and lines else None
     return asked, guide
 
 
@@ -50,7 +60,7 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
     pressed = np.stack([np.zeros((4, 4)), np.zeros((4, 4)), finger(0)])
     answer_to([pressed] * 10, guide)
     assert guide.felt > 1
-    assert guide.skip() == "Skipped. Let go."
+    assert guide.type() == "Skipped. Let go."
     more, _ = answer_to([pressed] * 40, guide)
     assert more[1:] == [], "the finger is still there"
     rest = visit()
@@ -62,9 +72,9 @@ def test_a_skipped_corner_is_left_out_and_its_finger_is_not_taken_for_the_next()
     assert mounting == Mounting()
     ended = GuidedPress()
     for _ in range(4):
-        ended.skip()
+        ended.type()
         answer_to([np.zeros((3, 4, 4))] * 25, ended)
-    assert ended.done and ended.skip() is None and not ended.presses
+    assert ended.done and ended.type() is None and not ended.presses
 
 
 def press(place, taxel=None, z=4000.0, push=(500.0, 500.0)):
@@ -149,7 +159,7 @@ class TestPerson:
         laid[:, 2] = z_counts * share + np.random.default_rng(0).normal(0, 1, (120, 4, 4))
         laid[:20, 2] *= np.linspace(0, 1, 20)[:, None, None]
         script = [*visit(), *laid, *np.zeros((30, 3, 4, 4))]
-        asked, guide = answer_to(script, GuidedPress(weight_g=200.0))
+        asked, guide = answer_to(script, typed=["200"])
         assert asked[-2:] == ["Lay 200 g on the pad, flat and covering all of it, hands off.", "Good. Take it off."]
         assert guide.weighed == pytest.approx((z_counts / 1.96133, error), rel=0.02)
         assert judge_force(guide.weighed, kept=False).verdict == verdict
@@ -157,7 +167,7 @@ class TestPerson:
     def test_an_unsteady_weight_gives_none(self):
         laid = np.zeros((7000, 3, 4, 4))
         laid[:, 2] = (200 + 40 * (np.arange(7000) % 2))[:, None, None]
-        _, guide = answer_to([*visit(), *laid], GuidedPress(weight_g=200.0))
+        _, guide = answer_to([*visit(), *laid], typed=["200"])
         assert guide.done and judge_force(guide.weighed, kept=False).verdict == "not known"
 
     @pytest.mark.parametrize(
@@ -176,10 +186,18 @@ class TestPerson:
             laid = np.random.default_rng(seed).normal(0, noise, (400, 3, 4, 4))
             laid[:, 2] += 147.1 * share[:, None, None]
             _, guide = answer_to(
-                [*visit(), *laid, *np.zeros((30, 3, 4, 4))], GuidedPress(200.0, z_noise_counts=4 * noise)
+                [*visit(), *laid, *np.zeros((30, 3, 4, 4))],
+                GuidedPress(weigh=True, z_noise_counts=4 * noise),
+                typed=["200"],
             )
             assert (guide.weighed is not None) is steady, seed
             assert not steady or guide.weighed == pytest.approx((1200.0, 0.08), rel=0.01)
+
+    @pytest.mark.parametrize("wrong", ["0.2", "19", "4001", "nan", "-200", "200 g", "\x1b[2J"])
+    def test_what_is_no_mass_in_grams_is_asked_again(self, wrong):
+        asked, guide = answer_to(visit(), typed=[wrong, " 200 "])
+        assert asked[-2].startswith(f"{wrong!r} is not a mass of 20 to 4000 grams.") and guide.weight_g == 200
+        assert answer_to(visit(), typed=[wrong, ""])[1].weight_g is None
 
     def test_a_torn_scan_is_not_taken_for_letting_go(self):
         script = visit(rest=25)

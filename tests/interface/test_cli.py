@@ -38,6 +38,13 @@ def test_a_sensor_gets_the_model_of_one_tap_unless_asked_and_the_demo_that_of_po
 
 
 class TestHelp:
+    def test_the_short_help_has_the_usual_options_on_one_screen(self, capsys):
+        assert cli.main(["-h"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        options = [line.split()[0] for line in lines if line.startswith("  --")]
+        assert options == ["--version", "--source", "--sensor", "--model", "--sink", "--duration-s", "--view"]
+        assert len(lines) < 60 and lines[-1].startswith("edge-sr --help lists all options")
+
     def test_help_fits_the_terminal_and_80_columns(self, capsys, monkeypatch):
         for columns, most in (("1", 40), ("40", 40), ("80", 80), ("200", 80)):
             monkeypatch.setenv("COLUMNS", columns)

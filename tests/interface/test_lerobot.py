@@ -127,13 +127,14 @@ def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plu
     pattern = np.zeros((40, 40), dtype=np.float32)
     pattern[3, 7], pattern[0, 0], pattern[1, 1] = 0.15, -0.1, 9.0
     one = replace(pressed, pattern=pattern, deviation=pattern / 10, trusted=True)
-    image = observation.image_of(one, contract, 0.3)
+    rendering = observation.Rendering()
+    image = rendering.image_of(one, contract)
     assert image[3, 7].tolist() == [128, 13, 255] and image[0, 0, 0] == 0 and image[1, 1, 0] == 255
     for doubt in ({"trusted": False}, {"trusted": None}, {"state": "baseline_in_doubt", "contact": None}):
-        assert observation.image_of(replace(one, **doubt), contract, 0.3)[..., 2].max() == 0
-    assert observation.image_of(replace(free, pattern=None), contract, 0.3)[..., 2].min() == 255, "nothing touches"
+        assert rendering.image_of(replace(one, **doubt), contract)[..., 2].max() == 0
+    assert rendering.image_of(replace(free, pattern=None), contract)[..., 2].min() == 255, "nothing touches"
     unknown = replace(one, pattern=None, deviation=None, contact=None, zeroed=None, wrench=None, state="zeroing")
-    assert not observation.image_of(unknown, contract, 0.3).any()
+    assert not rendering.image_of(unknown, contract).any()
     state = observation.state_of(replace(pressed, trusted=True), contract)
     assert [state[name] for name in observation.WRENCH] == [*pressed.wrench.force_n, *pressed.wrench.torque_n_mm]
     assert state["taxel_z_5"] == pressed.zeroed[2, 1, 1] and state["believed"] == 1
@@ -144,21 +145,42 @@ def test_images_have_a_fixed_range_and_say_where_they_are_not_to_be_believed(plu
     assert (state["taxel_x_0"], state["believed"]) == (0.0, 0.0)
 
 
+def test_forces_are_drawn_as_the_paxini_plugin_draws_them(plugin):
+    observation = importlib.import_module("lerobot_camera_tactile_sr.observation")
+    contract = make_contract(traction_scale=2)
+    traction = np.zeros((3, 8, 8), dtype=np.float32)
+    traction[:, 2, 5] = np.array([-2.0, 1.0, 7.0]) * 1000 / contract.pitch_mm**2  # N on a taxel's area
+    one = replace(make_wrench_result(), traction=traction, trusted=True)
+    drawn = observation.Rendering("vector_rgb", force_max_n=5.0)
+    image = drawn.image_of(one, contract, zoom=2)
+    assert image.shape == (80, 80, 3) and (image[20:30, 50:60] == (77, 153, 255)).all()
+    assert (np.delete(image, slice(50, 60), axis=1) == 128).all()
+    for doubt in ({"trusted": False}, {"state": "baseline_in_doubt", "contact": None}, {"traction": None}):
+        assert (drawn.image_of(replace(one, **doubt), contract) == 128).all()
+    for wrong, told in (
+        ({"render": "heatmap"}, "'heatmap', expected one of pattern, vector_rgb"),
+        ({"force_max_n": 0}, "0"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            camera_of(plugin, **wrong)
+
+
 def test_a_recording_becomes_frames_at_the_dataset_s_rate(plugin):
     to_dataset = importlib.import_module("lerobot_camera_tactile_sr.to_dataset")
     model = load_model("stsr-int8")
     results = to_dataset.results_of(demo_recording(), model)
-    scans = to_dataset.scans_in_frame(results, 10)
-    frames = list(to_dataset.frames_of(results, 10, model.contract, 0.3, scans))
+    scans, rendering = to_dataset.scans_in_frame(results, 10), to_dataset.Rendering()
+    frames = list(to_dataset.frames_of(results, 10, model.contract, rendering, scans))
     features = to_dataset.features_of(frames[0][0], model.contract, "image", scans)
     for sensors, frame in frames:
         assert frame.keys() == features.keys() and sensors == frames[0][0]
         for key, values in frame.items():
             assert values.shape == features[key]["shape"], key
-    touched = [frame[to_dataset.image_key(frames[0][0][0])][..., 0].max() for _, frame in frames]
+    touched = [frame[to_dataset.key_of("images", frames[0][0][0])][..., 0].max() for _, frame in frames]
     assert min(touched) == 0 and max(touched) > 100
-    names = features["observation.state"]["names"]
-    assert len(names) == len(set(names)) == frames[0][1]["observation.state"].size
+    (numbers,) = (key for key in features if key.startswith("observation.tactile."))
+    names = features[numbers]["names"]
+    assert len(names) == len(set(names)) == frames[0][1][numbers].size
     readings = np.array([result.zeroed.ravel() for result in results if result.zeroed is not None])
     windows = np.stack([frame["observation.tactile_window"] for _, frame in frames])
     assert (windows[0] == windows[0, 0]).all(), "the first reading stands for those before it"
@@ -178,7 +200,7 @@ def test_lerobot_loads_the_dataset_that_it_was_given(plugin, tmp_path):
     images = np.stack([dataset[index][key].numpy() for index in range(dataset.num_frames)])
     assert images.shape[1:] == (3, 40, 40) and images[:, 0].max() > 0.4
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
-    assert info["features"]["observation.state"]["dtype"] == "float32"
+    assert info["features"]["observation.tactile.4"]["dtype"] == "float32"
     assert dataset[5]["observation.tactile_window"].shape == (10, 48)
 
 

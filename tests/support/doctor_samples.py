@@ -70,8 +70,8 @@ class Person:
         self._noise_counts = np.array([2, 2, z_noise_counts])[:, None, None]
         self._rng = np.random.default_rng(7)
 
-    def hear(self, text: str) -> None:
-        """Do what a request says."""
+    def hear(self, text: str) -> str | None:
+        """Do what a request says, and return a line to type, if any."""
         for place, corner in zip(USPA44.corners, CORNERS, strict=True):
             if f"the {corner} corner" in text:
                 self._place = place
@@ -86,6 +86,7 @@ class Person:
             self._gripped = 150
         if "et go" in text or "Take it off" in text:
             self._felt = self._free
+        return None
 
     def deformation(self) -> np.ndarray:
         """Return what the wire has over its rest, noiseless, (3, 4, 4)."""

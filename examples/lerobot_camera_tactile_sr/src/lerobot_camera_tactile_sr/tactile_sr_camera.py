@@ -23,7 +23,7 @@ from edge.api import (
     open_runtime,
     open_source,
 )
-from lerobot_camera_tactile_sr.observation import image_of, state_names, state_of, taxels_of, window_of
+from lerobot_camera_tactile_sr.observation import Rendering, state_names, state_of, taxels_of, window_of
 
 
 @CameraConfig.register_subclass("tactile_sr")
@@ -39,12 +39,13 @@ class TactileSrCameraConfig(CameraConfig):
     name: str | None = None  # of the sensor where the source has several
     model: str = DEFAULT_MODEL  # name of a bundled model, or a file
     window_scans: int = 4  # scans of read_window: at 100 a second, all that come within a frame of 1/30 s
-    full_scale_mm: float = 0.3  # deformation and deviation at 255; it is fixed, so that images can be compared
+    render: str = "pattern"  # or vector_rgb; see `observation.Rendering`
+    full_scale_mm: float = 0.3
+    force_max_n: float = 5.0
     pretend: bool = False  # accept emulated sensors and recordings, on which no robot may act
 
     def __post_init__(self) -> None:
-        if not self.full_scale_mm > 0:
-            raise ValueError(f"full_scale_mm is {self.full_scale_mm}, expected a number above 0")
+        self.rendering = Rendering(self.render, self.full_scale_mm, self.force_max_n)
         if self.window_scans < 1:
             raise ValueError(f"window_scans is {self.window_scans}, expected 1 or more")
 
@@ -119,7 +120,7 @@ class TactileSrCamera(Camera):
             raise
 
     def read(self) -> NDArray[np.uint8]:
-        """Return the image of the next scan; see `observation.image_of`. Raises as `async_read` does."""
+        """Return the image of the next scan; see `observation.Rendering`. Raises as `async_read` does."""
         with self._changed:
             self._fresh = False
         return self.async_read(1000.0)
@@ -183,7 +184,7 @@ class TactileSrCamera(Camera):
             return self._newest
 
     def _image(self, result: Result) -> NDArray[np.uint8]:
-        return image_of(result, self._contract, self.config.full_scale_mm, self._zoom)
+        return self.config.rendering.image_of(result, self._contract, self._zoom)
 
     def _wait(self, satisfied: Any, timeout_s: float) -> None:
         if not self.is_connected:

@@ -24,25 +24,25 @@ from edge.api import (
     open_recording,
     open_runtime,
 )
-from lerobot_camera_tactile_sr.observation import AXES, image_of, state_names, state_of, taxels_of, window_of
+from lerobot_camera_tactile_sr.observation import AXES, RENDERS, Rendering, state_names, state_of, taxels_of, window_of
 
-STATE = "observation.state"
 WINDOW = "observation.tactile_window"
 
 
-def image_key(sensor: str) -> str:
-    """Return the feature of a sensor's images; LeRobot refuses a slash in names."""
-    return f"observation.images.{sensor.replace('/', '_')}"
+def key_of(kind: str, sensor: str) -> str:
+    """Return the feature of a sensor's "images", or of its numbers, "tactile"; LeRobot refuses a slash in names."""
+    return f"observation.{kind}.{sensor.replace('/', '_')}"
 
 
 def features_of(sensors: Sequence[str], contract: Contract, dtype: str, scans: int) -> dict[str, dict[str, Any]]:
     """Return the features of a dataset, as `LeRobotDataset.create` takes them, with so many scans in a frame."""
     image = {"dtype": dtype, "shape": (*contract.pattern_shape, 3), "names": ["height", "width", "channels"]}
-    names = [f"{sensor}.{name}" for sensor in sensors for name in state_names(contract)]
-    state = {"dtype": "float32", "shape": (len(names),), "names": names}
+    names = state_names(contract)
+    numbers = {"dtype": "float32", "shape": (len(names),), "names": names}
     channels = len(AXES) * contract.rows * contract.cols * len(sensors)
     window = {"dtype": "float32", "shape": (scans, channels), "names": ["scan", "channel"]}
-    return {STATE: state, WINDOW: window} | {image_key(sensor): image for sensor in sensors}
+    kinds = {"tactile": numbers, "images": image}
+    return {WINDOW: window} | {key_of(kind, sensor): one for kind, one in kinds.items() for sensor in sensors}
 
 
 def results_of(path: Path, model: Any) -> list[Result]:
@@ -61,7 +61,7 @@ def scans_in_frame(results: Sequence[Result], fps: int) -> int:
 
 
 def frames_of(
-    results: Sequence[Result], fps: int, contract: Contract, full_scale_mm: float, scans: int
+    results: Sequence[Result], fps: int, contract: Contract, rendering: Rendering, scans: int
 ) -> Iterator[tuple[list[str], dict[str, Any]]]:
     """Yield the sensors and the frame of each instant, from when every sensor is zeroed.
 
@@ -73,7 +73,7 @@ def frames_of(
     due_ns: int | None = None
     for result in results:
         while due_ns is not None and result.scan.time_ns > due_ns:
-            yield sensors, _frame([newest[sensor] for sensor in sensors], readings, contract, full_scale_mm)
+            yield sensors, _frame([newest[sensor] for sensor in sensors], readings, contract, rendering)
             due_ns += round(1e9 / fps)
         if result.zeroed is not None:
             newest[result.scan.sensor] = result
@@ -83,12 +83,14 @@ def frames_of(
 
 
 def _frame(
-    results: Sequence[Result], readings: dict[str, deque[Any]], contract: Contract, full_scale_mm: float
+    results: Sequence[Result], readings: dict[str, deque[Any]], contract: Contract, rendering: Rendering
 ) -> dict[str, Any]:
-    state = [number for result in results for number in state_of(result, contract).values()]
-    images = {image_key(one.scan.sensor): image_of(one, contract, full_scale_mm) for one in results}
-    window = np.concatenate([window_of(kept) for kept in readings.values()], axis=1)
-    return {STATE: np.array(state, dtype=np.float32), WINDOW: window, **images}
+    frame: dict[str, Any] = {WINDOW: np.concatenate([window_of(kept) for kept in readings.values()], axis=1)}
+    for result in results:
+        numbers = list(state_of(result, contract).values())
+        frame[key_of("tactile", result.scan.sensor)] = np.array(numbers, dtype=np.float32)
+        frame[key_of("images", result.scan.sensor)] = rendering.image_of(result, contract)
+    return frame
 
 
 def convert(
@@ -99,10 +101,10 @@ def convert(
     fps: int,
     root: Path | None = None,
     model: str = DEFAULT_MODEL,
-    full_scale_mm: float = 0.3,
     video: bool = False,
+    **rendering: Any,
 ) -> int:
-    """Write a dataset, and return the number of its frames.
+    """Write a dataset, with images by the arguments of `Rendering`, and return the number of its frames.
 
     Raises:
         BridgeError: a recording cannot be used.
@@ -110,11 +112,11 @@ def convert(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    loaded, dataset, known, count, scans = load_model(model), None, None, 0, 0
+    drawn, loaded, dataset, known, count, scans = Rendering(**rendering), load_model(model), None, None, 0, 0
     for path in recordings:
         before, results = count, results_of(path, loaded)
         scans = scans or scans_in_frame(results, fps)
-        for sensors, frame in frames_of(results, fps, loaded.contract, full_scale_mm, scans):
+        for sensors, frame in frames_of(results, fps, loaded.contract, drawn, scans):
             if dataset is None:
                 features = features_of(sensors, loaded.contract, "video" if video else "image", scans)
                 dataset = LeRobotDataset.create(
@@ -143,6 +145,8 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--fps", type=int, default=30, metavar="N", help="frames a second (%(default)s)")
     parser.add_argument("--root", type=Path, metavar="FOLDER", help="new folder of the dataset; by default LeRobot's")
     parser.add_argument("--model", default=DEFAULT_MODEL, metavar="M", help="model that makes the patterns")
+    parser.add_argument("--render", choices=RENDERS, default=RENDERS[0], help="what images show (%(default)s)")
+    parser.add_argument("--force-max-n", type=float, default=5.0, metavar="N", help="force at full scale of vector_rgb")
     parser.add_argument("--full-scale-mm", type=float, default=0.3, metavar="MM", help="deformation that is 255")
     parser.add_argument("--video", action="store_true", help="images as video, which is smaller and not exact")
     options = parser.parse_args(words)
